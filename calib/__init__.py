@@ -1,0 +1,1 @@
+"""Pure geometry of mirror cameras: rigid transforms, camera models, rigs and panoramas."""

@@ -1,0 +1,70 @@
+"""The one face of every mirror camera: project, lift, and what part of the picture counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class OmniCamera(Protocol):
+    """A central camera that sees all around; pixel centres are integers, u right, v down."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image (width, height) [px]."""
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Pixel (u, v) of the model's axis."""
+
+    def project(self, points: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where the model has no image."""
+
+    def lift(self, pixels: Array) -> Array:
+        """Unit rays (N, 3) in the camera frame of pixels (N, 2); NaN where the model has no ray."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """The part of an image that shows the world: a ring about a centre, minus what a picture blanks out.
+
+    center (u, v) [px]; inner_px and outer_px bound the radius; image (H, W) uint8, 0 = not the world.
+    """
+
+    center: tuple[float, float]
+    inner_px: float = 0.0
+    outer_px: float = float("inf")
+    image: NDArray[np.uint8] | None = None
+
+    def contains(self, pixels: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
+        """Whether pixels (N, 2) lie inside, at least margin_px away from rim and hub."""
+        radius = np.hypot(pixels[:, 0] - self.center[0], pixels[:, 1] - self.center[1])
+        inner = self.inner_px + margin_px if self.inner_px > 0 else 0.0
+        inside = (radius >= inner) & (radius <= self.outer_px - margin_px)
+        return inside if self.image is None else inside & self._painted(pixels)
+
+    def _painted(self, pixels: Array) -> NDArray[np.bool_]:
+        assert self.image is not None
+        height, width = self.image.shape
+        finite = np.isfinite(pixels).all(axis=1)
+        column, row = np.rint(np.where(finite[:, None], pixels, -1)).astype(int).T
+        inside = finite & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return inside & (self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0)
+
+
+def inscribed_mask(camera: OmniCamera) -> Mask:
+    """The largest ring about the camera's axis that lies in its image: the mask where none is known."""
+    (u, v), (width, height) = camera.center, camera.size
+    return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
+
+
+def inside_image(camera: OmniCamera, pixels: Array) -> NDArray[np.bool_]:
+    """Whether pixels (N, 2) lie on the camera's image; NaN does not."""
+    width, height = camera.size
+    u, v = pixels[:, 0], pixels[:, 1]
+    return np.asarray((u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1))

@@ -1,0 +1,132 @@
+"""Rigid transforms as 4x4 matrices, `p_a = T_a_b @ p_b`; all functions accept stacks (..., 4, 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def transform(R: ArrayLike, t: ArrayLike) -> Array:
+    """The 4x4 transform of rotation R (..., 3, 3) and translation t (..., 3)."""
+    R, t = np.asarray(R, float), np.asarray(t, float)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T: ArrayLike) -> Array:
+    """T_b_a of T_a_b, exactly rigid: (R^T, -R^T t)."""
+    T = np.asarray(T, float)
+    R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T: ArrayLike, points: ArrayLike) -> Array:
+    """Points (..., N, 3) moved by T (..., 4, 4)."""
+    T = np.asarray(T, float)
+    return np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def hat(w: ArrayLike) -> Array:
+    """The cross-product matrix (..., 3, 3) of w (..., 3): hat(w) @ v = w x v."""
+    w = np.asarray(w, float)
+    W = np.zeros((*w.shape[:-1], 3, 3))
+    W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    return W - np.swapaxes(W, -1, -2)
+
+
+def _series(angle: Array) -> tuple[Array, Array, Array]:
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, by their series where a is tiny."""
+    small = angle < 1e-4
+    a = np.where(small, 1.0, angle)
+    first = np.where(small, 1 - angle**2 / 6, np.sin(a) / a)
+    second = np.where(small, 0.5 - angle**2 / 24, 2 * (np.sin(a / 2) / a) ** 2)
+    third = np.where(small, 1 / 6 - angle**2 / 120, (a - np.sin(a)) / a**3)
+    return first[..., None, None], second[..., None, None], third[..., None, None]
+
+
+def rotation_exp(w: ArrayLike) -> Array:
+    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
+    w = np.asarray(w, float)
+    a, b, _ = _series(np.linalg.norm(w, axis=-1))
+    W = hat(w)
+    return np.asarray(np.eye(3) + a * W + b * W @ W)
+
+
+def rotation_log(R: ArrayLike) -> Array:
+    """Rotation vector (..., 3) [rad] of a rotation matrix, good up to and including half a turn."""
+    q = quaternion(R)
+    norm = np.linalg.norm(q[..., :3], axis=-1)
+    angle = 2 * np.arctan2(norm, q[..., 3])
+    scale = np.where(norm < 1e-9, 2.0, angle / np.where(norm < 1e-9, 1.0, norm))
+    return np.asarray(q[..., :3] * scale[..., None])
+
+
+def exp(xi: ArrayLike) -> Array:
+    """The transform of a twist xi (..., 6) = [translation; rotation vector]."""
+    xi = np.asarray(xi, float)
+    _, b, c = _series(np.linalg.norm(xi[..., 3:], axis=-1))
+    W = hat(xi[..., 3:])
+    V = np.eye(3) + b * W + c * W @ W
+    return transform(rotation_exp(xi[..., 3:]), (V @ xi[..., :3, None])[..., 0])
+
+
+def log(T: ArrayLike) -> Array:
+    """The twist (..., 6) = [translation; rotation vector] whose exp is T."""
+    T = np.asarray(T, float)
+    w = rotation_log(T[..., :3, :3])
+    _, b, c = _series(np.linalg.norm(w, axis=-1))
+    W = hat(w)
+    V = np.eye(3) + b * W + c * W @ W
+    return np.concatenate([np.linalg.solve(V, T[..., :3, 3:])[..., 0], w], axis=-1)
+
+
+def interpolate(T_a: ArrayLike, T_b: ArrayLike, s: float) -> Array:
+    """The pose at fraction s of the screw motion from T_a (s = 0) to T_b (s = 1)."""
+    T_a = np.asarray(T_a, float)
+    return np.asarray(T_a @ exp(s * log(inverse(T_a) @ np.asarray(T_b, float))))
+
+
+def quaternion(R: ArrayLike) -> Array:
+    """Unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
+    R = np.asarray(R, float)
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    # Four times the outer product q q^T: its longest column is the best conditioned estimate of q.
+    K = np.empty((*R.shape[:-2], 4, 4))
+    K[..., 0, 0], K[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
+    K[..., 2, 2], K[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
+    K[..., 0, 1] = K[..., 1, 0] = R[..., 0, 1] + R[..., 1, 0]
+    K[..., 0, 2] = K[..., 2, 0] = R[..., 0, 2] + R[..., 2, 0]
+    K[..., 1, 2] = K[..., 2, 1] = R[..., 1, 2] + R[..., 2, 1]
+    K[..., 0, 3] = K[..., 3, 0] = R[..., 2, 1] - R[..., 1, 2]
+    K[..., 1, 3] = K[..., 3, 1] = R[..., 0, 2] - R[..., 2, 0]
+    K[..., 2, 3] = K[..., 3, 2] = R[..., 1, 0] - R[..., 0, 1]
+    longest = np.argmax(np.einsum("...ii->...i", K), axis=-1)
+    q = np.take_along_axis(K, longest[..., None, None], axis=-1)[..., 0]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def rotation(q: ArrayLike) -> Array:
+    """Rotation matrix (..., 3, 3) of a quaternion (..., 4) = (x, y, z, w), normalised here."""
+    q = np.asarray(q, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    W = hat(q[..., :3])
+    return np.asarray(np.eye(3) + 2 * q[..., 3, None, None] * W + 2 * W @ W)
+
+
+def yaw(T: ArrayLike) -> Array:
+    """Heading (...,) [rad] of the x axis of T about z."""
+    T = np.asarray(T, float)
+    return np.asarray(np.arctan2(T[..., 1, 0], T[..., 0, 0]))
+
+
+def is_rigid(T: ArrayLike, tolerance: float = 1e-4) -> bool:
+    """Whether T is a finite (4, 4) rotation and translation (no scale, no reflection)."""
+    T = np.asarray(T, float)
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], (0, 0, 0, 1), atol=tolerance):
+        return False
+    R = T[:3, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)

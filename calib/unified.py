@@ -1,0 +1,88 @@
+"""The unified model (Geyer and Daniilidis 2000; Mei and Rives 2007): any central mirror by one number xi.
+
+A unit ray (x, y, z) is seen from a point xi above the sphere's centre, m = (x, y) / (z + xi), then distorted and
+scaled: u = fu * mx + pu, v = fv * my + pv. xi = 0 is the pinhole, xi = 1 the parabolic mirror under an orthographic
+camera. fu < 0 is the mirror's flip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.camera import Array
+from calib.errors import CalibError
+
+# Newton steps that undo the lens distortion; a mild one converges in 3 to 5, what does not is given NaN.
+UNDISTORT_STEPS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class UnifiedCamera:
+    """Unified model `omni`: xi, focal lengths (fu, fv) [px], centre (pu, pv) [px], k1 k2 p1 p2 (Kalibr's radtan)."""
+
+    xi: float
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        values = (self.xi, *self.focal, *self.center, *self.distortion)
+        if not np.isfinite(values).all():
+            raise CalibError(f"omni camera: every parameter must be a finite number, found {values}")
+        if self.xi < 0 or 0 in self.focal or min(self.size) < 1:
+            raise CalibError(f"omni camera: needs xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
+                             f"focal {self.focal}, size {self.size}")
+
+    def project(self, points: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3); NaN behind the projection's edge. Mei and Rives 2007, eq. (1) to (4)."""
+        norm = np.linalg.norm(points, axis=1)
+        z = points[:, 2] / np.where(norm > 0, norm, np.nan)
+        # Beyond this plane two rays would share a pixel (xi > 1), or the denominator changes sign (xi <= 1).
+        edge = -self.xi if self.xi <= 1 else -1 / self.xi
+        scale = np.where(z > edge, norm * (z + self.xi), np.nan)
+        m = points[:, :2] / np.where(scale > 1e-12, scale, np.nan)[:, None]
+        return np.asarray(self._distort(m) * self.focal + self.center)
+
+    def lift(self, pixels: Array) -> Array:
+        """Unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""
+        m = self._undistort((np.asarray(pixels, float) - self.center) / self.focal)
+        r2 = (m**2).sum(axis=1)
+        root = 1 + (1 - self.xi**2) * r2
+        eta = (self.xi + np.sqrt(np.where(root >= 0, root, np.nan))) / (1 + r2)
+        return np.column_stack([eta[:, None] * m, eta - self.xi])
+
+    def _distort(self, m: Array) -> Array:
+        k1, k2, p1, p2 = self.distortion
+        if not any(self.distortion):
+            return m
+        x, y = m.T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + k2 * r2)
+        return np.column_stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+
+    def _undistort(self, distorted: Array) -> Array:
+        if not any(self.distortion):
+            return distorted
+        m = distorted.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(UNDISTORT_STEPS):
+                m -= self._newton_step(m, distorted)
+            bad = ~(np.abs(self._distort(m) - distorted).max(axis=1) < 1e-9)
+        m[bad] = np.nan
+        return m
+
+    def _newton_step(self, m: Array, target: Array) -> Array:
+        k1, k2, p1, p2 = self.distortion
+        x, y = m.T
+        r2 = x * x + y * y
+        radial, slope = 1 + r2 * (k1 + k2 * r2), 2 * k1 + 4 * k2 * r2
+        a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        b = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        d = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        ex, ey = (self._distort(m) - target).T
+        determinant = a * d - b * b
+        return np.column_stack([d * ex - b * ey, a * ey - b * ex]) / determinant[:, None]
