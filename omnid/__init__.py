@@ -1,0 +1,1 @@
+"""The daemon: stages, wiring, transport and command line."""

@@ -1,0 +1,1 @@
+"""Pure numerics: no clock, no thread, no log, no I/O."""

@@ -1,0 +1,1 @@
+"""Messages to the outside: CDR bytes and the zenoh bus."""

@@ -1,0 +1,214 @@
+"""Messages as CDR bytes, the same for the log and the bus: ROS 2 (Humble) types, serialised by rosbags.
+
+Arrays in SI units; p_a = T_a_b @ p_b; covariances in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores import ros2_humble as ros
+
+from calib import se3
+from omnid.errors import OmnidError
+
+ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
+POSE_SCHEMA = "geometry_msgs/msg/PoseStamped"
+TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
+POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
+DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
+TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
+
+CLOUD_FIELDS = ("x", "y", "z", "confidence")
+QUATERNION_TOLERANCE = 1e-3
+NS_PER_S = 1_000_000_000
+MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
+
+Array = NDArray[np.float64]
+Frames = tuple[str, str]
+Cartesian = ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryRecord:
+    """What a nav_msgs/msg/Odometry message says."""
+
+    stamp_ns: int
+    T_odom_base: Array  # (4, 4)
+    covariance: Array  # (6, 6) of the pose, in odom axes
+    velocity: Array  # (6,) [m/s, rad/s] in the base frame
+    velocity_covariance: Array  # (6, 6)
+    frames: Frames  # (parent, child)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
+
+    parent: str
+    child: str
+    T_parent_child: Array  # (4, 4)
+
+
+@cache
+def _typestore() -> Typestore:
+    """The message definitions, made at first use: the serialisers are compiled then."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _cdr(message: object, schema: str) -> bytes:
+    return bytes(_typestore().serialize_cdr(message, schema))
+
+
+def _time(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
+    seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
+    if not 0 <= seconds <= MAX_SECONDS:
+        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
+    return ros.builtin_interfaces__msg__Time(seconds, nanoseconds)
+
+
+def _header(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
+    return ros.std_msgs__msg__Header(_time(stamp_ns), frame)
+
+
+def _vector(xyz: ArrayLike) -> ros.geometry_msgs__msg__Vector3:
+    return ros.geometry_msgs__msg__Vector3(*(float(v) for v in np.asarray(xyz)))
+
+
+def _quaternion(R: ArrayLike) -> ros.geometry_msgs__msg__Quaternion:
+    return ros.geometry_msgs__msg__Quaternion(*(float(v) for v in se3.quaternion(R)))
+
+
+def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
+    position = ros.geometry_msgs__msg__Point(*(float(v) for v in T[:3, 3]))
+    return ros.geometry_msgs__msg__Pose(position, _quaternion(T[:3, :3]))
+
+
+def _covariance(matrix: ArrayLike) -> Array:
+    flat = np.ascontiguousarray(matrix, np.float64).reshape(-1)
+    if flat.shape != (36,):
+        raise OmnidError(f"a covariance is (6, 6); got {np.shape(matrix)}; give it in the order x y z rx ry rz")
+    return flat
+
+
+def odometry_cdr(
+    stamp_ns: int,
+    T_odom_base: Array,
+    covariance: Array,
+    velocity: Array,
+    velocity_covariance: Array,
+    frames: Frames = ("odom", "base_link"),
+) -> bytes:
+    """A nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
+    parent, child = frames
+    twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
+    message = ros.nav_msgs__msg__Odometry(
+        _header(stamp_ns, parent),
+        child,
+        ros.geometry_msgs__msg__PoseWithCovariance(_pose(T_odom_base), _covariance(covariance)),
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)),
+    )
+    return _cdr(message, ODOMETRY_SCHEMA)
+
+
+def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") -> bytes:
+    """A geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
+    message = ros.geometry_msgs__msg__PoseStamped(_header(stamp_ns, frame), _pose(T_frame_body))
+    return _cdr(message, POSE_SCHEMA)
+
+
+def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
+    """A tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
+    edges = [_edge(stamp_ns, edge) for edge in transforms]
+    return _cdr(ros.tf2_msgs__msg__TFMessage(edges), TRANSFORM_SCHEMA)
+
+
+def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__TransformStamped:
+    T = edge.T_parent_child
+    motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
+    return ros.geometry_msgs__msg__TransformStamped(_header(stamp_ns, edge.parent), edge.child, motion)
+
+
+def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike) -> bytes:
+    """A sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): 16 bytes a point, float32."""
+    packed = _packed(points, confidence)
+    number = ros.sensor_msgs__msg__PointField.FLOAT32
+    fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
+    message = ros.sensor_msgs__msg__PointCloud2(
+        header=_header(stamp_ns, frame),
+        height=1,
+        width=len(packed),
+        fields=fields,
+        is_bigendian=False,
+        point_step=16,
+        row_step=16 * len(packed),
+        data=packed.reshape(-1).view(np.uint8),
+        is_dense=bool(np.isfinite(packed).all()),
+    )
+    return _cdr(message, POINT_CLOUD_SCHEMA)
+
+
+def _packed(points: ArrayLike, confidence: ArrayLike) -> NDArray[np.float32]:
+    """Points and confidence side by side (N, 4), little-endian float32."""
+    points, confidence = np.asarray(points, "<f4").reshape(-1, 3), np.asarray(confidence, "<f4").reshape(-1, 1)
+    if len(points) != len(confidence):
+        raise OmnidError(f"{len(points)} points but {len(confidence)} confidences; give one for each point")
+    return np.ascontiguousarray(np.hstack([points, confidence]))
+
+
+def diagnostics_cdr(stamp_ns: int, name: str, level: int, message: str, values: Mapping[str, str]) -> bytes:
+    """A diagnostic_msgs/msg/DiagnosticArray with one status; level 0 ok, 1 warning, 2 error, 3 stale."""
+    if not 0 <= level <= 3:
+        raise OmnidError(f"diagnostic level {level} of {name} is none of 0 ok, 1 warning, 2 error, 3 stale")
+    pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in values.items()]
+    status = ros.diagnostic_msgs__msg__DiagnosticStatus(level, name, message, "", pairs)
+    return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), [status]), DIAGNOSTICS_SCHEMA)
+
+
+def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
+    """A geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
+    twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
+    return _cdr(ros.geometry_msgs__msg__TwistStamped(_header(stamp_ns, frame), twist), TWIST_SCHEMA)
+
+
+def odometry_from_cdr(payload: bytes) -> OdometryRecord:
+    """What an Odometry message says; any bytes may come: OmnidError unless they are one with a finite, rigid pose."""
+    try:
+        message = _typestore().deserialize_cdr(bytes(payload), ODOMETRY_SCHEMA)
+    except (SerdeError, IndexError, OverflowError) as error:
+        raise OmnidError(f"{len(payload)} bytes are no {ODOMETRY_SCHEMA} in CDR ({error}); check the sender") from error
+    assert isinstance(message, ros.nav_msgs__msg__Odometry)
+    twist = message.twist.twist
+    return OdometryRecord(
+        stamp_ns=_stamp_ns(message.header.stamp),
+        T_odom_base=_transform(message.pose.pose),
+        covariance=message.pose.covariance.reshape(6, 6),
+        velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
+        velocity_covariance=message.twist.covariance.reshape(6, 6),
+        frames=(message.header.frame_id, message.child_frame_id),
+    )
+
+
+def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
+        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns is no time since 1970; check the sender")
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def _xyz(vector: Cartesian) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def _transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
+    q, position = (*_xyz(pose.orientation), pose.orientation.w), _xyz(pose.position)
+    if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
+        raise OmnidError(f"odometry pose {position} {q} is not finite with a unit quaternion; check the sender")
+    return se3.transform(se3.rotation(q), position)

@@ -1,0 +1,164 @@
+"""The CDR messages, read back with rosbags and byte by byte."""
+
+from __future__ import annotations
+
+import random
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from calib import se3
+from omnid.errors import OmnidError
+from omnid.transport import codec
+
+STAMP_NS = 1_700_000_123_987_654_321
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+T_ODOM_BASE = se3.transform(se3.rotation_exp([0.1, -0.2, 2.9]), [1.5, -2.25, 0.125])
+COVARIANCE = np.arange(36.0).reshape(6, 6)
+VELOCITY = np.array([0.5, 0.01, -0.02, 0.003, -0.004, 0.7])
+
+
+def read(payload: bytes, schema: str) -> Any:
+    return STORE.deserialize_cdr(payload, schema)
+
+
+def odometry() -> bytes:
+    return codec.odometry_cdr(STAMP_NS, T_ODOM_BASE, COVARIANCE, VELOCITY, 2.0 * COVARIANCE)
+
+
+def test_odometry_comes_back() -> None:
+    record = codec.odometry_from_cdr(odometry())
+    assert record.stamp_ns == STAMP_NS
+    assert record.frames == ("odom", "base_link")
+    np.testing.assert_allclose(record.T_odom_base, T_ODOM_BASE, atol=1e-14)
+    np.testing.assert_array_equal(record.covariance, COVARIANCE)
+    np.testing.assert_array_equal(record.velocity, VELOCITY)
+    np.testing.assert_array_equal(record.velocity_covariance, 2.0 * COVARIANCE)
+
+
+def test_odometry_bytes_are_where_ros_expects_them() -> None:
+    payload = odometry()
+    body = payload[4:]
+    assert payload[:4] == b"\x00\x01\x00\x00" and len(payload) == 4 + 720
+    assert struct.unpack_from("<iI", body) == divmod(STAMP_NS, 10**9)
+    assert body[8:17] == b"\x05\x00\x00\x00odom\x00"
+    np.testing.assert_allclose(struct.unpack_from("<3d", body, 40), T_ODOM_BASE[:3, 3])
+    np.testing.assert_allclose(struct.unpack_from("<4d", body, 64), se3.quaternion(T_ODOM_BASE[:3, :3]))
+    assert struct.unpack_from("<36d", body, 96) == tuple(float(i) for i in range(36))
+    assert struct.unpack_from("<6d", body, 384) == tuple(VELOCITY)
+
+
+def test_odometry_frames_can_be_named() -> None:
+    eye = np.eye(6)
+    payload = codec.odometry_cdr(1, T_ODOM_BASE, eye, VELOCITY, eye, frames=("map", "rig"))
+    assert codec.odometry_from_cdr(payload).frames == ("map", "rig")
+
+
+def test_decoder_survives_any_bytes() -> None:
+    rng = random.Random(1)
+    good = odometry()
+    for _ in range(4000):
+        spoiled = bytearray(good)
+        for _ in range(rng.randint(1, 6)):
+            spoiled[rng.randrange(len(spoiled))] = rng.randrange(256)
+        payload = bytes(spoiled[: rng.randint(0, len(spoiled))]) if rng.random() < 0.5 else bytes(spoiled)
+        expect_record_or_refusal(payload)
+    for _ in range(2000):
+        expect_record_or_refusal(b"\x00\x01\x00\x00" + rng.randbytes(rng.randint(0, 900)))
+
+
+def expect_record_or_refusal(payload: bytes) -> None:
+    try:
+        record = codec.odometry_from_cdr(payload)
+    except OmnidError as error:
+        assert "\n" not in str(error)
+    else:
+        assert se3.is_rigid(record.T_odom_base) and record.covariance.shape == (6, 6)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00", b"\x00\x01\x00\x00", b"hello", bytes(724), odometry()[:-9]])
+def test_decoder_refuses(payload: bytes) -> None:
+    with pytest.raises(OmnidError):
+        codec.odometry_from_cdr(payload)
+
+
+def test_decoder_refuses_a_pose_that_is_not_finite() -> None:
+    T = T_ODOM_BASE.copy()
+    T[0, 3] = np.nan
+    with pytest.raises(OmnidError, match="not finite"):
+        codec.odometry_from_cdr(codec.odometry_cdr(STAMP_NS, T, COVARIANCE, VELOCITY, COVARIANCE))
+
+
+@pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
+def test_stamp_must_fit(stamp_ns: int) -> None:
+    with pytest.raises(OmnidError, match="stamp"):
+        codec.pose_stamped_cdr(stamp_ns, T_ODOM_BASE)
+
+
+def test_covariance_must_have_36_numbers() -> None:
+    with pytest.raises(OmnidError, match="covariance"):
+        codec.odometry_cdr(STAMP_NS, T_ODOM_BASE, np.eye(3), VELOCITY, COVARIANCE)
+
+
+def test_pose_stamped() -> None:
+    message = read(codec.pose_stamped_cdr(STAMP_NS, T_ODOM_BASE), codec.POSE_SCHEMA)
+    position, q = message.pose.position, message.pose.orientation
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
+    assert message.header.frame_id == "odom"
+    np.testing.assert_array_equal([position.x, position.y, position.z], T_ODOM_BASE[:3, 3])
+    np.testing.assert_allclose(se3.rotation([q.x, q.y, q.z, q.w]), T_ODOM_BASE[:3, :3], atol=1e-14)
+
+
+def test_transforms() -> None:
+    edges = [codec.FrameTransform("map", "odom", np.eye(4)), codec.FrameTransform("odom", "base_link", T_ODOM_BASE)]
+    message = read(codec.transform_cdr(STAMP_NS, edges), codec.TRANSFORM_SCHEMA)
+    names = [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
+    shift = message.transforms[1].transform.translation
+    assert names == [("map", "odom"), ("odom", "base_link")]
+    assert message.transforms[0].transform.rotation.w == 1.0
+    np.testing.assert_array_equal([shift.x, shift.y, shift.z], T_ODOM_BASE[:3, 3])
+
+
+def test_point_cloud() -> None:
+    rng = np.random.default_rng(2)
+    points, confidence = rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32)
+    message = read(codec.point_cloud_cdr(STAMP_NS, "rig", points, confidence), codec.POINT_CLOUD_SCHEMA)
+    assert [(f.name, f.offset, f.datatype, f.count) for f in message.fields] == [
+        ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), ("confidence", 12, 7, 1)
+    ]  # fmt: skip
+    assert (message.height, message.width, message.point_step, message.row_step) == (1, 50, 16, 800)
+    assert message.is_dense and not message.is_bigendian
+    rows = message.data.view("<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(rows, np.column_stack([points, confidence]))
+
+
+def test_empty_point_cloud() -> None:
+    message = read(codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0)), codec.POINT_CLOUD_SCHEMA)
+    assert message.width == 0 and len(message.data) == 0
+
+
+def test_point_cloud_needs_a_confidence_a_point() -> None:
+    with pytest.raises(OmnidError, match="3 points but 2"):
+        codec.point_cloud_cdr(STAMP_NS, "rig", np.zeros((3, 3)), np.zeros(2))
+
+
+def test_diagnostics() -> None:
+    payload = codec.diagnostics_cdr(STAMP_NS, "omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})
+    (status,) = read(payload, codec.DIAGNOSTICS_SCHEMA).status
+    assert (status.level, status.name, status.message) == (1, "omnid/odometry", "degraded")
+    assert [(pair.key, pair.value) for pair in status.values] == [("inliers", "12"), ("fps", "9.8")]
+
+
+def test_diagnostic_level_must_exist() -> None:
+    with pytest.raises(OmnidError, match="level 4"):
+        codec.diagnostics_cdr(STAMP_NS, "omnid", 4, "", {})
+
+
+def test_twist_stamped() -> None:
+    message = read(codec.twist_stamped_cdr(STAMP_NS, "base_link", 0.4, -0.3), codec.TWIST_SCHEMA)
+    linear, angular = message.twist.linear, message.twist.angular
+    assert message.header.frame_id == "base_link"
+    assert (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z) == (0.4, 0, 0, 0, 0, -0.3)
