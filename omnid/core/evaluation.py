@@ -1,0 +1,134 @@
+"""How far an estimated trajectory is from the truth: the numbers of `evo_ape --align_origin` and `evo_rpe -d 1 -u f`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.trajectory import Trajectory
+from omnid.errors import OmnidError
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """Errors over the associated poses; the first of them is aligned and nothing else. NaN: undefined."""
+
+    pairs: int  # associated poses
+    coverage: float  # share of the truth's poses that have an estimate, 0..1
+    length_estimate_m: float
+    length_truth_m: float
+    length_error_ratio: float  # (estimate - truth) / truth; negative: too short; NaN where the truth stands still
+    ate_rmse_m: float  # absolute position error
+    ate_max_m: float
+    end_error_m: float
+    rpe_translation_rmse_m: float  # relative pose error from each associated pose to the next
+    rpe_rotation_rmse_rad: float
+    heading_rmse_rad: float  # yaw of R_truth^T R_estimate
+    heading_max_rad: float
+    heading_end_rad: float  # signed, positive: the estimate looks too far left
+
+
+def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> Metrics:
+    """Metrics of an estimate against the truth, both T_world_rig of the same rig frame in any two worlds.
+
+    Each estimate takes the truth nearest in time within the tolerance; where two take the same, the nearer keeps it.
+    Raises OmnidError for fewer than two associated poses.
+    """
+    of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
+    if of_estimate.size < 2:
+        raise OmnidError(
+            f"2 poses at the same times (within {tolerance_s:g} s) were expected, {of_estimate.size} found:"
+            f" estimate {_span(estimate)}, truth {_span(truth)}: do both use the same clock?"
+        )
+    T_true = truth.T[of_truth]
+    T_world_odom = T_true[0] @ se3.inverse(estimate.T[of_estimate[0]])
+    return _metrics(T_world_odom @ estimate.T[of_estimate], T_true, of_truth.size / truth.stamps_ns.size)
+
+
+def format_metrics(metrics: Metrics) -> str:
+    """The metrics as a few aligned lines for a terminal: metres, per cent and degrees."""
+    m = metrics
+    rows = [
+        ("associated poses", f"{m.pairs} ({m.coverage:.1%} of the truth)"),
+        ("path length", f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"),
+        ("position error (ATE)", f"rmse {m.ate_rmse_m:.4f} m, max {m.ate_max_m:.4f} m, end {m.end_error_m:.4f} m"),
+        ("heading error", f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"),
+        ("step error (RPE)", f"rmse {m.rpe_translation_rmse_m:.5f} m, {_deg(m.rpe_rotation_rmse_rad)}"),
+    ]
+    return "\n".join(f"{name:<21} {value}" for name, value in rows)
+
+
+def _percent(ratio: float) -> str:
+    return "no truth to compare" if math.isnan(ratio) else f"{100.0 * ratio:+.2f} %"
+
+
+def _deg(angle_rad: float) -> str:
+    return f"{math.degrees(angle_rad):.3f} deg"
+
+
+def _tolerance_ns(tolerance_s: float) -> int:
+    if not math.isfinite(tolerance_s) or tolerance_s < 0.0:
+        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: name one below half a frame time")
+    return round(tolerance_s * 1e9)
+
+
+def _associate(
+    stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64], tolerance_ns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (of the estimate, of the truth) of the associated poses, in time order; each index stands at most once."""
+    if not stamps_ns.size or not true_ns.size:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    after = np.clip(np.searchsorted(true_ns, stamps_ns), 0, true_ns.size - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = np.abs(stamps_ns - true_ns[before]) <= np.abs(true_ns[after] - stamps_ns)
+    nearest = np.where(earlier, before, after).astype(np.int64)
+    gap_ns = np.abs(stamps_ns - true_ns[nearest])
+    near = np.flatnonzero(gap_ns <= tolerance_ns)
+    best_first = near[np.lexsort((near, gap_ns[near]))]
+    of_truth, first = np.unique(nearest[best_first], return_index=True)
+    return best_first[first], of_truth
+
+
+def _span(trajectory: Trajectory) -> str:
+    stamps_ns = trajectory.stamps_ns
+    return f"spans {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s" if stamps_ns.size else "holds no pose"
+
+
+def _metrics(T_est: NDArray[np.float64], T_true: NDArray[np.float64], coverage: float) -> Metrics:
+    """Metrics of poses (N, 4, 4), row by row at the same time and in the same world."""
+    position_m = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    heading_rad = se3.yaw(se3.inverse(T_true) @ T_est)
+    steps = se3.inverse(_steps(T_true)) @ _steps(T_est)
+    length_est_m, length_true_m = _length_m(T_est), _length_m(T_true)
+    return Metrics(
+        pairs=len(T_est),
+        coverage=coverage,
+        length_estimate_m=length_est_m,
+        length_truth_m=length_true_m,
+        length_error_ratio=(length_est_m - length_true_m) / length_true_m if length_true_m > 0.0 else math.nan,
+        ate_rmse_m=_rms(position_m),
+        ate_max_m=float(position_m.max()),
+        end_error_m=float(position_m[-1]),
+        rpe_translation_rmse_m=_rms(np.linalg.norm(steps[:, :3, 3], axis=1)),
+        rpe_rotation_rmse_rad=_rms(np.linalg.norm(se3.rotation_log(steps[:, :3, :3]), axis=1)),
+        heading_rmse_rad=_rms(heading_rad),
+        heading_max_rad=float(np.abs(heading_rad).max()),
+        heading_end_rad=float(heading_rad[-1]),
+    )
+
+
+def _steps(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The motions T_i_next (N-1, 4, 4) between poses that follow one another."""
+    return se3.inverse(T[:-1]) @ T[1:]
+
+
+def _length_m(T: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,147 @@
+"""Trajectories in the TUM format: one pose a line, `t x y z qx qy qz qw` (seconds, metres, unit quaternion)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.errors import OmnidError
+
+FILE_LIMIT_BYTES = 1 << 28  # some 2.5 million poses: days of driving, and a log named by mistake is not swallowed whole
+POSITION_LIMIT_M = 1e9  # squares and sums of anything nearer stay far from overflow
+STAMP_LIMIT_NS = 1 << 62  # the difference of any two stamps still fits int64
+_DECIMALS = 9  # nanoseconds, nanometres
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses T_odom_rig (or T_world_rig) over time; stamps rise strictly; both arrays are read-only."""
+
+    stamps_ns: NDArray[np.int64]  # (N,)
+    T: NDArray[np.float64]  # (N, 4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    line: int
+    stamp_ns: int
+    pose: tuple[float, ...]  # x y z qx qy qz qw, quaternion of any length but zero
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """The trajectory in a TUM file, sorted by stamp.
+
+    Blank lines and everything after `#` are skipped; quaternions are brought to unit length. A stamp that stands twice
+    is refused: two poses of one moment contradict each other. Raises OmnidError naming file, line and what was found.
+    """
+    text = _read_text(Path(path))
+    rows = sorted(_rows(text, str(path)), key=lambda row: row.stamp_ns)
+    if not rows:
+        raise OmnidError(f"{path}: a trajectory was asked for, no pose was found: expected lines of 't x y z qx qy qz qw'")
+    _refuse_repeated_stamps(rows, str(path))
+    return _trajectory(rows)
+
+
+def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
+    """One TUM line without its newline: every number with 9 decimals, w >= 0, never '-0'; same bytes for the same pose."""
+    sign, (whole_s, rest_ns) = "-" if stamp_ns < 0 else "", divmod(abs(int(stamp_ns)), 10**9)
+    pose = np.concatenate([T[:3, 3], _canonical(se3.quaternion(T[:3, :3]))])
+    numbers = [f"{float(value):.{_DECIMALS}f}" for value in np.round(pose, _DECIMALS) + 0.0]
+    return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *numbers])
+
+
+def _canonical(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The one of q and -q whose last number that prints as non-zero (w, else z, y, x) is positive."""
+    printed = np.round(np.asarray(q, dtype=np.float64), _DECIMALS)
+    visible = printed[printed != 0.0]
+    return -printed if visible.size and visible[-1] < 0.0 else printed
+
+
+def _read_text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(FILE_LIMIT_BYTES + 1)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise OmnidError(f"{path}: a trajectory was asked for, it cannot be read: {error}") from error
+    if len(raw) > FILE_LIMIT_BYTES:
+        raise OmnidError(f"{path}: a trajectory of at most {FILE_LIMIT_BYTES >> 20} MiB was expected, this file is larger")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        found = f"found byte 0x{raw[error.start]:02x}, which is not text"
+        raise OmnidError(f"{path}, line {line}: expected 't x y z qx qy qz qw', {found}: is it a TUM file?") from error
+
+
+def _rows(text: str, name: str) -> Iterator[_Row]:
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    for line, content in enumerate(lines, start=1):
+        words = content.partition("#")[0].split()
+        if words:
+            try:
+                yield _row(words, line)
+            except ValueError as error:
+                raise OmnidError(f"{name}, line {line}: {error}") from error
+
+
+def _row(words: list[str], line: int) -> _Row:
+    if len(words) != 8:
+        found = _shortened(" ".join(words[:9]))
+        raise ValueError(f"expected 8 numbers parted by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
+    pose = tuple(_number(word) for word in words[1:])
+    if max(abs(value) for value in pose[:3]) > POSITION_LIMIT_M:
+        raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {_shortened(' '.join(words[1:4]))}")
+    if max(abs(value) for value in pose[3:]) < 1e-9:
+        raise ValueError(f"expected a unit quaternion, found zero: {_shortened(' '.join(words[4:]))}")
+    return _Row(line, _stamp_ns(words[0]), pose)
+
+
+def _number(word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise ValueError(f"expected a finite number, found {_shortened(word)}")
+    return value
+
+
+def _stamp_ns(word: str) -> int:
+    """Nanoseconds of a stamp in decimal seconds, never through float64, whose step at today's Unix time is 238 ns."""
+    try:
+        stamp_s = Decimal(word)
+    except InvalidOperation:
+        stamp_s = Decimal("nan")
+    # adjusted() comes first: int() of 1e999999999 would never end
+    if not stamp_s.is_finite() or stamp_s.adjusted() > 12 or abs(stamp_s.scaleb(9)) >= STAMP_LIMIT_NS:
+        raise ValueError(f"expected a stamp in seconds, found {_shortened(word)}")
+    return int(stamp_s.scaleb(9).to_integral_value())
+
+
+def _shortened(text: str) -> str:
+    return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+def _refuse_repeated_stamps(rows: list[_Row], name: str) -> None:
+    for first, second in pairwise(rows):
+        if first.stamp_ns == second.stamp_ns:
+            raise OmnidError(
+                f"{name}, line {second.line}: expected each stamp once, found that of line {first.line} again: remove one"
+            )
+
+
+def _trajectory(rows: list[_Row]) -> Trajectory:
+    stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
+    pose = np.array([row.pose for row in rows], dtype=np.float64)
+    q = pose[:, 3:] / np.abs(pose[:, 3:]).max(axis=1, keepdims=True)  # se3 normalises; here its squares cannot overflow
+    T = se3.transform(se3.rotation(q), pose[:, :3])
+    stamps_ns.setflags(write=False)
+    T.setflags(write=False)
+    return Trajectory(stamps_ns, T)

@@ -1,0 +1,151 @@
+"""The map of a whole run in bounded memory: points of all frames, in the world frame, fused in voxels.
+
+Dang et al. 2012, § IV.G: points reconstructed at each frame are moved by the estimated motion into one frame and merged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.errors import OmnidError
+
+_AXIS_BITS = 21
+_HALF_SPAN = 1 << (_AXIS_BITS - 1)  # voxel indices run from -2^20 to 2^20 - 1 on each axis
+_EMPTY = np.int64(-1)  # packed keys are never negative
+_MAX_LOAD, _LOAD_AFTER_EVICTION = 0.7, 0.5
+_BATCH_SHARE = 8  # at most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing always ends
+_OLD_FRAMES = 30  # a point seen once and not again for so many frames was most likely a false match
+_VARIANCE_RANGE_M2 = (1e-8, 1e8)  # no point claims better than 0.1 mm; sums of weights stay far from overflow
+_HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
+
+
+@dataclass(frozen=True, slots=True)
+class MapPoints:
+    """A snapshot of the map, sorted by voxel; world frame."""
+
+    xyz: NDArray[np.float32]  # (M, 3) m
+    confidence: NDArray[np.float32]  # (M,) 0..1
+    frames: NDArray[np.int32]  # (M,) frames that saw the voxel
+    age: NDArray[np.int32]  # (M,) seqs since it was last seen
+
+
+class VoxelMap:
+    """A hash table of voxels in preallocated arrays: 52 bytes a slot, however long the run.
+
+    Each voxel keeps the mean position weighted by information (1 / variance), its sum of weights, the number of frames
+    that saw it and the last of them. `evicted` counts voxels dropped for space, `refused` points that were not mapped:
+    not finite, of no valid variance, or outside +-2^20 voxels.
+    """
+
+    def __init__(self, voxel_m: float = 0.05, capacity: int = 1 << 18) -> None:
+        if not (np.isfinite(voxel_m) and voxel_m > 0.0):
+            raise OmnidError(f"a voxel edge above 0 m was expected, {voxel_m} found: name one such as 0.05")
+        if capacity < 16 or capacity & (capacity - 1):
+            raise OmnidError(f"a map capacity of a power of two from 16 up was expected, {capacity} found: try {1 << 18}")
+        self.evicted = 0
+        self.refused = 0
+        self._voxel_m = voxel_m
+        self._shift = np.uint64(65 - capacity.bit_length())  # the hash's top bits are its best mixed
+        self._count = 0
+        self._newest_seq = 0
+        self._keys = np.full(capacity, _EMPTY, dtype=np.int64)
+        self._sums = np.zeros((capacity, 4))  # information, and information times x, y, z
+        self._frames = np.zeros(capacity, dtype=np.int32)
+        self._last_seq = np.zeros(capacity, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def insert(self, points: NDArray[np.float64], variance_m2: NDArray[np.float64], seq: int) -> None:
+        """Fuse the points (N, 3) of frame `seq`, in metres in the world frame, with their isotropic variances (N,)."""
+        usable = self._usable(points, variance_m2)
+        self.refused += len(points) - int(usable.sum())
+        keys, sums = self._reduce(points[usable], variance_m2[usable])
+        self._newest_seq = max(self._newest_seq, seq)
+        batch = len(self._keys) // _BATCH_SHARE
+        for start in range(0, len(keys), batch):
+            self._fuse(keys[start : start + batch], sums[start : start + batch], seq)
+            if self._count > _MAX_LOAD * len(self._keys):
+                self._evict()
+
+    def points(self, min_frames: int = 2) -> MapPoints:
+        """The voxels seen in at least `min_frames` frames, as their mean positions in the order of their keys."""
+        slots = np.flatnonzero((self._keys != _EMPTY) & (self._frames >= min_frames))
+        slots = slots[np.argsort(self._keys[slots])]
+        age = np.minimum(self._newest_seq - self._last_seq[slots], np.iinfo(np.int32).max)
+        return MapPoints(
+            xyz=(self._sums[slots, 1:] / self._sums[slots, :1]).astype(np.float32),
+            confidence=self._confidence(slots).astype(np.float32),
+            frames=self._frames[slots],
+            age=age.astype(np.int32),
+        )
+
+    def _usable(self, points: NDArray[np.float64], variance_m2: NDArray[np.float64]) -> NDArray[np.bool_]:
+        inside = (np.abs(points) < _HALF_SPAN * self._voxel_m).all(axis=1)  # false for NaN and infinity too
+        return np.asarray(inside & np.isfinite(variance_m2) & (variance_m2 > 0.0))
+
+    def _reduce(
+        self, points: NDArray[np.float64], variance_m2: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """One frame's voxels: sorted packed keys (U,) and sums (U, 4)."""
+        keys, voxel = np.unique(self._pack(points), return_inverse=True)
+        weight = 1.0 / np.clip(variance_m2, *_VARIANCE_RANGE_M2)
+        columns = (weight, *(weight[:, None] * points).T)
+        return keys, np.stack([np.bincount(voxel, column, len(keys)) for column in columns], axis=1)
+
+    def _pack(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        index = np.floor(points / self._voxel_m).astype(np.int64) + _HALF_SPAN
+        index = np.clip(index, 0, 2 * _HALF_SPAN - 1)  # rounding at the very border
+        return np.asarray((index[:, 0] << (2 * _AXIS_BITS)) | (index[:, 1] << _AXIS_BITS) | index[:, 2])
+
+    def _fuse(self, keys: NDArray[np.int64], sums: NDArray[np.float64], seq: int) -> None:
+        slots = self._place(keys)
+        known = self._frames[slots] > 0
+        self._count += int(len(keys) - known.sum())
+        self._sums[slots] += sums
+        self._frames[slots] += ~known | (self._last_seq[slots] != seq)
+        self._last_seq[slots] = np.where(known, np.maximum(self._last_seq[slots], seq), seq)
+
+    def _place(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The slot of each of the keys, all different; free slots are claimed.
+
+        Triangular probing visits every slot of a table of 2^n, and the table is never full: the loop ends.
+        """
+        slots = (keys.view(np.uint64) * _HASH >> self._shift).astype(np.int64)
+        pending = np.arange(len(keys))
+        step = 0
+        while pending.size:
+            tried = slots[pending]
+            free = self._keys[tried] == _EMPTY
+            self._keys[tried[free]] = keys[pending[free]]  # of two that want one slot, one stays; the other goes on
+            pending = pending[self._keys[tried] != keys[pending]]
+            step += 1
+            slots[pending] = (slots[pending] + step) & (len(self._keys) - 1)
+        return slots
+
+    def _confidence(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
+        """0..1, growing with both witnesses: n / (n + 1) of n frames, times 1 / (1 + variance of the mean / voxel^2)."""
+        frames, weight = self._frames[slots].astype(np.float64), self._sums[slots, 0]
+        return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
+
+    def _evict(self) -> None:
+        """Rebuild the table with its best half: voxels seen once and long ago go first, then the least confident."""
+        slots = np.flatnonzero(self._keys != _EMPTY)
+        old_single = (self._frames[slots] == 1) & (self._newest_seq - self._last_seq[slots] > _OLD_FRAMES)
+        order = np.lexsort((self._keys[slots], self._confidence(slots), ~old_single))  # the key makes ties repeatable
+        kept = slots[order[len(slots) - int(_LOAD_AFTER_EVICTION * len(self._keys)) :]]
+        self.evicted += len(slots) - len(kept)
+        self._rebuild(kept)
+
+    def _rebuild(self, kept: NDArray[np.int64]) -> None:
+        keys, sums = self._keys[kept], self._sums[kept]
+        frames, last_seq = self._frames[kept], self._last_seq[kept]
+        self._keys.fill(_EMPTY)
+        self._frames.fill(0)
+        self._sums.fill(0.0)
+        slots = self._place(keys)
+        self._sums[slots], self._frames[slots], self._last_seq[slots] = sums, frames, last_seq
+        self._count = len(kept)

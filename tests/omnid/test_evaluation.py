@@ -1,0 +1,154 @@
+"""Metrics against hand-made errors, and against the program evo on the same files."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.core.evaluation import evaluate, format_metrics
+from omnid.core.trajectory import Trajectory, read_tum, tum_row
+from omnid.errors import OmnidError
+
+STEP_NS = 100_000_000
+
+
+def trajectory(stamps_ns: np.ndarray | list[int], T: np.ndarray) -> Trajectory:
+    return Trajectory(np.asarray(stamps_ns, dtype=np.int64), T)
+
+
+def spline(count: int = 80) -> Trajectory:
+    """A curved drive with some roll and pitch, somewhere in the world."""
+    s = np.linspace(0.0, 4.0, count)
+    turn = np.stack([0.05 * np.sin(3 * s), 0.04 * np.cos(2 * s), 0.4 + 0.8 * np.sin(s)], axis=1)
+    t = np.stack([3 + 2 * s, np.sin(s) - 7, 1.2 + 0.02 * s], axis=1)
+    stamps_ns = 1_700_000_000_000_000_000 + STEP_NS * np.arange(count)
+    return trajectory(stamps_ns, se3.transform(se3.rotation_exp(turn), t))
+
+
+def drifted(truth: Trajectory) -> Trajectory:
+    """The truth seen from its first pose, with errors that add up, and stamps a little off."""
+    rng = np.random.default_rng(7)
+    steps = se3.inverse(truth.T[:-1]) @ truth.T[1:]
+    steps = steps @ se3.exp(rng.normal(0.0, 0.01, (len(steps), 6)))
+    T = [np.eye(4)]
+    for step in steps:
+        T.append(T[-1] @ step)
+    return trajectory(truth.stamps_ns + rng.integers(-3_000_000, 3_000_000, len(T)), np.array(T))
+
+
+def straight(count: int, step_m: float, heading_rad: float = 0.0) -> Trajectory:
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, 0, 3] = step_m * np.arange(count)
+    T[1:, :3, :3] = se3.rotation_exp([0.0, 0.0, heading_rad])
+    return trajectory(STEP_NS * np.arange(count), T)
+
+
+def test_truth_in_another_world_is_no_error() -> None:
+    truth = spline()
+    moved = trajectory(truth.stamps_ns, se3.exp([4.0, -2.0, 1.0, 0.3, -0.2, 2.5]) @ truth.T)
+    metrics = evaluate(moved, truth)
+    assert (metrics.pairs, metrics.coverage) == (80, 1.0)
+    assert metrics.length_estimate_m == pytest.approx(metrics.length_truth_m)
+    errors = [metrics.ate_rmse_m, metrics.ate_max_m, metrics.end_error_m, metrics.heading_max_rad]
+    errors += [metrics.rpe_translation_rmse_m, metrics.rpe_rotation_rmse_rad, metrics.length_error_ratio]
+    np.testing.assert_allclose(errors, 0.0, atol=1e-7)
+
+
+def test_known_errors() -> None:
+    metrics = evaluate(straight(11, 0.099, heading_rad=-0.02), straight(11, 0.1))
+    assert metrics.length_truth_m == pytest.approx(1.0)
+    assert metrics.length_error_ratio == pytest.approx(-0.01)
+    assert metrics.end_error_m == metrics.ate_max_m == pytest.approx(0.01)
+    assert metrics.ate_rmse_m == pytest.approx(0.001 * math.sqrt(np.mean(np.arange(11) ** 2)))
+    assert metrics.heading_end_rad == pytest.approx(-0.02)
+    assert metrics.heading_max_rad == pytest.approx(0.02)
+    assert metrics.heading_rmse_rad == pytest.approx(0.02 * math.sqrt(10 / 11))
+    assert metrics.rpe_rotation_rmse_rad == pytest.approx(0.02 / math.sqrt(10))
+
+
+def test_worst_is_not_the_end() -> None:
+    estimate = straight(11, 0.1)
+    estimate.T[4, 1, 3] = 0.3
+    metrics = evaluate(estimate, straight(11, 0.1))
+    assert metrics.ate_max_m == pytest.approx(0.3) and metrics.end_error_m == 0.0
+
+
+def test_only_the_first_associated_pose_is_aligned() -> None:
+    truth, estimate = straight(11, 0.1), straight(11, 0.1)
+    late = trajectory(estimate.stamps_ns[3:], estimate.T[3:] + 0.0)
+    late.T[:, 1, 3] += 5.0
+    metrics = evaluate(late, truth)
+    assert (metrics.pairs, metrics.coverage) == (8, pytest.approx(8 / 11))
+    assert metrics.ate_max_m == pytest.approx(0.0) and metrics.length_truth_m == pytest.approx(0.7)
+
+
+def test_each_truth_is_used_once_by_the_nearest() -> None:
+    truth = straight(3, 1.0)
+    stamps_ns = [4_000_000, 9_000_000, STEP_NS - 2_000_000, STEP_NS + 1_000_000, 2 * STEP_NS + 11_000_000]
+    estimate = trajectory(stamps_ns, straight(5, 1.0).T)
+    metrics = evaluate(estimate, truth)  # rows 0 and 3 against truths 0 and 1
+    assert (metrics.pairs, metrics.length_estimate_m, metrics.length_truth_m) == (2, 3.0, 1.0)
+    assert evaluate(estimate, truth, tolerance_s=0.011).pairs == 3
+
+
+def test_standing_still_has_no_relative_length() -> None:
+    metrics = evaluate(straight(5, 0.01), straight(5, 0.0))
+    assert math.isnan(metrics.length_error_ratio)
+    assert "no truth to compare" in format_metrics(metrics)
+
+
+def test_too_few_poses_names_both_ranges() -> None:
+    truth = straight(5, 0.1)
+    late = trajectory(truth.stamps_ns + 10**12, truth.T)
+    with pytest.raises(OmnidError, match=r"0 found: estimate spans 1000.000 to 1000.400 s, truth spans 0.000 to 0.400 s"):
+        evaluate(late, truth)
+    with pytest.raises(OmnidError, match="1 found"):
+        evaluate(trajectory(truth.stamps_ns[:1], truth.T[:1]), truth)
+    with pytest.raises(OmnidError, match="estimate holds no pose"):
+        evaluate(trajectory([], np.empty((0, 4, 4))), truth)
+
+
+@pytest.mark.parametrize("tolerance_s", [-0.1, math.nan, math.inf])
+def test_bad_tolerance(tolerance_s: float) -> None:
+    with pytest.raises(OmnidError, match="tolerance"):
+        evaluate(straight(5, 0.1), straight(5, 0.1), tolerance_s)
+
+
+def test_format_is_for_people() -> None:
+    text = format_metrics(evaluate(straight(11, 0.099, heading_rad=-0.02), straight(11, 0.1)))
+    for part in ("11 (100.0% of the truth)", "0.9900 m, truth 1.0000 m (-1.00 %)", "end 0.0100 m", "end -1.146 deg"):
+        assert part in text
+
+
+@pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo is not on PATH: pipx install evo==1.38.1")
+def test_same_numbers_as_evo(tmp_path: Path) -> None:
+    truth = spline()
+    files = [write(tmp_path / "truth.txt", truth), write(tmp_path / "estimate.txt", drifted(truth))]
+    metrics = evaluate(read_tum(files[1]), read_tum(files[0]))
+    assert metrics.pairs == 80 and metrics.ate_rmse_m > 0.05  # there is something to compare
+    ape = evo("evo_ape", *files, "--align_origin")
+    assert metrics.ate_rmse_m == pytest.approx(ape["rmse"], abs=1e-6)
+    assert metrics.ate_max_m == pytest.approx(ape["max"], abs=1e-6)
+    rpe = evo("evo_rpe", *files, "-d", "1", "-u", "f")
+    assert metrics.rpe_translation_rmse_m == pytest.approx(rpe["rmse"], abs=1e-6)
+    turned = evo("evo_rpe", *files, "-d", "1", "-u", "f", "-r", "angle_deg")
+    assert math.degrees(metrics.rpe_rotation_rmse_rad) == pytest.approx(turned["rmse"], abs=1e-6)
+
+
+def write(path: Path, poses: Trajectory) -> str:
+    rows = [tum_row(stamp_ns, T) for stamp_ns, T in zip(poses.stamps_ns, poses.T, strict=True)]
+    path.write_text("\n".join(rows) + "\n")
+    return str(path)
+
+
+def evo(program: str, truth: str, estimate: str, *options: str) -> dict[str, float]:
+    run = subprocess.run([program, "tum", truth, estimate, *options], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr
+    return {name: float(value) for name, value in re.findall(r"^\s*(rmse|max)\s+(\S+)$", run.stdout, re.MULTILINE)}
