@@ -1,0 +1,148 @@
+"""The bus against a subscriber in a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.errors import OmnidError
+from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+
+DEADLINE_S = 30.0
+
+SUBSCRIBER = """
+import json, sys, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    samples = session.declare_subscriber(sys.argv[2], zenoh.handlers.FifoChannel(1000))
+    print("ready", flush=True)
+    for _ in range(int(sys.argv[3])):
+        s = samples.recv()
+        print(s.key_expr, s.encoding, s.priority, s.congestion_control, s.express, flush=True)
+        print(bytes(s.payload).hex(), flush=True)
+"""
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def subscriber(endpoint: str, key: str, count: int) -> Iterator[subprocess.Popen[str]]:
+    arguments = [sys.executable, "-c", SUBSCRIBER, endpoint, key, str(count)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def odometry(i: int) -> bytes:
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1 * i]), [0.25 * i, -1.0, 0.0])
+    return codec.odometry_cdr(10**9 + i, T, np.eye(6) * i, np.arange(6.0), np.eye(6))
+
+
+def publish_until_done(bus: Bus, key: str, process: subprocess.Popen[str]) -> list[str]:
+    """The subscriber's lines; its subscription takes a moment to arrive here, so messages go on until it has enough."""
+    deadline = time.monotonic() + DEADLINE_S
+    for i in range(10_000):
+        bus.publish(key, odometry(i), realtime=True)
+        time.sleep(0.005)
+        if process.poll() is not None or time.monotonic() > deadline:
+            break
+    process.kill()
+    assert process.stdout is not None
+    return process.stdout.read().splitlines()
+
+
+def test_another_process_reads_the_same_odometry() -> None:
+    endpoint = free_endpoint()
+    bus = Bus(BusConfig(robot="site/robot-1", listen=(endpoint,)))
+    with contextlib.closing(bus), subscriber(endpoint, "site/robot-1/**", 5) as process:
+        lines = publish_until_done(bus, "odom", process)
+    assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP True"] * 5
+    records = [codec.odometry_from_cdr(bytes.fromhex(line)) for line in lines[1::2]]
+    for record in records:
+        expected = codec.odometry_from_cdr(odometry(record.stamp_ns - 10**9))
+        np.testing.assert_array_equal(record.T_odom_base, expected.T_odom_base)
+        np.testing.assert_array_equal(record.covariance, expected.covariance)
+
+
+def listening() -> set[str]:
+    """Sockets this process listens on or has bound, as `address:port` in the kernel's hex."""
+    inodes = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
+    rows = [line.split() for table in ("tcp", "tcp6", "udp", "udp6") for line in _table(table)]
+    return {row[1] for row in rows if f"socket:[{row[9]}]" in inodes and row[3] in ("0A", "07")}
+
+
+def _table(name: str) -> list[str]:
+    path = Path("/proc/self/net") / name
+    return path.read_text().splitlines()[1:] if path.exists() else []
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux's /proc")
+def test_nothing_but_the_given_endpoint_is_open() -> None:
+    before, endpoint = listening(), free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))):
+        assert listening() - before == {f"0100007F:{int(endpoint.rsplit(':')[-1]):04X}"}
+    with contextlib.closing(Bus(BusConfig(listen=()))):
+        assert listening() - before == set()
+
+
+def test_default_is_this_machine_only() -> None:
+    assert BusConfig() == BusConfig("omnid", ("tcp/127.0.0.1:7447",), ())
+
+
+def test_missing_router_does_not_matter() -> None:
+    with contextlib.closing(Bus(BusConfig(listen=(free_endpoint(),), connect=(free_endpoint(),)))) as bus:
+        bus.publish("odom", odometry(1), realtime=True)
+
+
+def test_second_instance_is_told_which_knob() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), pytest.raises(OmnidError) as caught:
+        Bus(BusConfig(listen=(endpoint,)))
+    text = str(caught.value)
+    assert endpoint in text and "bus.listen" in text and "in use" in text
+    assert "\n" not in text and ".rs:" not in text
+
+
+@pytest.mark.parametrize("robot", ["", "/omnid", "omnid/", "a//b", "*", "a/**", "a$b", "a#b", "a?b", "@a", "a b"])
+def test_robot_name_must_be_plain(robot: str) -> None:
+    with pytest.raises(OmnidError, match=r"bus\.robot"):
+        Bus(BusConfig(robot=robot, listen=()))
+
+
+@pytest.mark.parametrize("endpoint", ["", "nonsense", "127.0.0.1:7447", "tcp/127.0.0.1", "foo/127.0.0.1:1"])
+def test_endpoints_must_be_endpoints(endpoint: str) -> None:
+    with pytest.raises(OmnidError, match=r"bus\.listen"):
+        Bus(BusConfig(listen=(endpoint,)))
+    with pytest.raises(OmnidError, match=r"bus\.connect"):
+        Bus(BusConfig(listen=(), connect=(endpoint,)))
+
+
+def test_keys_must_be_plain_and_the_bus_open() -> None:
+    bus = Bus(BusConfig(listen=()))
+    with pytest.raises(OmnidError, match="key"):
+        bus.publish("a/*", b"")
+    bus.close()
+    bus.close()
+    with pytest.raises(OmnidError, match="cannot publish"):
+        bus.publish("odom", b"")
