@@ -1,0 +1,1 @@
+"""Tests of omnid, its drivers and its geometry."""

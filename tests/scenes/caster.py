@@ -1,0 +1,194 @@
+"""Renders what a mirror camera sees of a scene, by casting the rays its model lifts from the pixels.
+
+Exact by construction: no mirror is modelled, the camera's own lift() is the mirror. Rays are cast in square tiles, and
+a rectangle meets only the tiles whose cone of directions overlaps its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.camera import Array
+from calib.rig import MountedCamera
+from tests.scenes.surfaces import Rectangle, Scene
+
+Floats = NDArray[np.float32]
+TILE_PX = 32
+REMAP_COLUMNS = 1024  # cv2.remap takes pictures, not lists: samples are folded into rows of this length
+RAY_CHUNK = 1 << 18
+MAX_TABLES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class RayTable:
+    """The rays of one camera's visible samples, sorted by tile; N samples, M tiles."""
+
+    shape: tuple[int, int]  # (height, width) of the picture without supersampling
+    supersample: int
+    rays: Floats  # (3, N) unit, camera frame
+    spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
+    index: NDArray[np.int64]  # (N,) into the flattened supersampled picture
+    starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
+    axes: Array  # (M, 3) unit
+    angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
+
+
+def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
+    """The rays of all samples (supersample^2 per pixel) inside the camera's mask."""
+    width, height = mounted.camera.size
+    rays, spacing = _lift_grid(mounted, supersample)
+    ss_height, ss_width = height * supersample, width * supersample
+    rows, columns = np.divmod(np.arange(ss_height * ss_width), ss_width)
+    tile = rows // TILE_PX * (-(-ss_width // TILE_PX)) + columns // TILE_PX
+    index = np.flatnonzero(np.isfinite(rays[:, 0]) & np.isfinite(spacing))
+    index = index[np.argsort(tile[index], kind="stable")]
+    _, starts = np.unique(tile[index], return_index=True)
+    starts = np.append(starts, len(index))
+    axes, angles = _cones(rays[index], starts)
+    return RayTable((height, width), supersample, np.ascontiguousarray(rays[index].T), spacing[index], index,
+                    starts, axes, angles)
+
+
+def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
+    """Rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
+    width, height = mounted.camera.size
+    u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
+    v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
+    pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
+    rays = np.concatenate([mounted.camera.lift(p) for p in np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))])
+    grid = rays.reshape(len(v), len(u), 3)
+    solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
+    rays[~mounted.visible.contains(pixels)] = np.nan
+    return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
+
+
+def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Axis (M, 3) and half angle (M,) of the cone around each tile's rays."""
+    axes = np.add.reduceat(rays.astype(float), starts[:-1])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    cosines = np.einsum("ij,ij->i", rays, np.repeat(axes, np.diff(starts), axis=0))
+    return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + 1e-3
+
+
+_tables: dict[tuple[int, int], tuple[MountedCamera, RayTable]] = {}
+
+
+def _remembered_table(mounted: MountedCamera, supersample: int) -> RayTable:
+    """The camera's table, built once; the camera is kept with it so that its id cannot be given away."""
+    key = (id(mounted), supersample)
+    if key not in _tables:
+        if len(_tables) >= MAX_TABLES:
+            del _tables[next(iter(_tables))]
+        _tables[key] = (mounted, ray_table(mounted, supersample))
+    return _tables[key][1]
+
+
+def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
+    """The picture (H, W) uint8 of the camera on a rig that stands at T_world_rig; 0 outside the mask."""
+    return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
+
+
+def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
+    """The picture (H, W) float32 before any sensor, 0 to 255; 0 outside the mask and where no rectangle is hit."""
+    table = _remembered_table(mounted, supersample)
+    T_world_cam = T_world_rig @ se3.inverse(mounted.T_cam_rig)
+    hits = _Hits.nothing(table.rays.shape[1])
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for number, rectangle in enumerate(scene.rectangles):
+            _cast(table, rectangle, T_world_cam, (hits, number))
+    height, width = table.shape
+    canvas = np.zeros(height * width * supersample**2, np.float32)
+    canvas[table.index] = _shade(table, scene, hits, T_world_cam)
+    canvas = canvas.reshape(height * supersample, width * supersample)
+    return np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _Hits:
+    """The nearest hit of every ray so far: distance [m], fractions u and v, rectangle number (-1 = none)."""
+
+    distance: Floats
+    u: Floats
+    v: Floats
+    number: NDArray[np.int16]
+
+    @staticmethod
+    def nothing(count: int) -> _Hits:
+        empty = (np.empty(count, np.float32) for _ in range(2))
+        return _Hits(np.full(count, np.inf, np.float32), *empty, np.full(count, -1, np.int16))
+
+
+def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tuple[_Hits, int]) -> None:
+    """Meets the rays of all tiles that may see the rectangle, and keeps the hits nearer than those before."""
+    hits, number = target
+    axes = np.column_stack([rectangle.edge_u, rectangle.edge_v, rectangle.normal])
+    # In the rectangle's own coordinates (u, v, height) the camera stands at q and a ray runs along M @ ray.
+    q = np.linalg.solve(axes, T_world_cam[:3, 3] - rectangle.origin).astype(np.float32)
+    M = np.linalg.solve(axes, T_world_cam[:3, :3]).astype(np.float32)
+    for start, stop in _runs(table, _tiles_that_see(table, rectangle, T_world_cam)):
+        du, dv, dn = M @ table.rays[:, start:stop]
+        s = -q[2] / dn
+        u, v = q[0] + s * du, q[1] + s * dv
+        nearer = (s > 0) & (s < hits.distance[start:stop]) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        for kept, new in ((hits.distance, s), (hits.u, u), (hits.v, v)):
+            np.copyto(kept[start:stop], new, where=nearer)
+        hits.number[start:stop][nearer] = number
+
+
+def _tiles_that_see(table: RayTable, rectangle: Rectangle, T_world_cam: Array) -> NDArray[np.bool_]:
+    """Which tiles (M,) have a cone that overlaps the cone through the rectangle's corners."""
+    corners = se3.apply(se3.inverse(T_world_cam), rectangle.corners)
+    rays = corners / np.maximum(np.linalg.norm(corners, axis=1, keepdims=True), 1e-9)
+    axis = rays.sum(axis=0) / max(float(np.linalg.norm(rays.sum(axis=0))), 1e-9)
+    angle = np.arccos(np.clip(rays @ axis, -1, 1)).max()
+    if angle > 1.5:  # a cone bounds what lies between its corners only if it is narrower than a half space
+        return np.ones(len(table.angles), bool)
+    return np.asarray(np.arccos(np.clip(table.axes @ axis, -1, 1)) <= angle + table.angles)
+
+
+def _runs(table: RayTable, chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Sample ranges [start, stop) of runs of neighbouring chosen tiles."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
+    return [(int(table.starts[a]), int(table.starts[b])) for a, b in edges.reshape(-1, 2)]
+
+
+def _shade(table: RayTable, scene: Scene, hits: _Hits, T_world_cam: Array) -> Floats:
+    """Grey (N,) of every ray's nearest rectangle."""
+    grey = np.zeros(len(hits.distance), np.float32)
+    for number, rectangle in enumerate(scene.rectangles):
+        mine = np.flatnonzero(hits.number == number)
+        if len(mine):
+            normal = (T_world_cam[:3, :3].T @ rectangle.normal).astype(np.float32)
+            slant = np.maximum(np.abs(normal @ table.rays[:, mine]), 0.02)
+            footprint_m2 = (hits.distance[mine] * table.spacing[mine]) ** 2 / slant
+            grey[mine] = rectangle.brightness * _sample(rectangle, (hits.u[mine], hits.v[mine]), footprint_m2)
+    return grey
+
+
+def _sample(rectangle: Rectangle, uv: tuple[Floats, Floats], footprint_m2: Floats) -> Floats:
+    """Texture grey (N,) at fractions uv, from the level whose pixels are about as large as a sample's footprint."""
+    height, width = rectangle.texture.shape
+    pixels = footprint_m2 * np.float32(height * width / (rectangle.height_m * rectangle.width_m))
+    level = np.clip(np.rint(0.5 * np.log2(pixels)), 0, len(rectangle.pyramid) - 1).astype(np.int8)
+    grey = np.empty(len(level), np.float32)
+    for number in range(level.min(), level.max() + 1):
+        mine = np.flatnonzero(level == number)
+        if len(mine):
+            grey[mine] = _bilinear(rectangle.pyramid[number], uv[0][mine], uv[1][mine])
+    return grey
+
+
+def _bilinear(texture: Floats, u: Floats, v: Floats) -> Floats:
+    """Texture (H, W) at fractions u, v (N,) of its outline, bilinear, the border repeated."""
+    height, width = texture.shape
+    rows = -(-len(u) // REMAP_COLUMNS)
+    maps = np.zeros((2, rows * REMAP_COLUMNS), np.float32)
+    maps[0, :len(u)], maps[1, :len(u)] = u * width - 0.5, v * height - 0.5
+    map_u, map_v = maps.reshape(2, rows, REMAP_COLUMNS)
+    picture = cv2.remap(texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(picture.ravel()[:len(u)], np.float32)

@@ -1,0 +1,118 @@
+"""Writes a rendered run as a log with exact truth: log.mcap, camchain.yaml, rig.toml, truth.txt."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from calib import se3
+from calib.camera import Array, OmniCamera
+from calib.rig import MountedCamera, Rig
+from calib.unified import UnifiedCamera
+from tests.scenes.caster import render_grey
+from tests.scenes.sensor import Exposure, Sensor
+from tests.scenes.surfaces import Scene
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+ARRIVAL_NS = 3_000_000  # a picture reaches the recorder this long after its stamp
+SKEW_NS = 2_000_000  # the two cameras' stamps differ by at most this
+SCHEMA = "sensor_msgs/msg/CompressedImage"
+Pictures = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
+
+
+def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
+              supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
+    """Renders both cameras at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder.
+
+    Both pictures of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps = START_NS + PERIOD_NS * np.arange(len(poses))
+    (folder / "truth.txt").write_text(tum(stamps, poses))
+    (folder / "camchain.yaml").write_text(camchain(rig))
+    _write_rig_toml(folder / "rig.toml", rig)
+    rng = np.random.default_rng([seed, 6])
+    skews = rng.integers(-SKEW_NS, SKEW_NS + 1, len(poses))
+    exposures = [Exposure.of(sensor or Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+
+    def pictures() -> Pictures:
+        for i, T_world_rig in enumerate(poses):
+            both = [e.jpeg(e.expose(render_grey(scene, m, T_world_rig, supersample), rng))
+                    for m, e in zip((rig.lower, rig.upper), exposures, strict=True)]
+            yield i, both[0], both[1]
+            if progress:
+                progress(i + 1, len(poses))
+
+    _write_mcap(folder / "log.mcap", rig, (stamps, stamps + skews), pictures())
+
+
+def _write_mcap(path: Path, rig: Rig, stamps: tuple[Array, Array], pictures: Pictures) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    Image, Header = store.types[SCHEMA], store.types["std_msgs/msg/Header"]
+    Time = store.types["builtin_interfaces/msg/Time"]
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="")
+        definition, _ = store.generate_msgdef(SCHEMA, ros_version=2)
+        schema = writer.register_schema(SCHEMA, "ros2msg", definition.encode())
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in rig.topics]
+        for i, *jpegs in pictures:
+            pair = [(int(stamps[k][i]), k) for k in (0, 1)]
+            for stamp, k in sorted(pair):
+                header = Header(Time(*divmod(stamp, 10**9)), ("lower", "upper")[k])
+                message = Image(header, "jpeg", np.frombuffer(jpegs[k], np.uint8))
+                data = bytes(store.serialize_cdr(message, SCHEMA))
+                writer.add_message(channels[k], stamp + ARRIVAL_NS, data, stamp, 2 * i + k)
+        writer.finish()
+
+
+def tum(stamps_ns: Array, poses: Array) -> str:
+    """The trajectory as TUM text: t x y z qx qy qz qw."""
+    rows = []
+    for stamp, T in zip(stamps_ns, poses, strict=True):
+        values = " ".join(f"{x:.9f}" for x in (*T[:3, 3], *se3.quaternion(T[:3, :3])))
+        rows.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {values}\n")
+    return "".join(rows)
+
+
+def camchain(rig: Rig) -> str:
+    """The rig as Kalibr's camchain.yaml; T_cam_imu is T_cam_rig."""
+    lower, upper = _kalibr("cam0", rig.lower, rig.topics[0]), _kalibr("cam1", rig.upper, rig.topics[1])
+    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    return "".join([*lower, *upper, *_matrix("T_cn_cnm1", T_upper_lower)])
+
+
+def _kalibr(name: str, mounted: MountedCamera, topic: str) -> list[str]:
+    camera = _unified(mounted.camera)
+    numbers = (camera.xi, *camera.focal, *camera.center)
+    bent = any(camera.distortion)
+    return [f"{name}:\n  camera_model: omni\n  intrinsics: [{', '.join(map(_number, numbers))}]\n",
+            f"  distortion_model: {'radtan' if bent else 'none'}\n",
+            f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if bent else ''}]\n",
+            f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n  rostopic: {topic}\n",
+            *_matrix("T_cam_imu", mounted.T_cam_rig)]
+
+
+def _matrix(name: str, T: Array) -> list[str]:
+    return [f"  {name}:\n", *(f"  - [{', '.join(map(_number, row))}]\n" for row in T)]
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _unified(camera: OmniCamera) -> UnifiedCamera:
+    assert isinstance(camera, UnifiedCamera), "Kalibr's file holds unified cameras only"
+    return camera
+
+
+def _write_rig_toml(path: Path, rig: Rig) -> None:
+    """rig.toml by the product's own writer, where it has one."""
+    if importlib.util.find_spec("calib.rig_file"):
+        importlib.import_module("calib.rig_file").write_rig(path, rig)

@@ -1,0 +1,97 @@
+"""Whole runs by name: a rig, a path, a world and a sensor from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.camera import Array
+from calib.rig import Rig
+from tests.scenes import paths
+from tests.scenes.builders import corridor, room
+from tests.scenes.rigs import make_rig
+from tests.scenes.sensor import Sensor
+from tests.scenes.surfaces import Scene
+
+TURN_DEG = 94.0
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """All that write_log needs."""
+
+    rig: Rig
+    poses: Array  # T_world_rig (N, 4, 4)
+    scene: Scene
+    sensor: Sensor = field(default_factory=Sensor)
+
+
+Recipe = Callable[[int, int, int], Run]  # (seed, picture size, pairs)
+
+
+def mild_rig(seed: int, size: int, **how: float) -> Rig:
+    """A rig with a mirror scale, a baseline and a little crookedness of its own per seed."""
+    rng = np.random.default_rng([seed, 7])
+    scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
+    turned, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
+    x, y = rng.uniform(-4, 4, 2)
+    return make_rig(size=size, scale=float(scale), baseline_m=float(baseline), offset_mm=(x, y),
+                    crooked_deg=(turned[0], turned[1], turned[2]), lower_crooked_deg=(lower[0], lower[1], 0.0), **how)
+
+
+def two_walls(seed: int, size: int, pairs: int) -> Run:
+    """The paper's second experiment: 5 cm steps between two walls, a turn of 94 degrees just before the end."""
+    poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
+    return Run(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+
+
+def crooked(seed: int, size: int, pairs: int) -> Run:
+    """15 cm steps with viewpoints and cameras turned about every axis; the rig frame is neither camera's."""
+    rig = make_rig(size=size, scale=0.95, baseline_m=0.16, crooked_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
+                   lower_crooked_deg=(-0.7, 0.6, 25.0), lower_offset_mm=(30.0, -20.0), centre_px=(1.7, -2.4))
+    poses = paths.spline_path(seed, pairs, 0.15)
+    return Run(rig, poses, corridor(seed, max(8.0, 0.15 * pairs + 3.2)))
+
+
+def turns(seed: int, size: int, pairs: int) -> Run:
+    """Turns of 9 to 30 degrees between pairs, either way, with a few centimetres of motion."""
+    rng = np.random.default_rng([seed, 8])
+    angles = np.linspace(9, 30, max(1, pairs - 1)) * rng.choice([-1, 1], max(1, pairs - 1))
+    return Run(mild_rig(seed, size), paths.turns([float(a) for a in angles[:pairs - 1]]), corridor(seed))
+
+
+def struts(seed: int, size: int, pairs: int) -> Run:
+    """two_walls through a mirror on three struts with a hub, an uneven picture and changing light."""
+    run = two_walls(seed, size, pairs)
+    sensor = Sensor(strut_angles_deg=(35.0, 155.0, 275.0), hub=0.07, vignette=0.3, flicker=0.03)
+    return Run(run.rig, run.poses, run.scene, sensor)
+
+
+def still(seed: int, size: int, pairs: int) -> Run:
+    """The rig stands; only the noise is new."""
+    return Run(mild_rig(seed, size), paths.still(pairs), corridor(seed))
+
+
+def fast(seed: int, size: int, pairs: int) -> Run:
+    """30 cm between pairs (3 m/s), with a little vibration."""
+    poses = paths.vibrate(paths.spline_path(seed, pairs, 0.3), seed)
+    return Run(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.3 * pairs + 3.2)))
+
+
+def rooms(seed: int, size: int, pairs: int) -> Run:
+    """A closed round through a room with boxes at changing speed, with a little vibration."""
+    return Run(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
+
+
+RECIPES: dict[str, tuple[Recipe, int]] = {  # and how many pairs it has unless told otherwise
+    "two_walls": (two_walls, 99), "crooked": (crooked, 33), "turns": (turns, 11), "struts": (struts, 99),
+    "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
+}
+
+
+def build(name: str, seed: int, size: int = 768, pairs: int | None = None) -> Run:
+    """The run of that name; pairs None takes the recipe's own length."""
+    recipe, usual = RECIPES[name]
+    return recipe(seed, size, pairs or usual)

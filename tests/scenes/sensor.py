@@ -1,0 +1,78 @@
+"""What a real camera adds to an ideal picture: blur, struts, hub, vignette, changing light, noise, JPEG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Mask
+
+Floats = NDArray[np.float32]
+FITTING_GREY = 18.0  # struts and hub
+EDGE_STEPS = 4  # samples per pixel and axis of a strut's edge
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """All faults of a camera; lengths are fractions of the picture's width, angles in the picture."""
+
+    noise_sigma: float = 1.5
+    blur_px: float = 0.5
+    black_level: float = 5.0
+    jpeg_quality: int = 90
+    vignette: float = 0.0  # how much darker the rim is, 0 to 1
+    flicker: float = 0.0  # standard deviation of the brightness from frame to frame
+    strut_angles_deg: tuple[float, ...] = ()
+    strut_width: float = 0.014
+    hub: float = 0.0  # radius
+
+
+def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
+    """How much of each pixel (H, W) struts and hub hide, 0 to 1; they turn with the camera."""
+    width, height = size
+    fine = (np.arange(width * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[0]
+    x, y = np.meshgrid(fine, (np.arange(height * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[1])
+    hidden = np.hypot(x, y) <= sensor.hub * width
+    for angle in np.deg2rad(sensor.strut_angles_deg):
+        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        hidden |= (along > 0) & (np.abs(across) <= sensor.strut_width * width / 2)
+    return cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+
+def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
+    """Brightness factor (H, W): 1 in the middle, 1 - vignette at the rim, falling with the square of the radius."""
+    x, y = np.meshgrid(np.arange(size[0]) - mask.center[0], np.arange(size[1]) - mask.center[1])
+    rim_px = min(mask.outer_px, size[0] / 2)
+    return (1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1)).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One camera's sensor with its fixed patterns computed once."""
+
+    sensor: Sensor
+    hidden: Floats
+    falloff: Floats
+
+    @staticmethod
+    def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Exposure:
+        """The exposure of a camera with that mask and picture size (width, height)."""
+        return Exposure(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
+
+    def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """The picture (H, W) uint8 the sensor gives of an ideal one."""
+        s = self.sensor
+        gain = max(0.0, 1 + s.flicker * float(rng.standard_normal()))
+        grey = (ideal * self.falloff * np.float32(gain)) * (1 - self.hidden) + FITTING_GREY * self.hidden
+        if s.blur_px > 0:
+            grey = cv2.GaussianBlur(grey, (0, 0), s.blur_px)
+        noise = s.noise_sigma * rng.standard_normal(grey.shape, dtype=np.float32)
+        return np.clip(np.rint(grey * (1 - s.black_level / 255) + s.black_level + noise), 0, 255).astype(np.uint8)
+
+    def jpeg(self, picture: NDArray[np.uint8]) -> bytes:
+        """The picture as grey JPEG."""
+        _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, self.sensor.jpeg_quality])
+        return data.tobytes()

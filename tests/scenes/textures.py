@@ -1,0 +1,117 @@
+"""Seeded textures: repetitive, natural, printed and nearly empty ones; all (H, W) uint8."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Array
+from tests.scenes.surfaces import Texture
+
+Random = np.random.Generator
+Size = tuple[int, int]  # (width, height) [px]
+Painter = Callable[[Random, Size, float], Texture]  # the last argument: pixels per metre
+
+
+def _grey(values: Array | NDArray[np.float32]) -> Texture:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float = 0.6) -> NDArray[np.float32]:
+    """Noise (H, W) float32 of mean 0 and standard deviation 1 with all scales from coarsest_px to 2 pixels."""
+    width, height = size
+    total, weight = np.zeros((height, width), np.float32), 1.0
+    while coarsest_px >= 2:
+        cells = (int(width / coarsest_px) + 2, int(height / coarsest_px) + 2)
+        grid = rng.standard_normal(cells[::-1]).astype(np.float32)
+        total += weight * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
+        coarsest_px, weight = coarsest_px / 2, weight * persistence
+    return (total - total.mean()) / max(float(total.std()), 1e-6)
+
+
+def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Running bond of bricks that look exactly alike: one pair of courses, repeated."""
+    length, course = round(px_per_m * rng.uniform(0.22, 0.32)), round(px_per_m * rng.uniform(0.075, 0.11))
+    joint = max(1, round(px_per_m * rng.uniform(0.008, 0.014)))
+    face, mortar = rng.uniform(60, 110), rng.uniform(140, 190)
+    one = face + 4 * value_noise(rng, (length, course), course / 2)
+    one[:joint], one[:, :joint] = mortar, mortar
+    courses = np.vstack([one, np.roll(one, length // 2, axis=1)])
+    times = (-(-size[1] // courses.shape[0]), -(-size[0] // length))
+    return _grey(np.tile(courses, times)[:size[1], :size[0]])
+
+
+def plaster(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Soft cloudy wall with fine grain."""
+    return _grey(rng.uniform(115, 165) + 11 * value_noise(rng, size, px_per_m * 0.5, 0.7))
+
+
+def granite(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Strong contrast at every scale."""
+    return _grey(rng.uniform(100, 140) + 42 * value_noise(rng, size, px_per_m * 0.4, 0.75))
+
+
+def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Square tiles with joints, each of its own grey, grained."""
+    side, joint = max(4, round(px_per_m * rng.uniform(0.25, 0.45))), max(1, round(px_per_m * 0.006))
+    rows, columns = np.arange(size[1]) // side, np.arange(size[0]) // side
+    level = rng.uniform(120, 160) + 7 * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))
+    picture = level[np.ix_(rows, columns)] + 7 * value_noise(rng, size, px_per_m * 0.3, 0.75)
+    picture[np.arange(size[1]) % side < joint] = 85
+    picture[:, np.arange(size[0]) % side < joint] = 85
+    return _grey(picture)
+
+
+def plain(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Nearly textureless paint: a few grey levels of very coarse clouds."""
+    return _grey(rng.uniform(130, 180) + 1.2 * value_noise(rng, size, px_per_m * 1.0, 0.35))
+
+
+PAINTERS: dict[str, Painter] = {"brick": brick, "plaster": plaster, "granite": granite, "tiles": tiles, "plain": plain}
+
+
+def poster(rng: Random, size: Size) -> Texture:
+    """A printed page, a drawing or a photograph, by chance."""
+    kinds = (_page, _drawing, _blobs, _photograph)
+    return kinds[rng.integers(len(kinds))](rng, size)
+
+
+def _page(rng: Random, size: Size) -> Texture:
+    """Lines of writing on white paper; real letters, so that a mirrored picture shows."""
+    page = np.full(size[::-1], rng.uniform(215, 245), np.uint8)
+    height = max(10, size[1] // int(rng.integers(8, 16)))
+    for bottom in range(2 * height, size[1] - height, height):
+        text = "".join(chr(c) for c in rng.integers(65, 91, 200))
+        cv2.putText(page, text, (height, bottom), cv2.FONT_HERSHEY_SIMPLEX, height / 34, 25, max(1, height // 12))
+    page[:, size[0] - height:] = page[0, 0]
+    return page
+
+
+def _drawing(rng: Random, size: Size) -> Texture:
+    """Lines and filled shapes of any grey."""
+    sheet = np.full(size[::-1], rng.uniform(60, 220), np.uint8)
+    for _ in range(int(rng.integers(12, 30))):
+        a, b = (tuple(int(x) for x in rng.uniform(0, size)) for _ in range(2))
+        cv2.line(sheet, a, b, float(rng.uniform(10, 245)), int(rng.integers(1, max(3, size[0] // 25))), cv2.LINE_AA)
+        cv2.circle(sheet, a, int(rng.uniform(0.02, 0.1) * size[0]), float(rng.uniform(10, 245)), -1, cv2.LINE_AA)
+    return sheet
+
+
+def _blobs(rng: Random, size: Size) -> Texture:
+    """Two tones with wavy outlines."""
+    dark, light = rng.uniform(15, 80), rng.uniform(150, 240)
+    return _grey(np.where(value_noise(rng, size, size[0] / 4, 0.5) > 0, light, dark))
+
+
+def _photograph(rng: Random, size: Size) -> Texture:
+    """Noise of strong contrast with a few round things in front."""
+    picture = _grey(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
+    for _ in range(int(rng.integers(2, 6))):
+        centre = tuple(int(x) for x in rng.uniform(0, size))
+        axes = (int(rng.uniform(0.05, 0.2) * size[0]), int(rng.uniform(0.05, 0.2) * size[1]))
+        cv2.ellipse(picture, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(10, 245)), -1,
+                    cv2.LINE_AA)
+    return picture
