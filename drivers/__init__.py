@@ -1,1 +1,1 @@
-"""Hardware and logs: cameras, motors and recordings; drivers block and own no threads."""
+"""Hardware and logs: cameras, MCAP files, motors. Imports neither ``calib`` nor ``omnid``."""

@@ -1,5 +1,9 @@
-"""What goes wrong with a device or a log."""
+"""What a driver raises: one line that says what was asked, what was found and what to do about it."""
 
 
 class DriverError(Exception):
-    """A device or log that cannot be used; one line: asked, found, what to do."""
+    """A device or a log cannot be used as it was asked for."""
+
+
+class BrokenFrame(DriverError):  # noqa: N818 - it is told of a frame, not of the program
+    """One picture cannot be decoded; the stream that brought it goes on."""

@@ -1,0 +1,120 @@
+"""What the end and the start of an MCAP log tell without its messages: topics, message counts, attachments."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Statistics
+
+from drivers.mcap_catalog import Catalog
+from drivers.mcap_records import (
+    HEAD,
+    MAGIC,
+    PARSE_ERRORS,
+    Buffer,
+    LogFile,
+    Record,
+    RecordError,
+    content,
+    parsing,
+    records,
+)
+
+MAX_ATTACHMENT_BYTES = 16 * 2**20
+MAX_ATTACHMENTS = 32
+_MAX_SUMMARY_BYTES = 64 * 2**20
+_MAX_NAME = 256
+
+_FOOTER = struct.Struct("<QQI")  # summary start, summary offset start, CRC of the summary and of the footer before it
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The end of a whole log: what is in it and where."""
+
+    catalog: Catalog
+    message_counts: Mapping[int, int]  # by channel
+    attachments: tuple[int, ...] = field(repr=False)  # where their records start
+
+
+def read_summary(file: LogFile) -> Summary | None:
+    """The log's summary, None where the file is cut, was written without one, or the summary's CRC is wrong."""
+    section = _summary_section(file)
+    if section is None:
+        return None
+    catalog, counts = Catalog(), Counter[int]()
+    attachments: list[int] = []
+    try:
+        for record in records(section, 0, section.size):
+            body = content(section, record)
+            if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                catalog.add(record.opcode, body)
+            elif record.opcode == Opcode.STATISTICS:
+                counts.update(Statistics.read(parsing(body)).channel_message_counts)
+            elif record.opcode == Opcode.ATTACHMENT_INDEX and len(attachments) < MAX_ATTACHMENTS:
+                attachments.append(AttachmentIndex.read(parsing(body)).offset)
+    except (RecordError, *PARSE_ERRORS):
+        return None
+    return Summary(catalog, counts, tuple(attachments))
+
+
+def has_footer(file: LogFile) -> bool:
+    """Whether the file ends the way a whole log does."""
+    return _footer(file) is not None
+
+
+def _footer(file: LogFile) -> bytes | None:
+    size = HEAD.size + _FOOTER.size
+    end = file.read(max(0, file.size - size - len(MAGIC)), size + len(MAGIC))
+    whole = len(end) == size + len(MAGIC) and end.endswith(MAGIC) and HEAD.unpack_from(end) == (2, _FOOTER.size)
+    return end[:size] if whole else None
+
+
+def _summary_section(file: LogFile) -> Buffer | None:
+    footer = _footer(file)
+    if footer is None:
+        return None
+    start, _, crc = _FOOTER.unpack_from(footer, HEAD.size)
+    size = file.size - len(MAGIC) - len(footer) - start
+    if not start or not 0 < size <= _MAX_SUMMARY_BYTES:
+        return None
+    section = file.read(start, size)
+    if len(section) < size or (crc and zlib.crc32(section + footer[:-4]) != crc):
+        return None
+    return Buffer(section)
+
+
+def read_attachments(file: LogFile, summary: Summary | None) -> dict[str, bytes]:
+    """Name -> bytes of the attachments that are whole and within the limits; without a summary, those at the start."""
+    found: dict[str, bytes] = {}
+    places = records(file, len(MAGIC), file.size) if summary is None else _records_at(file, summary.attachments)
+    for record in places:
+        if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END) or len(found) >= MAX_ATTACHMENTS:
+            break
+        if record.opcode == Opcode.ATTACHMENT and record.size <= MAX_ATTACHMENT_BYTES + 1024:
+            found.update(_attachment(file, record))
+    return found
+
+
+def _records_at(file: LogFile, offsets: tuple[int, ...]) -> Iterator[Record]:
+    for offset in offsets:
+        record = next(records(file, offset, file.size), None)
+        if record is not None and record.opcode == Opcode.ATTACHMENT:
+            yield record
+
+
+def _attachment(file: LogFile, record: Record) -> dict[str, bytes]:
+    try:
+        body = content(file, record)
+        attachment = Attachment.read(parsing(body))
+    except (RecordError, *PARSE_ERRORS):
+        return {}
+    crc = int.from_bytes(body[-4:], "little")
+    if (crc and zlib.crc32(body[:-4]) != crc) or len(attachment.data) > MAX_ATTACHMENT_BYTES:
+        return {}
+    return {attachment.name[:_MAX_NAME]: attachment.data}

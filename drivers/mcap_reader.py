@@ -1,0 +1,126 @@
+"""The frames of two cameras out of an MCAP log as `ros2 bag record -s mcap` writes it, however damaged."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+from drivers.errors import BrokenFrame, DriverError
+from drivers.frame import Camera, Frame
+from drivers.mcap_catalog import Catalog
+from drivers.mcap_index import has_footer, read_attachments, read_summary
+from drivers.mcap_messages import DataSection, Message, scan
+from drivers.mcap_records import LogFile, RecordError
+from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, RosImage, parse_image
+from drivers.stamp_order import StampOrder
+from drivers.topic_choice import choose_topics
+
+_SCAN_BYTES = 64 * 2**20
+_SCAN_MESSAGES = 2000
+_WARNINGS = {
+    "late": "dropped {} frames older than others given before: record with less delay or widen the window",
+    "duplicate": "dropped {} frames whose camera had given one with the same stamp",
+    "broken": "skipped {} messages of the cameras' topics that hold no picture",
+    "unstamped": "{} frames have no stamp in their header: used the time of logging",
+    "broken_records": "skipped {} corrupt chunks or records of the file",
+}
+_COUNTERS = ("lower", "upper", *_WARNINGS)
+
+
+class LogReader:
+    """A FrameSource that streams a log once per call of frames(); it never needs the log's index.
+
+    path: the .mcap file, or the folder that `ros2 bag record` made. lower, upper: topics,
+    where their names do not tell. window: how many frames may wait for one that was written late.
+    Raises DriverError where the path is no such log or the topics of the two cameras are not clear.
+
+    During and after frames(): counts holds 'lower' and 'upper' (frames given), 'late', 'duplicate', 'unstamped' (used
+    the log's time), 'broken' (picture messages that were none) and 'broken_records' (chunks or records of the file);
+    after its end `truncated` tells whether the file was cut, and `warnings` says in one line each what was amiss.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32
+    ) -> None:
+        self._window = window
+        self._file = LogFile(path)
+        self._forget()
+        try:
+            self._summary = read_summary(self._file)
+            self._catalog = self._known_channels()
+            wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
+            self._cameras = choose_topics(repr(str(self._file.path)), self._catalog.topics(), wanted)
+        except DriverError:
+            self.close()
+            raise
+
+    @property
+    def topics(self) -> dict[Camera, str]:
+        """The topic of each camera."""
+        return {camera: topic for topic, camera in self._cameras.items()}
+
+    def frames(self) -> Iterator[Frame]:
+        """Gives the frames of both cameras in the order of their stamps, each camera's seq from 0; data is bytes."""
+        self._forget()
+        section = DataSection(self._file, self._catalog)
+        order = StampOrder(self._window, self.counts)
+        for message in section.messages():
+            taken = self._image(message)
+            if taken is not None:
+                yield from order.push(*taken)
+            if self._file.closed:
+                return
+        yield from order.drain()
+        self._report(section)
+
+    def close(self) -> None:
+        """Ends frames() and closes the file."""
+        self._file.close()
+
+    def pair_estimate(self) -> int | None:
+        """How many pairs the log can give at most, for a progress bar; None where the file does not say."""
+        if self._summary is None or not self._summary.message_counts:
+            return None
+        catalog, counts = self._summary.catalog, self._summary.message_counts
+        return min(sum(counts.get(channel, 0) for channel in catalog.ids(topic)) for topic in self._cameras)
+
+    def attachments(self) -> dict[str, bytes]:
+        """Name -> bytes of the files within the log, such as a rig; at most 32 of up to 16 MiB each."""
+        return read_attachments(self._file, self._summary)
+
+    def _forget(self) -> None:
+        self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
+        self.warnings: list[str] = []
+        self.truncated = False
+
+    def _known_channels(self) -> Catalog:
+        """From the summary; a cut log has none, so there the start of the file is looked through."""
+        if self._summary is not None and self._summary.catalog.topics():
+            return self._summary.catalog
+        return scan(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
+
+    def _image(self, message: Message) -> tuple[Camera, RosImage] | None:
+        """The message's picture, copied out of its chunk so that a waiting frame holds no more than itself."""
+        topic = self._catalog.topic(message.channel_id)
+        if topic is None or topic.name not in self._cameras or topic.type not in (IMAGE, COMPRESSED_IMAGE):
+            return None
+        try:
+            image = parse_image(topic.type, message.data())
+        except (BrokenFrame, RecordError):
+            self.counts["broken"] += 1
+            return None
+        self.counts["unstamped"] += not image.stamp_ns
+        stamp_ns = image.stamp_ns or message.log_time_ns
+        return self._cameras[topic.name], replace(image, stamp_ns=stamp_ns, data=memoryview(bytes(image.data)))
+
+    def _report(self, section: DataSection) -> None:
+        self.counts["broken_records"] = section.broken
+        self.truncated = not (section.ended and has_footer(self._file))
+        if self.truncated:
+            self.warnings.append(
+                f"the log {str(self._file.path)!r} is cut or corrupt after byte {section.at} of {self._file.size}: "
+                "used what is whole before that"
+            )
+        self.warnings += [text.format(self.counts[name]) for name, text in _WARNINGS.items() if self.counts[name]]

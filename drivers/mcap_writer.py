@@ -1,0 +1,152 @@
+"""A log as ROS 2, Foxglove, Rerun and evo read it: MCAP, profile ros2, CDR messages."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Literal, Self
+
+from mcap.exceptions import McapError
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from drivers.errors import DriverError
+
+_COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+_MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
+_MAX_CHANNELS = 4096
+_FLUSH_NS = 10**9
+
+
+class LogWriter:
+    """Writes a log that loses at most the last chunk, or second of stamps, when the program dies.
+
+    attachments (name -> bytes) come first in the file, so they survive a crash. compression: lz4 or none; pictures that
+    are JPEG already gain nothing by it. An existing file is replaced. Raises DriverError where the file cannot be made
+    or written (a full disk), and for a message type that ROS 2 does not know.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        attachments: Mapping[str, bytes] | None = None,
+        chunk_bytes: int = 256 * 1024,
+        *,
+        compression: Literal["lz4", "none"] = "lz4",
+    ) -> None:
+        self._path = Path(path)
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._file = self._open()
+        self._usable = True
+        self._flushed_bytes = 0
+        self._flushed_ns: int | None = None
+        with self._guarded():
+            self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
+            self._writer.start("ros2", "omnid")
+            self._attach(attachments or {})
+
+    def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
+        """Adds a message, CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry, at its stamp."""
+        if not 0 <= stamp_ns < 2**63:
+            raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
+        with self._guarded():
+            channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
+            self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns)
+            self._flush_when_due(stamp_ns)
+
+    def close(self) -> None:
+        """Writes the index, which makes the file whole, and brings it to the disk; may be called twice."""
+        if self._file.closed:
+            return
+        try:
+            if self._usable:
+                with self._guarded():
+                    self._finish()
+        finally:
+            self._abandon()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self) -> IO[bytes]:
+        try:
+            return self._path.open("wb")
+        except OSError as error:
+            raise self._failure("create", error) from error
+
+    def _failure(self, verb: str, error: Exception) -> DriverError:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        return DriverError(f"cannot {verb} the log {str(self._path)!r}: {reason}; give a path that can be written")
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Turns a failure to write into DriverError; the file then stays as it is, for what it holds can be read."""
+        if not self._usable:
+            raise DriverError(f"cannot write the log {str(self._path)!r}: it is closed or failed before")
+        try:
+            yield
+        except (OSError, McapError) as error:
+            self._usable = False
+            self._abandon()
+            raise self._failure("write", error) from error
+
+    def _abandon(self) -> None:
+        """Closes the file; what cannot be flushed has been reported already."""
+        self._usable = False
+        with suppress(OSError):
+            self._file.close()
+
+    def _attach(self, attachments: Mapping[str, bytes]) -> None:
+        for name, data in attachments.items():
+            media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+            self._writer.add_attachment(0, 0, name, media_type, data)
+        self._file.flush()
+
+    def _register(self, topic: str, schema_name: str) -> int:
+        if len(self._channels) >= _MAX_CHANNELS:
+            raise DriverError(f"cannot log {topic!r}: there are {_MAX_CHANNELS} topics already")
+        if schema_name not in self._schemas:
+            text = schema_text(schema_name)
+            self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
+        metadata = {"offered_qos_profiles": ""}
+        channel = self._writer.register_channel(topic, "cdr", self._schemas[schema_name], metadata)
+        self._channels[topic, schema_name] = channel
+        return channel
+
+    def _flush_when_due(self, stamp_ns: int) -> None:
+        """Ends the chunk after a second of stamps, and hands ended chunks to the kernel at once."""
+        if self._flushed_ns is None:
+            self._flushed_ns = stamp_ns
+        if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
+            self._flushed_ns = stamp_ns
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        elif (written := self._file.tell()) != self._flushed_bytes:
+            self._flushed_bytes = written
+            self._file.flush()
+
+    def _finish(self) -> None:
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+
+_typestore = cache(get_typestore)
+
+
+@cache
+def schema_text(schema_name: str) -> str:
+    """The message definition of a ROS 2 type with all it is made of; raises DriverError for an unknown type."""
+    store = _typestore(Stores.ROS2_HUMBLE)
+    if schema_name not in store.fielddefs:
+        raise DriverError(f"unknown message type {schema_name!r}: give one of ROS 2's own, as nav_msgs/msg/Odometry")
+    return store.generate_msgdef(schema_name, ros_version=2)[0]

@@ -1,0 +1,92 @@
+"""Which topics of a log are the lower and the upper camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+from drivers.errors import DriverError
+from drivers.frame import Camera
+from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
+
+_WORDS: dict[str, Camera] = {
+    "lower": "lower",
+    "bottom": "lower",
+    "down": "lower",
+    "upper": "upper",
+    "top": "upper",
+    "up": "upper",
+}
+_MAX_LISTED = 16
+
+Wanted = Mapping[Camera, str | None]
+
+
+def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[str, Camera]:
+    """Topic -> camera of the two cameras, out of topics (name -> type) of the log so named in errors.
+
+    A topic given in wanted must be there; the other cameras are known by a word of their topic's name. Raises
+    DriverError that lists what there is where that leaves a doubt.
+    """
+    images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
+    if not images:
+        raise DriverError(
+            f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
+        )
+    given = {name for name in wanted.values() if name is not None}
+    free = [name for name in images if name not in given]
+    cameras: tuple[Camera, Camera] = ("lower", "upper")
+    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in cameras}
+    return _both(log, images, found)
+
+
+def _is_image(name: str, kind: str) -> bool:
+    return kind in (IMAGE, COMPRESSED_IMAGE) and not name.endswith("/compressedDepth")
+
+
+def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
+    if name is None:
+        return None
+    if name not in topics:
+        raise DriverError(f"no topic {name!r} in {log}: found {_listed(topics)}; give one of these")
+    if topics[name] not in (IMAGE, COMPRESSED_IMAGE):
+        raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {_listed(topics)}")
+    return name
+
+
+def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
+    """The topic named after the camera, compressed rather than raw; None without one, DriverError with several."""
+    mine = [name for name in names if _camera_named(name) == camera]
+    if len(_pictures(mine)) > 1:
+        raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
+    return max(mine, key=lambda name: name.endswith("/compressed"), default=None)
+
+
+def _camera_named(topic: str) -> Camera | None:
+    """The first word of the name that names a camera: /upper/down_sampled is the upper one."""
+    words = re.split(r"[^a-z0-9]+", topic.lower())
+    return next((_WORDS[word] for word in words if word in _WORDS), None)
+
+
+def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None]) -> dict[str, Camera]:
+    lower, upper = found["lower"], found["upper"]
+    if lower is None and upper is None and len(_pictures(images)) > 1:
+        raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
+    if lower is None or upper is None:
+        missing = "lower" if lower is None else "upper"
+        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
+    if lower == upper:
+        raise DriverError(f"topic {lower!r} of {log} cannot be both cameras; give two of {_listed(images)}")
+    return {lower: "lower", upper: "upper"}
+
+
+def _pictures(names: Iterable[str]) -> set[str]:
+    return {name.removesuffix("/compressed") for name in names}
+
+
+def _listed(names: Iterable[str]) -> str:
+    """The names on one line, with what a terminal should not print made visible."""
+    every = sorted(names)
+    shown = [name if name.isprintable() else ascii(name) for name in every[:_MAX_LISTED]]
+    more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""
+    return (", ".join(shown) or "no topics at all") + more
