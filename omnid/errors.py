@@ -1,5 +1,5 @@
-"""What goes wrong in the daemon."""
+"""The daemon's one error class for everything a user can put right."""
 
 
 class OmnidError(Exception):
-    """A request, file or message that cannot be used; one line: asked, found, what to do."""
+    """What was asked, what was found and what to do about it, in one line: the command line prints it and exits with 2."""

@@ -1,0 +1,331 @@
+"""The wiring and the threads that carry it: the only module that imports threading.
+
+Wiring is assignment, so a cycle cannot be written. Messages flow down through bounded inboxes that belong to their
+readers; the end of a stream flows down the same way. Inline, the same stages run in the caller's thread, each message
+depth first, and give the same numbers. Where streams merge, or sources are several, only the inline order is fixed.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
+from typing import Any, Final, TypeVar
+
+from omnid.errors import OmnidError
+from omnid.flow import END, LOSSLESS, NEWEST, Direct, Node, Policy, Reader, Sink, Slot, Source, Stage, Stream, nothing
+from omnid.telemetry import StageStats, Telemetry
+
+__all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "Stream", "Ticker"]
+
+T = TypeVar("T")
+In = TypeVar("In")
+Out = TypeVar("Out")
+_WAIT_S: Final = 0.1  # a signal that lands in a foreign thread wakes nobody: the main thread looks up this often
+
+
+class _Inbox:
+    """A reader's bounded queue for a number of writers; gives the end once all of them have ended."""
+
+    def __init__(self, stats: StageStats, writers: int, capacity: int, policy: Policy) -> None:
+        self._stats, self._writers, self._capacity, self._policy = stats, writers, capacity, policy
+        self._messages: deque[object] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, message: object) -> None:
+        with self._changed:
+            if self._policy is LOSSLESS:
+                self._changed.wait_for(lambda: self._closed or len(self._messages) < self._capacity)
+            if self._closed:  # the reader is gone: nobody waits for it
+                self._stats.dropped += 1
+                return
+            if len(self._messages) >= self._capacity:
+                self._messages.popleft()
+                self._stats.dropped += 1
+            self._messages.append(message)
+            self._changed.notify_all()
+
+    def get(self) -> object:
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._messages or not self._writers)
+            if not self._messages:
+                return END
+            self._changed.notify_all()
+            return self._messages.popleft()
+
+    def end(self) -> None:
+        with self._changed:
+            self._writers -= 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Forgets what waits, counts it and refuses the rest: for a reader that is gone."""
+        with self._changed:
+            self._closed = True
+            self._stats.dropped += len(self._messages)
+            self._messages.clear()
+            self._changed.notify_all()
+
+
+class Ticker:
+    """An action at a fixed rate that waits for nobody.
+
+    The graph calls the action's optional `close` once, whatever ended the ticking. `stats.dropped`: missed deadlines.
+    """
+
+    def __init__(self, name: str, period_s: float, action: Callable[[], object]) -> None:
+        if not 0.0 < period_s < threading.TIMEOUT_MAX:
+            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
+        self.name = name
+        self.stats = StageStats(name)
+        self._period_ns = round(period_s * 1e9)
+        self._action = action
+        self._halt = threading.Event()
+
+    def halt(self) -> None:
+        """Ends `run` before its next tick."""
+        self._halt.set()
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Ticks until halted or stopping."""
+        deadline_ns = time.monotonic_ns()
+        while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
+            skipped = skipped_deadlines(deadline_ns, time.monotonic_ns(), self._period_ns)
+            self.stats.dropped += skipped
+            self.stats.timed(self._action)
+            deadline_ns += (1 + skipped) * self._period_ns
+
+    def close(self) -> None:
+        """Closes the action."""
+        getattr(self._action, "close", nothing)()
+
+
+def skipped_deadlines(deadline_ns: int, now_ns: int, period_ns: int) -> int:
+    """How many deadlines to leave out so that the newest one that has passed is served now: no drift and no burst."""
+    return max(0, now_ns - deadline_ns) // period_ns
+
+
+class Graph:
+    """The wiring of one run, and the run itself.
+
+    `policy` holds for all inboxes, a sink may overrule it; `depth` is an inbox's room for messages of each input.
+    """
+
+    def __init__(self, *, policy: Policy = LOSSLESS, threaded: bool = True, depth: int = 2) -> None:
+        self.telemetry = Telemetry()
+        self._policy, self._threaded, self._depth = policy, threaded, depth
+        self._sources: list[Source] = []
+        self._inboxes: list[_Inbox] = []
+        self._tickers: list[Ticker] = []
+        self._threads: list[threading.Thread] = []
+        self._ended: set[str] = set()  # names of threads
+        self._errors: list[BaseException] = []
+        self._stops: deque[None] = deque(maxlen=2)
+        self._bell: SimpleQueue[None] = SimpleQueue()  # its put is reentrant: safe in a signal handler
+        self._ran = False
+
+    def source(
+        self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = nothing
+    ) -> Stream[T]:
+        """The messages of an iterable that is opened, read and closed in the source's own thread.
+
+        `wake` is called once when a threaded run is to end early: it must end this read and all later ones.
+        """
+        source = Source(self._add(StageStats(name)), messages, wake)
+        self._sources.append(source)
+        self._thread(name, self._run_source, source)
+        return source.stream
+
+    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In]) -> Stream[Out]:
+        """What the stage makes of its inputs, which merge into its one inbox."""
+        return self._node(Node(self._add(StageStats(name)), stage), inputs, self._policy, self._depth)
+
+    def sink(
+        self, name: str, sink: Sink[In], *inputs: Stream[In], policy: Policy | None = None, depth: int | None = None
+    ) -> None:
+        """Ends streams in a sink, with its own policy or depth where given."""
+        node = Node(self._add(StageStats(name)), sink)
+        self._node(node, inputs, policy or self._policy, self._depth if depth is None else depth)
+
+    def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> Ticker:
+        """Calls the action at a fixed rate in a thread of its own, also inline, until the run ends.
+
+        A stop or a failure ends it at once, before the inboxes have drained.
+        """
+        ticker = Ticker(name, period_s, action)
+        self._add(ticker.stats)
+        self._tickers.append(ticker)
+        return ticker
+
+    def stop(self) -> None:
+        """Ends the sources and lets the rest drain; a second call forgets what waits and finishes nothing.
+
+        Takes no lock: any thread or signal handler may call it.
+        """
+        self._stops.append(None)
+        self._bell.put(None)
+
+    def run(self) -> None:
+        """Runs until the sources have ended, the inboxes are empty and the threads joined; only once.
+
+        Ctrl-C means `stop`. Raises the first error of any box, later ones in its notes, and KeyboardInterrupt after a
+        second stop.
+        """
+        self._require_fresh()
+        self._ran = True
+        with self._ctrl_c_stops():
+            self._carry()
+        for error in self._errors[1:]:
+            self._errors[0].add_note(f"and then: {error!r}")
+        if self._errors:
+            raise self._errors[0]
+        if self._hard:
+            raise KeyboardInterrupt("stopped twice: what waited in the inboxes is lost")
+
+    @property
+    def _stopping(self) -> bool:
+        return bool(self._stops or self._errors)
+
+    @property
+    def _hard(self) -> bool:
+        return len(self._stops) > 1
+
+    def _require_fresh(self) -> None:
+        if self._ran:
+            raise OmnidError("a graph runs once and is wired before: make a new one")
+
+    def _add(self, stats: StageStats) -> StageStats:
+        self._require_fresh()
+        return self.telemetry.add(stats)
+
+    def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int) -> Stream[Any]:
+        if not inputs or depth < 1:
+            raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
+        reader: Reader = Direct(node, len(inputs), self._succeeds, self._finish)
+        if self._threaded:
+            reader = inbox = _Inbox(node.stats, len(inputs), depth * len(inputs), policy)
+            self._inboxes.append(inbox)
+            self._thread(node.name, self._run_node, node, inbox)
+        for stream in inputs:
+            stream.readers.append(reader)
+        return node.stream
+
+    def _thread(self, name: str, body: Callable[..., None], *args: object) -> None:
+        def run() -> None:
+            body(*args)
+            self._ended.add(name)
+            self._bell.put(None)
+
+        if self._threaded:
+            self._threads.append(threading.Thread(target=run, name=name))
+
+    def _succeeds(self, name: str, work: Callable[..., object], *args: object) -> bool:
+        """Whether the work came to its end; its error ends the run."""
+        try:
+            work(*args)
+        except BaseException as error:
+            error.add_note(f"in '{name}'")
+            self._errors.append(error)
+            self._bell.put(None)
+            return False
+        return True
+
+    def _run_source(self, source: Source) -> None:
+        while self._advances(source):
+            pass
+
+    def _advances(self, source: Source) -> bool:
+        """Whether the source took a step; otherwise it is closed and its end flows down."""
+        if not (source.ended or self._stopping) and self._succeeds(source.name, source.step):
+            return True
+        self._succeeds(source.name, source.close)
+        source.stream.end()
+        return False
+
+    def _run_node(self, node: Node, inbox: _Inbox) -> None:
+        self._succeeds(node.name, self._drain, node, inbox)
+        inbox.close()
+        node.stream.end()
+
+    def _drain(self, node: Node, inbox: _Inbox) -> None:
+        while (message := inbox.get()) is not END:
+            node.handle(message)
+        self._finish(node)
+
+    def _finish(self, node: Node) -> None:
+        if not self._hard:
+            node.finish()
+
+    def _run_inline(self) -> None:
+        turns = deque(self._sources)
+        while turns:
+            source = turns.popleft()
+            if self._advances(source):
+                turns.append(source)
+
+    def _beat(self, ticker: Ticker) -> None:
+        self._succeeds(ticker.name, ticker.run, lambda: self._stopping)
+        self._succeeds(ticker.name, ticker.close)
+
+    def _carry(self) -> None:
+        beats = [threading.Thread(target=self._beat, args=(ticker,), name=ticker.name) for ticker in self._tickers]
+        try:
+            for thread in beats + self._threads:
+                thread.start()
+            self._wait() if self._threaded else self._run_inline()
+        except BaseException as error:  # from a signal handler of the caller's, or no thread to be had
+            self._errors.insert(0, error)
+            self._stops.extend((None, None))
+            self._wait()
+        finally:
+            for ticker in self._tickers:
+                ticker.halt()
+            for thread in filter(_started, beats):
+                thread.join()
+
+    def _wait(self) -> None:
+        started = list(filter(_started, self._threads))
+        while any(thread.name not in self._ended for thread in started):
+            with suppress(Empty):
+                self._bell.get(timeout=_WAIT_S)
+            self._pass_on_stop()
+        for thread in started:
+            thread.join()
+
+    def _pass_on_stop(self) -> None:
+        if self._stopping:
+            for ticker in self._tickers:
+                ticker.halt()
+            for source in self._sources:
+                wake, source.wake = source.wake, nothing
+                self._succeeds(source.name, wake)
+        if self._hard:
+            for inbox in self._inboxes:
+                inbox.close()
+
+    @contextmanager
+    def _ctrl_c_stops(self) -> Iterator[None]:
+        """Ctrl-C as a stop: an exception in the main thread could tear a lock or the state of a stage."""
+        in_main = threading.current_thread() is threading.main_thread()
+        if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield
+            return
+        signal.signal(signal.SIGINT, self._on_ctrl_c)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _on_ctrl_c(self, *_: object) -> None:
+        self.stop()
+        if self._hard and not self._threaded:  # nothing else reaches a stage that the main thread is stuck in
+            raise KeyboardInterrupt
+
+
+def _started(thread: threading.Thread) -> bool:
+    return thread.ident is not None
