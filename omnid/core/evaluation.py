@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth: the numbers of `evo_ape --align_origin` and `evo_rpe -d 1 -u f`."""
+"""How far an estimated trajectory is from the truth: what `evo_ape --align_origin` and `evo_rpe -d 1 -u f` measure."""
 
 from __future__ import annotations
 
@@ -52,11 +52,13 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01)
 def format_metrics(metrics: Metrics) -> str:
     """The metrics as a few aligned lines for a terminal: metres, per cent and degrees."""
     m = metrics
+    length = f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"
+    heading = f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"
     rows = [
         ("associated poses", f"{m.pairs} ({m.coverage:.1%} of the truth)"),
-        ("path length", f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"),
+        ("path length", length),
         ("position error (ATE)", f"rmse {m.ate_rmse_m:.4f} m, max {m.ate_max_m:.4f} m, end {m.end_error_m:.4f} m"),
-        ("heading error", f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"),
+        ("heading error", heading),
         ("step error (RPE)", f"rmse {m.rpe_translation_rmse_m:.5f} m, {_deg(m.rpe_rotation_rmse_rad)}"),
     ]
     return "\n".join(f"{name:<21} {value}" for name, value in rows)
@@ -72,14 +74,14 @@ def _deg(angle_rad: float) -> str:
 
 def _tolerance_ns(tolerance_s: float) -> int:
     if not math.isfinite(tolerance_s) or tolerance_s < 0.0:
-        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: name one below half a frame time")
+        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: try 0.01")
     return round(tolerance_s * 1e9)
 
 
 def _associate(
     stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64], tolerance_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (of the estimate, of the truth) of the associated poses, in time order; each index stands at most once."""
+    """Indices (of the estimate, of the truth) of the associated poses, in time order; each at most once."""
     if not stamps_ns.size or not true_ns.size:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     after = np.clip(np.searchsorted(true_ns, stamps_ns), 0, true_ns.size - 1)

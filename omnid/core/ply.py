@@ -46,7 +46,7 @@ def read_ply(path: str | Path) -> MapPoints:
         raise OmnidError(f"{path}: a map was asked for, it cannot be read: {error}") from error
     header = _HEADER_PATTERN.match(raw)
     if header is None:
-        raise OmnidError(f"{path}: a PLY map of omnid was expected, another header was found: only its own maps are read")
+        raise OmnidError(f"{path}: a PLY map of omnid was expected, found another header: only its own are read")
     body, expected = raw[header.end() :], int(header[1]) * _VERTEX.itemsize
     if len(body) != expected:
         raise OmnidError(f"{path}: {expected} bytes of points were expected, {len(body)} found: write the map again")

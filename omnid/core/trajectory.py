@@ -44,13 +44,13 @@ def read_tum(path: str | Path) -> Trajectory:
     text = _read_text(Path(path))
     rows = sorted(_rows(text, str(path)), key=lambda row: row.stamp_ns)
     if not rows:
-        raise OmnidError(f"{path}: a trajectory was asked for, no pose was found: expected lines of 't x y z qx qy qz qw'")
+        raise OmnidError(f"{path}: a trajectory was asked for, no pose found: expected lines 't x y z qx qy qz qw'")
     _refuse_repeated_stamps(rows, str(path))
     return _trajectory(rows)
 
 
 def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
-    """One TUM line without its newline: every number with 9 decimals, w >= 0, never '-0'; same bytes for the same pose."""
+    """One TUM line without its newline: 9 decimals everywhere, w >= 0, never '-0'; same bytes for the same pose."""
     sign, (whole_s, rest_ns) = "-" if stamp_ns < 0 else "", divmod(abs(int(stamp_ns)), 10**9)
     pose = np.concatenate([T[:3, 3], _canonical(se3.quaternion(T[:3, :3]))])
     numbers = [f"{float(value):.{_DECIMALS}f}" for value in np.round(pose, _DECIMALS) + 0.0]
@@ -59,7 +59,7 @@ def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
 
 def _canonical(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """The one of q and -q whose last number that prints as non-zero (w, else z, y, x) is positive."""
-    printed = np.round(np.asarray(q, dtype=np.float64), _DECIMALS)
+    printed: NDArray[np.float64] = np.round(q, _DECIMALS)
     visible = printed[printed != 0.0]
     return -printed if visible.size and visible[-1] < 0.0 else printed
 
@@ -71,7 +71,7 @@ def _read_text(path: Path) -> str:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise OmnidError(f"{path}: a trajectory was asked for, it cannot be read: {error}") from error
     if len(raw) > FILE_LIMIT_BYTES:
-        raise OmnidError(f"{path}: a trajectory of at most {FILE_LIMIT_BYTES >> 20} MiB was expected, this file is larger")
+        raise OmnidError(f"{path}: at most {FILE_LIMIT_BYTES >> 20} MiB were expected, more found: split it")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -132,9 +132,8 @@ def _shortened(text: str) -> str:
 def _refuse_repeated_stamps(rows: list[_Row], name: str) -> None:
     for first, second in pairwise(rows):
         if first.stamp_ns == second.stamp_ns:
-            raise OmnidError(
-                f"{name}, line {second.line}: expected each stamp once, found that of line {first.line} again: remove one"
-            )
+            found = f"found that of line {first.line} again"
+            raise OmnidError(f"{name}, line {second.line}: expected each stamp once, {found}: remove one of them")
 
 
 def _trajectory(rows: list[_Row]) -> Trajectory:

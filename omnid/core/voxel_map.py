@@ -1,6 +1,7 @@
 """The map of a whole run in bounded memory: points of all frames, in the world frame, fused in voxels.
 
-Dang et al. 2012, § IV.G: points reconstructed at each frame are moved by the estimated motion into one frame and merged.
+Dang et al. 2012, § IV.G: points reconstructed at each frame are moved by the estimated motion into one
+frame and merged.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class VoxelMap:
         if not (np.isfinite(voxel_m) and voxel_m > 0.0):
             raise OmnidError(f"a voxel edge above 0 m was expected, {voxel_m} found: name one such as 0.05")
         if capacity < 16 or capacity & (capacity - 1):
-            raise OmnidError(f"a map capacity of a power of two from 16 up was expected, {capacity} found: try {1 << 18}")
+            raise OmnidError(f"a capacity of 16, 32, 64 ... voxels was expected, {capacity} found: try {1 << 18}")
         self.evicted = 0
         self.refused = 0
         self._voxel_m = voxel_m
@@ -127,7 +128,7 @@ class VoxelMap:
         return slots
 
     def _confidence(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
-        """0..1, growing with both witnesses: n / (n + 1) of n frames, times 1 / (1 + variance of the mean / voxel^2)."""
+        """0..1, growing with both witnesses: n / (n + 1) of n frames; 1 / (1 + variance of the mean / voxel^2)."""
         frames, weight = self._frames[slots].astype(np.float64), self._sums[slots, 0]
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
 

@@ -85,7 +85,7 @@ def test_only_the_first_associated_pose_is_aligned() -> None:
     late = trajectory(estimate.stamps_ns[3:], estimate.T[3:] + 0.0)
     late.T[:, 1, 3] += 5.0
     metrics = evaluate(late, truth)
-    assert (metrics.pairs, metrics.coverage) == (8, pytest.approx(8 / 11))
+    assert metrics.pairs == 8 and metrics.coverage == pytest.approx(8 / 11)
     assert metrics.ate_max_m == pytest.approx(0.0) and metrics.length_truth_m == pytest.approx(0.7)
 
 
@@ -107,7 +107,7 @@ def test_standing_still_has_no_relative_length() -> None:
 def test_too_few_poses_names_both_ranges() -> None:
     truth = straight(5, 0.1)
     late = trajectory(truth.stamps_ns + 10**12, truth.T)
-    with pytest.raises(OmnidError, match=r"0 found: estimate spans 1000.000 to 1000.400 s, truth spans 0.000 to 0.400 s"):
+    with pytest.raises(OmnidError, match=r"0 found: estimate spans 1000.000 to 1000.400 s, truth spans 0.000 to 0.400"):
         evaluate(late, truth)
     with pytest.raises(OmnidError, match="1 found"):
         evaluate(trajectory(truth.stamps_ns[:1], truth.T[:1]), truth)

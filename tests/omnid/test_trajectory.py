@@ -37,7 +37,7 @@ def random_poses(count: int) -> np.ndarray:
 def test_rows_written_are_read_back(tmp_path: Path) -> None:
     T = random_poses(200)
     stamps_ns = 1_700_000_000_000_000_001 + 66_666_667 * np.arange(200)
-    rows = [tum_row(stamp, pose) for stamp, pose in zip(stamps_ns, T, strict=True)]
+    rows = [tum_row(int(stamp), pose) for stamp, pose in zip(stamps_ns, T, strict=True)]
     read = read_tum(written(tmp_path, "\n".join(rows)))
     assert np.array_equal(read.stamps_ns, stamps_ns)
     np.testing.assert_allclose(read.T, T, atol=5e-9)
@@ -132,7 +132,7 @@ def test_random_bytes_never_crash(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "\n\n", "# nothing but a comment"])
 def test_empty_file(tmp_path: Path, content: str) -> None:
-    assert "no pose was found" in refusal(tmp_path, content)
+    assert "no pose found" in refusal(tmp_path, content)
 
 
 def test_repeated_stamp_names_both_lines(tmp_path: Path) -> None:

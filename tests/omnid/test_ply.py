@@ -1,0 +1,93 @@
+"""PLY maps: exact round trip, the format other programs read, atomic writing, plain refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omnid.core.ply import read_ply, write_ply
+from omnid.core.voxel_map import MapPoints
+from omnid.errors import OmnidError
+
+
+def some_points(count: int) -> MapPoints:
+    rng = np.random.default_rng(count)
+    return MapPoints(
+        xyz=rng.normal(0.0, 9.0, (count, 3)).astype(np.float32),
+        confidence=rng.uniform(0.0, 1.0, count).astype(np.float32),
+        frames=rng.integers(1, 500, count, dtype=np.int32),
+        age=rng.integers(0, 500, count, dtype=np.int32),
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_what_is_written_is_read(tmp_path: Path, count: int) -> None:
+    path, points = tmp_path / "map.ply", some_points(count)
+    write_ply(path, points)
+    read = read_ply(path)
+    for name in ("xyz", "confidence", "frames", "age"):
+        expected, found = getattr(points, name), getattr(read, name)
+        assert found.dtype == expected.dtype and np.array_equal(found, expected)
+
+
+def test_layout_is_the_one_in_the_header(tmp_path: Path) -> None:
+    path, points = tmp_path / "map.ply", some_points(3)
+    write_ply(path, points)
+    header, body = path.read_bytes().split(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and "element vertex 3" in lines
+    types = {"float": "<f4", "int": "<i4"}
+    fields = [(line.split()[2], types[line.split()[1]]) for line in lines if line.startswith("property")]
+    vertices = np.frombuffer(body, dtype=fields)
+    assert [name for name, _ in fields] == ["x", "y", "z", "confidence", "frames", "age"]
+    assert np.array_equal(vertices["y"], points.xyz[:, 1]) and np.array_equal(vertices["age"], points.age)
+
+
+def test_replaces_the_old_map_and_leaves_nothing_beside(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    for count in (5, 2):
+        write_ply(str(path), some_points(count))
+    assert len(read_ply(str(path)).xyz) == 2 and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_reader_keeps_the_old_map_while_a_new_one_comes(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, some_points(5))
+    with path.open("rb") as reader:
+        old = path.read_bytes()
+        write_ply(path, some_points(900))
+        assert reader.read() == old
+
+
+def test_same_points_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.ply", "b.ply"):
+        write_ply(tmp_path / name, some_points(50))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_unwritable_places(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for name in ("absent/map.ply", "file/map.ply", "folder", "nul\0.ply", "x" * 300):
+        with pytest.raises(OmnidError, match="cannot be"):
+            write_ply(tmp_path / name, some_points(1))
+    with pytest.raises(OmnidError):
+        write_ply("/", some_points(1))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, some_points(4))
+    good = path.read_bytes()
+    foreign = good.replace(b"property int age", b"property int hue")
+    huge = good.replace(b"vertex 4", b"vertex 999999999999")
+    for content in (b"", b"ply\n", good[:-1], good + b"\0", foreign, huge, np.random.default_rng(0).bytes(999)):
+        path.write_bytes(content)
+        with pytest.raises(OmnidError, match=r"map\.ply"):
+            read_ply(path)
+    for absent in (tmp_path / "absent.ply", tmp_path):
+        with pytest.raises(OmnidError, match="cannot be read"):
+            read_ply(absent)
