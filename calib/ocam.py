@@ -1,0 +1,125 @@
+"""The polynomial model of OCamCalib (Scaramuzza et al. 2006): any central mirror or fisheye by f(rho).
+
+x = row - row centre and y = column - column centre, after the inverse of the affine [c d; e 1]; rho = |(x, y)|.
+Seen directly the ray is (x, y, f(rho)) with x down, y right, z towards the viewer. Seen in a mirror the picture is
+reflected and the right-handed ray is (x, y, -f(rho)). A flat board cannot tell the two apart, so `view` says it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from calib.camera import Array
+from calib.errors import CalibError
+
+View = Literal["mirror", "direct"]
+VIEWS: tuple[View, View] = ("mirror", "direct")
+
+# Radii of the table that starts the inversion; each solve stays between two of its neighbours.
+TABLE_SIZE = 1025
+# Newton steps on one table interval: 3 reach the last bit, the others bisect where the slope vanishes.
+SOLVE_STEPS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class OcamCamera:
+    """Model `ocam`: polynomial (a0, a1, ...) with a0 < 0 [px], centre (row, column), affine (c, d, e), size (w, h)."""
+
+    polynomial: tuple[float, ...]
+    center_row_column: tuple[float, float]
+    affine: tuple[float, float, float]
+    size: tuple[int, int]
+    view: View = "mirror"
+    _radii: Array = field(init=False, repr=False, compare=False)
+    _angles: Array = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self._check()
+        radii = np.linspace(0, self.radius_limit_px, TABLE_SIZE)
+        angles = np.arctan2(self.height(radii), radii)
+        object.__setattr__(self, "_radii", radii)
+        object.__setattr__(self, "_angles", np.maximum.accumulate(angles))
+
+    def _check(self) -> None:
+        values = (*self.polynomial, *self.center_row_column, *self.affine)
+        if not self.polynomial or not np.isfinite(values).all():
+            raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
+        c, d, e = self.affine
+        if self.polynomial[0] >= 0 or abs(c - d * e) < 1e-6 or min(self.size) < 1 or self.view not in VIEWS:
+            raise CalibError("ocam camera: needs a0 < 0, an invertible affine, a size and view mirror or direct, "
+                             f"found a0 {self.polynomial[0]}, affine {self.affine}, size {self.size}, "
+                             f"view {self.view!r}")
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Pixel (u, v) = (column, row) of the axis."""
+        row, column = self.center_row_column
+        return column, row
+
+    @property
+    def radius_limit_px(self) -> float:
+        """Where the model ends: at the image diagonal, or before it where f(rho)/rho stops rising.
+
+        Beyond that radius two pixels would share a ray.
+        """
+        diagonal = float(np.hypot(*self.size))
+        turning = np.roots(self._turning()[::-1])
+        real = turning.real[(np.abs(turning.imag) < 1e-9 * diagonal) & (turning.real > 0)]
+        return min(diagonal, float(real.min())) if real.size else diagonal
+
+    def _turning(self) -> Array:
+        """Coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""
+        return np.array([(power - 1) * a for power, a in enumerate(self.polynomial)])
+
+    def height(self, radius_px: Array) -> Array:
+        """f(rho) (N,) [px]: the ray's third component before the mirror's sign."""
+        return np.asarray(np.polynomial.polynomial.polyval(radius_px, self.polynomial))
+
+    def lift(self, pixels: Array) -> Array:
+        """Unit rays (N, 3) of pixels (N, 2); NaN beyond the model's radius. Scaramuzza et al. 2006, eq. (6)."""
+        pixels = np.asarray(pixels, float)
+        c, d, e = self.affine
+        row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
+        x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
+        rho = np.hypot(x, y)
+        z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
+        rays = np.column_stack([x, y, self._sign * z])
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def project(self, points: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3); NaN where no radius of the model sees them. Exact, not the file's inverse."""
+        points = np.asarray(points, float)
+        r = np.hypot(points[:, 0], points[:, 1])
+        rho = self._radius(r, self._sign * points[:, 2])
+        scale = rho / np.where(r > 0, r, 1.0)
+        x, y = points[:, 0] * scale, points[:, 1] * scale
+        c, d, e = self.affine
+        row, column = self.center_row_column
+        return np.column_stack([e * x + y + column, c * x + d * y + row])
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.view == "mirror" else 1.0
+
+    def _radius(self, r: Array, z: Array) -> Array:
+        """The rho (N,) that solves f(rho) * r = z * rho, by Newton steps kept inside one interval of the table."""
+        norm = np.hypot(r, z)
+        unit = np.where((norm > 0) & np.isfinite(norm), norm, np.nan)
+        r, z, angle = r / unit, z / unit, np.arctan2(z, r)
+        above = np.clip(np.searchsorted(self._angles, angle), 1, TABLE_SIZE - 1)
+        low, high = self._radii[above - 1], self._radii[above]
+        rho = (low + high) / 2
+        for _ in range(SOLVE_STEPS):
+            value = self.height(rho) * r - z * rho
+            low, high = np.where(value < 0, rho, low), np.where(value < 0, high, rho)
+            step = self._newton(rho, value, (r, z))
+            rho = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+        return np.where(np.isfinite(unit) & (angle <= self._angles[-1]), rho, np.nan)
+
+    def _newton(self, rho: Array, value: Array, slope: tuple[Array, Array]) -> Array:
+        derivative = np.polynomial.polynomial.polyder(np.array(self.polynomial))
+        gradient = np.polynomial.polynomial.polyval(rho, derivative) * slope[0] - slope[1]
+        return rho - value / np.where(gradient != 0, gradient, np.nan)

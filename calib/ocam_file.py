@@ -1,0 +1,117 @@
+"""OCamCalib's `calib_results.txt` in and out: one file per camera, so the transform between them comes extra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from calib.camera import Array, OmniCamera
+from calib.errors import CalibError
+from calib.ocam import OcamCamera, View
+from calib.rig import Rig
+from calib.rig_frame import rig_between
+from calib.strict import decode, read_bytes, shown
+
+# The toolbox's own C reader has room for so many coefficients.
+MAX_COEFFICIENTS = 64
+# The inverse polynomial grows until it is this good, or no better: the toolbox's own goal and bound.
+INVERSE_GOAL_PX = 0.01
+INVERSE_DEGREES = range(4, 26)
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """One line of numbers and where it stands."""
+
+    number: int
+    words: list[str]
+    file: str
+
+    def fail(self, expected: str) -> NoReturn:
+        raise CalibError(f"{self.file}, line {self.number}: expected {expected}, found {shown(' '.join(self.words))}")
+
+    def numbers(self, what: str, count: int) -> tuple[float, ...]:
+        try:
+            values = tuple(float(word) for word in self.words)
+        except ValueError:
+            values = ()
+        if len(values) != count or not np.isfinite(values).all():
+            self.fail(f"{count} finite numbers ({what})")
+        return values
+
+    def counted(self, what: str) -> tuple[float, ...]:
+        """Numbers led by their count."""
+        lead = self.words[0]
+        count = int(lead) if lead.isascii() and lead.isdigit() and len(lead) < 4 else 0
+        if not 1 <= count <= MAX_COEFFICIENTS:
+            self.fail(f"a count of 1 to {MAX_COEFFICIENTS}, then so many {what}")
+        return self.numbers(f"a count and {what}", count + 1)[1:]
+
+
+def import_ocam(lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror") -> Rig:
+    """The rig of two calib_results.txt; its frame is the lower viewpoint's, see rig_between."""
+    lower, upper = (parse_ocam(read_bytes(path), view, str(path)) for path in (lower_path, upper_path))
+    return rig_between(lower, upper, T_lower_upper)
+
+
+def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
+    """The camera in the text of a calib_results.txt; the inverse polynomial is checked and left: ours is exact."""
+    lines = [_Line(number, line.split(), name) for number, line in enumerate(decode(text, name).splitlines(), 1)
+             if line.strip() and not line.lstrip().startswith("#")]
+    if len(lines) != 5:
+        raise CalibError(f"{name}: expected 5 lines of numbers (polynomial, inverse polynomial, centre, affine, image "
+                         f"size), found {len(lines)}")
+    polynomial = lines[0].counted("polynomial coefficients")
+    lines[1].counted("inverse polynomial coefficients")
+    row, column = lines[2].numbers("row and column of the centre", 2)
+    c, d, e = lines[3].numbers("affine c d e", 3)
+    try:
+        return OcamCamera(polynomial, (row, column), (c, d, e), _size(lines[4]), view)
+    except CalibError as error:
+        raise CalibError(f"{name}: {error}") from error
+
+
+def _size(line: _Line) -> tuple[int, int]:
+    height, width = line.numbers("height and width of the image", 2)
+    if not all(1 <= side <= 32767 and side == int(side) for side in (height, width)):
+        line.fail("the image's height and width in whole pixels, 1 to 32767")
+    return int(width), int(height)
+
+
+def export_ocam(camera: OmniCamera) -> str:
+    """The camera as the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
+    if not isinstance(camera, OcamCamera):
+        raise CalibError("export: calib_results.txt holds ocam cameras, found an omni camera; use --format kalibr")
+    width, height = camera.size
+    sections = (
+        ("polynomial coefficients for the direct mapping: f(rho), constant first", _counted(camera.polynomial)),
+        ("polynomial coefficients for the inverse mapping: rho of the angle, constant first",
+         _counted(inverse_polynomial(camera))),
+        ('center: "row" and "column", starting from 0 (C convention)', _row(camera.center_row_column)),
+        ('affine parameters "c", "d", "e"', _row(camera.affine)),
+        ('image size: "height" and "width"', f"{int(height)} {int(width)}"),
+    )
+    return "".join(f"#{title}\n\n{numbers}\n\n" for title, numbers in sections)
+
+
+def inverse_polynomial(camera: OcamCamera) -> tuple[float, ...]:
+    """Coefficients of rho [px] in atan(f(rho)/rho) [rad], over the radii of the image, as the toolbox's files carry."""
+    corners = np.hypot(*(np.maximum(camera.center, np.subtract(camera.size, camera.center))))
+    radii = np.linspace(0, min(float(corners), camera.radius_limit_px), 1000)
+    angles = np.arctan2(camera.height(radii), radii)
+    for degree in INVERSE_DEGREES:
+        fit = np.polynomial.Polynomial.fit(angles, radii, degree)
+        if np.abs(fit(angles) - radii).max() < INVERSE_GOAL_PX:
+            break
+    return tuple(float(a) for a in fit.convert().coef)
+
+
+def _counted(values: tuple[float, ...]) -> str:
+    return f"{len(values)} {_row(values)}"
+
+
+def _row(values: tuple[float, ...]) -> str:
+    return " ".join(repr(float(value) + 0.0) for value in values)

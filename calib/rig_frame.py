@@ -1,0 +1,37 @@
+"""A rig out of two cameras of which only the transform between them is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib import se3
+from calib.camera import Array, OmniCamera
+from calib.errors import CalibError
+from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
+
+# Half the span, in pixels, over which the image's axis is measured: well inside any mirror or lens.
+STEP_PX = 1.0
+
+
+def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
+    """The rig whose frame is the lower viewpoint: z towards the upper one, x along the lower image's u axis."""
+    baseline = float(np.linalg.norm(T_lower_upper[:3, 3]))
+    if not baseline >= MIN_BASELINE_M:
+        raise CalibError(f"rig: the viewpoints must lie apart, found {baseline * 1e3:.3f} mm between them")
+    z = T_lower_upper[:3, 3] / baseline
+    u, v = image_axis(lower, (STEP_PX, 0.0)), image_axis(lower, (0.0, STEP_PX))
+    forward = u if abs(z @ u) < 0.9 else v
+    x = forward - z * (z @ forward)
+    x /= np.linalg.norm(x)
+    T_lower_rig = se3.transform(np.column_stack([x, np.cross(z, x), z]), np.zeros(3))
+    T_upper_rig = se3.inverse(T_lower_upper) @ T_lower_rig
+    return Rig(MountedCamera(lower, T_lower_rig), MountedCamera(upper, T_upper_rig), topics=topics)
+
+
+def image_axis(camera: OmniCamera, step_px: tuple[float, float]) -> Array:
+    """Unit vector (3,) in the camera frame along which the picture runs at its centre, for a step in pixels."""
+    ends = camera.lift(np.array([np.subtract(camera.center, step_px), np.add(camera.center, step_px)]))
+    axis = ends[1] - ends[0]
+    if not np.isfinite(axis).all():
+        raise CalibError("rig: the lower camera's model has no ray next to its own centre; check its intrinsics")
+    return np.asarray(axis / np.linalg.norm(axis))

@@ -1,0 +1,139 @@
+"""The mirror's rim in a picture, the circle beyond which it is dark, and a dark hub in its middle if there is one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Array, Mask
+
+AZIMUTHS = 720
+# The rim must stand out from the dark by so many grey levels at least, as must a single azimuth's edge.
+MIN_CONTRAST = 25.0
+# The edge lies between the dark and the light level, nearer the dark: the world at the rim is often dark too.
+EDGE_FRACTION = 0.25
+# Pixels on either side over which the edge is judged, and how far beyond it the dark has to last.
+EDGE_PX = 4
+# Azimuths agree when their edge is this near the circle; this part of those the circle has in the picture must.
+AGREE_PX = 2.0
+MIN_SUPPORT = 0.6
+# Part of the circle that has to lie in the picture: less leaves the centre loose.
+MIN_ARC = 0.4
+FIT_ROUNDS = 200
+# What is cut off inside the rim and outside the hub: blur and the last reflections at the edge.
+SAFETY_PX = 1.5
+MAX_HUB = 0.4
+HUB_RING_PX = 5
+HUB_SUPPORT = 0.9
+
+
+def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
+    """The ring that shows the world in a picture (H, W) uint8, or None where no rim can be told for sure.
+
+    center_guess (u, v) [px] may be off by a tenth of the radius. A picture that is bright all around (or the maximum of
+    several) gives the best rim. None: dark or full-frame pictures, noise, soft vignettes.
+    """
+    levels = _levels(image)
+    if levels is None:
+        return None
+    edges = _edges(image, center_guess, levels)
+    circle = _fit(edges, center_guess)
+    if circle is None or not _supported(circle, edges, image.shape):
+        return None
+    u, v, radius = (float(value) for value in circle)
+    hub = _hub(image, (u, v), radius, levels[0] + EDGE_FRACTION * (levels[1] - levels[0]))
+    return Mask((u, v), hub + SAFETY_PX if hub > 0 else 0.0, radius - SAFETY_PX)
+
+
+def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
+    """The dark level, of the corners, and the light one, of the middle; None where they are too close."""
+    side = max(4, min(image.shape) // 32)
+    corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
+    height, width = image.shape
+    dark = float(np.median([np.median(corner) for corner in corners]))
+    light = float(np.median(image[height // 4:-height // 4, width // 4:-width // 4]))
+    return (dark, light) if light - dark >= MIN_CONTRAST else None
+
+
+def _polar(image: NDArray[np.uint8], center: tuple[float, float], radius_px: int) -> Array:
+    """The picture as (AZIMUTHS, radius) about a centre, 1 px apart; NaN outside of it."""
+    azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)[:, None]
+    radii = np.arange(radius_px)
+    u, v = center[0] + radii * np.cos(azimuth), center[1] + radii * np.sin(azimuth)
+    sampled = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    inside = (u >= 0) & (v >= 0) & (u <= image.shape[1] - 1) & (v <= image.shape[0] - 1)
+    return np.where(inside, sampled, np.nan)
+
+
+def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[float, float]) -> Array:
+    """Pixels (N, 2) where the light ends for good, one an azimuth at most, to a fraction of a pixel."""
+    threshold = levels[0] + EDGE_FRACTION * (levels[1] - levels[0])
+    polar = _polar(image, center, int(np.hypot(*image.shape)))
+    found = [(index, radius) for index, profile in enumerate(polar) if (radius := _last_edge(profile, threshold)) > 0]
+    azimuth = 2 * np.pi * np.array([index for index, _ in found]) / AZIMUTHS
+    radius = np.array([radius for _, radius in found])
+    return np.column_stack([center[0] + radius * np.cos(azimuth), center[1] + radius * np.sin(azimuth)])
+
+
+def _last_edge(profile: Array, threshold: float) -> float:
+    """The radius [px] at which a profile falls below the threshold for good, and steeply; 0 where it does not."""
+    profile = profile[np.isfinite(profile)]
+    light = np.flatnonzero(profile >= threshold)
+    last = int(light[-1]) if light.size else 0
+    if last < EDGE_PX or last + 2 * EDGE_PX >= len(profile):
+        return 0.0
+    inside, outside = profile[last - EDGE_PX + 1:last + 1].mean(), profile[last + EDGE_PX:last + 2 * EDGE_PX].mean()
+    if inside - outside < MIN_CONTRAST:
+        return 0.0
+    half = (inside + outside) / 2
+    at = last - EDGE_PX + 1 + int(np.flatnonzero(profile[last - EDGE_PX + 1:last + 1] >= half)[-1])
+    return at + float((profile[at] - half) / (profile[at] - profile[at + 1]))
+
+
+def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
+    """The circle (u, v, radius) on which most edges agree, refined over those that do; None where there is none."""
+    if len(edges) < AZIMUTHS * MIN_ARC * MIN_SUPPORT:
+        return None
+    generator = np.random.default_rng(0)
+    circles = [_circle(edges[generator.choice(len(edges), 3, replace=False)]) for _ in range(FIT_ROUNDS)]
+    best = max(circles, key=lambda circle: int((_distance(edges, circle) < AGREE_PX).sum()))
+    for _ in range(3):
+        agreeing = edges[_distance(edges, best) < AGREE_PX]
+        if len(agreeing) < 3:
+            return None
+        best = _circle(agreeing)
+    near = np.hypot(best[0] - center[0], best[1] - center[1]) < 0.25 * best[2]
+    return best if near else None
+
+
+def _circle(points: Array) -> Array:
+    """Centre and radius (3,) of the circle through points (N, 2), least squares (Kasa 1976)."""
+    middle = points.mean(axis=0)
+    local = points - middle
+    A = np.column_stack([2 * local, np.ones(len(local))])
+    a, b, c = np.linalg.lstsq(A, (local**2).sum(axis=1), rcond=None)[0]
+    return np.array([a + middle[0], b + middle[1], np.sqrt(max(0.0, c + a * a + b * b))])
+
+
+def _distance(points: Array, circle: Array) -> Array:
+    return np.asarray(np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2]))
+
+
+def _supported(circle: Array, edges: Array, shape: tuple[int, ...]) -> bool:
+    """Whether enough of the circle lies in the picture, and enough of that part was seen as an edge."""
+    azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
+    reach = circle[2] + 2 * EDGE_PX
+    u, v = circle[0] + reach * np.cos(azimuth), circle[1] + reach * np.sin(azimuth)
+    possible = int(((u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)).sum())
+    agreeing = int((_distance(edges, circle) < AGREE_PX).sum())
+    return possible >= MIN_ARC * AZIMUTHS and agreeing >= MIN_SUPPORT * possible
+
+
+def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, threshold: float) -> float:
+    """The radius [px] of a dark disc or ring about the centre, as a camera's own lens shows in its mirror; 0: none."""
+    polar = _polar(image, center, int(MAX_HUB * rim_px))
+    dark = np.mean(polar < threshold, axis=0)
+    rings = np.convolve(dark >= HUB_SUPPORT, np.ones(HUB_RING_PX), "valid") == HUB_RING_PX
+    ends = np.flatnonzero(rings[:-1] & ~rings[1:]) + HUB_RING_PX
+    return float(ends[-1]) if ends.size else 0.0

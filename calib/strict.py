@@ -1,0 +1,136 @@
+"""Values out of parsed TOML or YAML, checked: an error names the file, the dotted key, what was found and expected."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from calib import se3
+from calib.camera import Array
+from calib.errors import CalibError
+
+# Larger than any calibration with two embedded masks; what is larger is not one.
+MAX_FILE_BYTES = 16_000_000
+SHOWN_CHARACTERS = 80
+# A rotation typed with few digits is made exactly one; what a program wrote is left bit for bit.
+ORTHONORMAL_TOLERANCE = 1e-9
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a calibration file of sane size."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise CalibError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise CalibError(f"{path}: expected a calibration file, found more than {MAX_FILE_BYTES} bytes")
+    return data
+
+
+def decode(data: bytes | str, name: str) -> str:
+    """The text of a calibration file, UTF-8."""
+    try:
+        return data if isinstance(data, str) else data.decode()
+    except UnicodeDecodeError as error:
+        raise CalibError(f"{name}: expected UTF-8 text, found byte {data[error.start]!r} at {error.start}") from error
+
+
+def shown(value: object) -> str:
+    """The value on one short line."""
+    text = repr(value)
+    return text if len(text) <= SHOWN_CHARACTERS else text[:SHOWN_CHARACTERS] + " ..."
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One table of a file: typed look-ups that raise CalibError; path is its dotted name, "" at the top."""
+
+    values: Mapping[Any, Any]
+    file: str
+    path: str = ""
+
+    def fail(self, key: str, expected: str) -> NoReturn:
+        """Refuse the value of a key."""
+        found = shown(self.values[key]) if key in self.values else "nothing"
+        raise CalibError(f"{self.file}: {self._dotted(key)}: expected {expected}, found {found}")
+
+    def only(self, known: Collection[str]) -> None:
+        """Refuse keys that nobody reads: a misspelt one must not pass for its default."""
+        unknown = [str(key) for key in self.values if key not in known]
+        if unknown:
+            raise CalibError(f"{self.file}: {self._dotted(repr(unknown[0])[1:-1][:SHOWN_CHARACTERS])}: unknown key, "
+                             f"expected one of {', '.join(sorted(known))}")
+
+    def has(self, key: str) -> bool:
+        """Whether the key is there."""
+        return key in self.values
+
+    def table(self, key: str) -> Table:
+        """The table under a key."""
+        if not isinstance(self.values.get(key), Mapping):
+            self.fail(key, "a table")
+        return Table(self.values[key], self.file, self._dotted(key))
+
+    def text(self, key: str) -> str:
+        """The string under a key."""
+        value = self.values.get(key)
+        return value if isinstance(value, str) else self.fail(key, "a string")
+
+    def choice(self, key: str, options: Collection[str]) -> str:
+        """The string under a key, one of the options."""
+        value = self.values.get(key)
+        return value if isinstance(value, str) and value in options else self.fail(key, " or ".join(options))
+
+    def number(self, key: str) -> float:
+        """The finite number under a key."""
+        value: Any = self.values.get(key)
+        return float(value) if _is_number(value) else self.fail(key, "a finite number")
+
+    def numbers(self, key: str, count: int = 0) -> tuple[float, ...]:
+        """The finite numbers under a key; count 0: at least one."""
+        value = self.values.get(key)
+        sized = isinstance(value, list) and (len(value) == count if count else len(value) > 0)
+        if not sized or not all(_is_number(item) for item in value or ()):
+            self.fail(key, f"{count or 'one or more'} finite numbers")
+        return tuple(float(item) for item in value or ())
+
+    def size(self, key: str) -> tuple[int, int]:
+        """The image size (width, height) [px] under a key."""
+        value = self.values.get(key)
+        whole = isinstance(value, list) and [type(item) for item in value] == [int, int]
+        if not whole or not all(1 <= item <= 32767 for item in value or ()):
+            self.fail(key, "[width, height] in pixels, 1 to 32767")
+        width, height = value or (0, 0)
+        return width, height
+
+    def transform(self, key: str) -> Array:
+        """The rigid transform (4, 4) under a key."""
+        value = self.values.get(key)
+        square = isinstance(value, list) and len(value) == 4
+        if not square or not all(isinstance(row, list) and len(row) == 4 for row in value or ()):
+            self.fail(key, "4 rows of 4 numbers")
+        if not all(_is_number(item) for row in value or () for item in row):
+            self.fail(key, "4 rows of 4 finite numbers")
+        T = np.array(value, float)
+        return rigid(T) if se3.is_rigid(T) else self.fail(key, "a rotation and a translation over 0 0 0 1")
+
+    def _dotted(self, key: str) -> str:
+        return f"{self.path}.{key}" if self.path else key
+
+
+def rigid(T: Array) -> Array:
+    """T (4, 4) with its rotation made orthonormal where it was written with few digits, else as it is."""
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
+        return T
+    left, _, right = np.linalg.svd(R)
+    return se3.transform(left @ right, T[:3, 3])
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300

@@ -1,0 +1,58 @@
+"""The transform between two cameras, from a small file or from one measured length."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from calib import se3
+from calib.camera import Array
+from calib.errors import CalibError
+from calib.kalibr import load_yaml
+from calib.rig import MIN_BASELINE_M
+from calib.strict import Table, decode, read_bytes
+
+KEY = "T_lower_upper"
+INVERSE_KEY = "T_upper_lower"
+
+
+def read_transform(path: Path) -> Array:
+    """T_lower_upper (4, 4) of a file: TOML or YAML with that key (or T_upper_lower), or 16 numbers of T_lower_upper."""
+    text = decode(read_bytes(path), str(path))
+    if path.suffix == ".toml":
+        return _named(_toml(text, path))
+    if path.suffix in (".yaml", ".yml"):
+        return _named(Table(load_yaml(text, str(path)), str(path)))
+    words = " ".join(line.partition("#")[0] for line in text.splitlines()).replace(",", " ").split()
+    try:
+        numbers: list[object] = [float(word) for word in words]
+    except ValueError as error:
+        raise CalibError(f"{path}: expected 16 numbers, the rows of {KEY}: {error}") from error
+    rows = [numbers[start:start + 4] for start in range(0, len(numbers), 4)]
+    return Table({KEY: rows}, str(path)).transform(KEY)
+
+
+def straight_up(baseline_m: float) -> Array:
+    """T_lower_upper of an upper camera straight above the lower one and turned alike, both looking up.
+
+    A lens that looks up, and a camera that looks up into its mirror, both have their z axis pointing down.
+    """
+    if not (np.isfinite(baseline_m) and baseline_m >= MIN_BASELINE_M):
+        raise CalibError(f"--baseline: expected metres, {MIN_BASELINE_M} or more, found {baseline_m}")
+    return se3.transform(np.eye(3), (0.0, 0.0, -baseline_m))
+
+
+def _toml(text: str, path: Path) -> Table:
+    try:
+        return Table(tomllib.loads(text), str(path))
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise CalibError(f"{path}: not a TOML file: {error}") from error
+
+
+def _named(table: Table) -> Array:
+    table.only((KEY, INVERSE_KEY))
+    if table.has(KEY) == table.has(INVERSE_KEY):
+        raise CalibError(f"{table.file}: expected either {KEY} or {INVERSE_KEY}")
+    return table.transform(KEY) if table.has(KEY) else se3.inverse(table.transform(INVERSE_KEY))
