@@ -1,0 +1,210 @@
+"""A line protocol for a base with a heading input: messages <-> bytes, no I/O.
+
+Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus sign; CR may stand before LF):
+
+    line    = "$" body "*" crc LF        at most 64 bytes
+    crc     = 4 hexadecimal digits: CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) of the bytes of body
+    body    = velocity | status | watchdog | armed
+
+    host to controller
+    velocity = "V," seq "," velocity "," heading "," yaw_rate          drive; answered by a status
+    watchdog = "W," time                                               set the watchdog; answered by armed
+
+    controller to host
+    status   = "S," seq "," velocity "," heading "," yaw_rate "," battery "," fault "," expired
+    armed    = "A," time                                               the watchdog time now in force
+
+| field    | unit     | range           |                                                                          |
+|----------|----------|-----------------|--------------------------------------------------------------------------|
+| seq      | 1        | 0 .. 65535      | one more with each velocity line, after 65535 comes 0; a status repeats it |
+| velocity | mm/s     | -10000 .. 10000 | forward                                                                  |
+| heading  | mrad     | -3142 .. 3142   | counter-clockwise; 0 is where the base pointed when the watchdog was set |
+| yaw_rate | mrad/s   | -20000 .. 20000 | counter-clockwise                                                        |
+| battery  | mV       | -1 .. 100000    | -1 is unknown                                                            |
+| fault    | 1        | 0 .. 65535      | 0 is none                                                                |
+| expired  | 1        | 0, 1            | 1: the watchdog had stopped the wheels before this command came          |
+| time     | ms       | 20 .. 10000     |                                                                          |
+
+A controller with a heading input steers to the heading; one without follows the yaw rate. Velocity 0 with yaw rate 0 is
+the stop for both. The controller stops the wheels by itself when no valid velocity line came for the watchdog time; the
+next one drives again. It ignores lines that are not exactly as above; the host asks again.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+import re
+from dataclasses import dataclass
+
+from drivers.errors import DriverError
+from drivers.motor import MotorStatus, VelocityCommand
+
+SEQ_COUNT = 65536
+MAX_LINE = 64
+
+_LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,7})\*([0-9A-Fa-f]{4})\r?\n?")
+_SEQ = (0, SEQ_COUNT - 1)
+_VELOCITY = (-10_000, 10_000)
+_HEADING = (-3142, 3142)
+_YAW_RATE = (-20_000, 20_000)
+_BATTERY = (-1, 100_000)
+_FAULT = (0, 65535)
+_TIME = (20, 10_000)
+_RANGES = {
+    "V": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE),
+    "S": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE, _BATTERY, _FAULT, (0, 1)),
+    "W": (_TIME,),
+    "A": (_TIME,),
+}
+_NAMES = (
+    ("seq", "(a count)"),
+    ("velocity", "mm/s"),
+    ("heading", "mrad"),
+    ("yaw rate", "mrad/s"),
+    ("battery", "mV"),
+    ("fault", "(a number)"),
+    ("expired", "(a flag)"),
+)
+_TIME_NAME = (("watchdog time", "ms"),)
+
+
+class ProtocolError(DriverError):
+    """A line that is not of the protocol, or a number that has no place in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """Host to controller: a command. Its stamp does not travel; a decoded one has stamp 0."""
+
+    seq: int
+    command: VelocityCommand
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Controller to host: the answer to the command with this seq."""
+
+    seq: int
+    status: MotorStatus
+
+
+@dataclass(frozen=True, slots=True)
+class SetWatchdog:
+    """Host to controller: stop by yourself after this time without a command."""
+
+    watchdog_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class WatchdogSet:
+    """Controller to host: the watchdog time in force."""
+
+    watchdog_ms: int
+
+
+Message = Velocity | Status | SetWatchdog | WatchdogSet
+
+
+def encode(message: Message) -> bytes:
+    """The line of a message; ProtocolError for a number that is not finite or out of its range."""
+    kind, numbers = _fields(message)
+    _check(kind, numbers)
+    body = ",".join([kind, *map(str, numbers)]).encode()
+    return b"$%b*%04X\n" % (body, crc16(body))
+
+
+def decode(line: bytes) -> Message:
+    """The message of a line, with or without its end; any bytes may come: ProtocolError unless it is exactly one."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise ProtocolError(f"{line[:MAX_LINE]!r} is not a line of the motor protocol; check port and baud rate")
+    body, crc = match.groups()
+    if int(crc, 16) != crc16(body):
+        raise ProtocolError(f"{line[:MAX_LINE]!r} has a wrong checksum (found {crc16(body):04X}); check the cable")
+    kind, *texts = body.decode("ascii").split(",")
+    numbers = [int(text) for text in texts]
+    _check(kind, numbers)
+    return _message(kind, numbers)
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE of data; of b"123456789" it is 0x29B1."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def _fields(message: Message) -> tuple[str, list[int]]:
+    match message:
+        case Velocity(seq, command):
+            return "V", [seq, *_motion(command)]
+        case Status(seq, status):
+            battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
+            return "S", [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
+        case SetWatchdog(watchdog_ms):
+            return "W", [watchdog_ms]
+        case WatchdogSet(watchdog_ms):
+            return "A", [watchdog_ms]
+
+
+def _motion(source: VelocityCommand | MotorStatus) -> tuple[int, int, int]:
+    return (
+        _milli("velocity", source.velocity_mps),
+        _milli("heading", source.heading_rad),
+        _milli("yaw rate", source.yaw_rate_radps),
+    )
+
+
+def _milli(name: str, value: float) -> int:
+    milli = value * 1000
+    if not math.isfinite(milli):
+        raise ProtocolError(f"motor {name} is {value}; only finite numbers can be sent, send a stop instead")
+    return round(milli)
+
+
+def _check(kind: str, numbers: list[int]) -> None:
+    ranges = _RANGES[kind]
+    if len(numbers) != len(ranges):
+        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(ranges)}; check the firmware")
+    names = _NAMES if len(ranges) > 1 else _TIME_NAME
+    for (name, unit), number, (low, high) in zip(names, numbers, ranges, strict=False):
+        if not low <= number <= high:
+            raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
+
+
+def _message(kind: str, numbers: list[int]) -> Message:
+    if kind == "W":
+        return SetWatchdog(numbers[0])
+    if kind == "A":
+        return WatchdogSet(numbers[0])
+    seq, velocity_mps, heading_rad, yaw_rate_radps = numbers[0], *(n / 1000 for n in numbers[1:4])
+    if kind == "V":
+        return Velocity(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
+    battery_v = math.nan if numbers[4] < 0 else numbers[4] / 1000
+    return Status(seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(numbers[6]), numbers[5], battery_v))
+
+
+class LineAssembler:
+    """Lines out of a byte stream in any pieces; starts anew at every '$', holds at most MAX_LINE bytes."""
+
+    def __init__(self) -> None:
+        self.garbage = 0  # bytes that belonged to no whole line
+        self._line = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The whole lines that end in data, each from its '$' to its line feed."""
+        lines = []
+        for byte in data:
+            if byte == ord("$") or len(self._line) >= MAX_LINE:
+                self._discard()
+            if not self._line and byte != ord("$"):
+                self.garbage += byte not in b"\r\n"
+                continue
+            self._line.append(byte)
+            if byte == ord("\n"):
+                lines.append(bytes(self._line))
+                self._line.clear()
+        return lines
+
+    def _discard(self) -> None:
+        self.garbage += len(self._line)
+        self._line.clear()

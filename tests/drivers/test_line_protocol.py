@@ -1,0 +1,148 @@
+"""The motor's line protocol: known lines, every range's edge, any bytes."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.line_protocol import (
+    MAX_LINE,
+    LineAssembler,
+    Message,
+    ProtocolError,
+    SetWatchdog,
+    Status,
+    Velocity,
+    WatchdogSet,
+    crc16,
+    decode,
+    encode,
+)
+from drivers.motor import MotorStatus, VelocityCommand, stop_command
+
+STATUS = MotorStatus(0.25, -1.5, 0.125, watchdog_expired=True, fault=7, battery_v=12.6)
+MESSAGES: list[Message] = [
+    Velocity(0, stop_command(0)),
+    Velocity(65535, VelocityCommand(0, -10.0, 3.142, -20.0)),
+    Velocity(1, VelocityCommand(0, 10.0, -3.142, 20.0)),
+    Status(65535, STATUS),
+    Status(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
+    SetWatchdog(20),
+    WatchdogSet(10_000),
+]
+
+
+def sealed(body: bytes) -> bytes:
+    return b"$%b*%04X\n" % (body, crc16(body))
+
+
+def test_checksum_is_ccitt_false() -> None:
+    assert crc16(b"123456789") == 0x29B1
+
+
+def test_known_lines() -> None:
+    command = VelocityCommand(99, 0.3, -1.571, 0.0504)
+    assert encode(Velocity(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
+    assert encode(Status(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
+    assert encode(SetWatchdog(500)) == sealed(b"W,500")
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_comes_back(message: Message) -> None:
+    line = encode(message)
+    assert decode(line) == message
+    assert decode(line.rstrip() + b"\r\n") == decode(line.rstrip()) == message
+    assert len(line) <= MAX_LINE
+
+
+def test_unknown_battery_is_nan() -> None:
+    line = encode(Status(3, MotorStatus(0.0, 0.0, 0.0, False, 0, math.nan)))
+    assert b",-1,0,0*" in line
+    back = decode(line)
+    assert isinstance(back, Status) and math.isnan(back.status.battery_v)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308, 10.001, -10.001, 20.001, -20.001])
+@pytest.mark.parametrize("field", ["velocity_mps", "heading_rad", "yaw_rate_radps"])
+def test_numbers_without_a_place_never_encode(field: str, bad: float) -> None:
+    if field == "yaw_rate_radps" and abs(bad) < 20:
+        bad *= 3
+    numbers = {"velocity_mps": 0.1, "heading_rad": 0.1, "yaw_rate_radps": 0.1, field: bad}
+    with pytest.raises(ProtocolError):
+        encode(Velocity(0, VelocityCommand(0, **numbers)))
+
+
+@pytest.mark.parametrize("message", [Velocity(-1, stop_command(0)), Velocity(65536, stop_command(0)),
+                                     SetWatchdog(0), SetWatchdog(19), SetWatchdog(10_001)])  # fmt: skip
+def test_counts_and_times_stay_inside(message: Message) -> None:
+    with pytest.raises(ProtocolError, match="keep it inside"):
+        encode(message)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"V", b"V,", b"V,1,2,3", b"V,1,2,3,4,5", b"V,+1,2,3,4", b"V,1_0,2,3,4", b"V, 1,2,3,4", b"v,1,2,3,4", b"Q,1",
+     b"V,1,10001,0,0", b"V,1,0,3143,0", b"V,1,0,0,20001", b"V,65536,0,0,0", b"V,-1,0,0,0", b"V,1,0.5,0,0", b"W,0",
+     b"W,1,2,3,4", b"V,0000001,0,0,0", "V,\u0661,0,0,0".encode(), b"S,1,0,0,0,0,0,2", b"A,10001"],
+)  # fmt: skip
+def test_well_sealed_nonsense_is_refused(body: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        decode(sealed(body))
+
+
+def test_every_changed_byte_is_noticed() -> None:
+    line = encode(Velocity(17, VelocityCommand(0, 0.3, -1.571, 0.05)))
+    for i in range(len(line) - 1):
+        for value in set(range(256)) - {line[i], line[i] ^ 0x20}:  # hexadecimal digits may be small letters
+            with pytest.raises(ProtocolError):
+                decode(line[:i] + bytes([value]) + line[i + 1 :])
+
+
+def test_errors_are_driver_errors_in_one_line() -> None:
+    with pytest.raises(DriverError) as caught:
+        decode(b"$\n\n" * 1000)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_any_bytes() -> None:
+    rng = random.Random(3)
+    assembler = LineAssembler()
+    for _ in range(3000):
+        noise = bytes(rng.choice(b"$V,S*W0123456789-AF\r\n\xff\x00") for _ in range(rng.randint(0, 90)))
+        for line in [noise, *assembler.feed(noise)]:
+            with pytest.raises(ProtocolError):
+                decode(line)
+
+
+def test_assembler_takes_any_pieces() -> None:
+    rng = random.Random(4)
+    stream = b"".join(encode(message) for message in MESSAGES * 20)
+    assembler, lines = LineAssembler(), []
+    while stream:
+        size = rng.randint(1, 40)
+        lines += assembler.feed(stream[:size])
+        stream = stream[size:]
+    assert [decode(line) for line in lines] == MESSAGES * 20
+    assert assembler.garbage == 0
+
+
+@pytest.mark.parametrize(
+    ("noise", "garbage"),
+    [(b"boot v1\r\n", 7), (b"$V,1,2", 6), (b"\xff\x00\xfe", 3), (b"$" * 10, 10), (b"$" + b"x" * 10_000, 10_001),
+     (b"\r\n\r\n", 0)],
+)  # fmt: skip
+def test_assembler_finds_the_next_line(noise: bytes, garbage: int) -> None:
+    assembler = LineAssembler()
+    (line,) = assembler.feed(noise + encode(SetWatchdog(500)))
+    assert decode(line) == SetWatchdog(500)
+    assert assembler.garbage == garbage
+
+
+def test_assembler_stays_small() -> None:
+    assembler = LineAssembler()
+    for _ in range(100):
+        assert assembler.feed(b"$" + b"1" * 5000) == []
+    assert len(assembler._line) <= MAX_LINE

@@ -1,0 +1,305 @@
+"""The serial motor against its twin: as pure state, and over a real pty."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import random
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from drivers import serial_motor
+from drivers.errors import DriverError
+from drivers.line_protocol import SetWatchdog, Status, Velocity, WatchdogSet, decode, encode
+from drivers.motor import MotorDriver, MotorStatus, VelocityCommand, is_stop, stop_command
+from drivers.serial_motor import SerialMotor
+from drivers.simulated_motor import SimulatedMotor, TwinState
+
+PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing here is measured against it
+ANSWER_S = 2.0
+
+
+def drive(state: TwinState, seconds: float, command: VelocityCommand) -> None:
+    """Commands at 20 Hz for a while."""
+    for _ in range(round(seconds * 20)):
+        assert state.handle(encode(Velocity(state.commands, command))) is not None
+        state.advance(0.05)
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return condition()
+
+
+@pytest.fixture
+def twin() -> Iterator[SimulatedMotor]:
+    with contextlib.closing(SimulatedMotor()) as twin:
+        yield twin
+
+
+# The twin as pure state
+
+
+def test_twin_drives_straight() -> None:
+    state = TwinState()
+    drive(state, 2.0, VelocityCommand(0, 0.5, 0.0, 0.0))
+    x_m, y_m, heading_rad = state.pose
+    assert 0.9 < x_m < 1.0 and y_m == 0.0 and heading_rad == 0.0
+    assert state.errors == 0 and state.commands == 40
+
+
+@pytest.mark.parametrize("heading_rad", [1.0, -2.0, 3.1, -3.1])
+def test_twin_steers_to_the_heading(heading_rad: float) -> None:
+    state = TwinState()
+    drive(state, 6.0, VelocityCommand(0, 0.2, heading_rad, 0.0))
+    assert state.pose[2] == pytest.approx(heading_rad, abs=0.01)
+
+
+def test_twin_crosses_half_a_turn_the_short_way() -> None:
+    state = TwinState()
+    drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
+    before, turned = state.pose[2], 0.0
+    for _ in range(40):
+        drive(state, 0.05, VelocityCommand(0, 0.2, -3.0, 0.0))
+        turned += math.remainder(state.pose[2] - before, math.tau)
+        before = state.pose[2]
+    assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
+
+
+def test_twin_without_heading_input_follows_the_yaw_rate() -> None:
+    state = TwinState(heading_input=False)
+    drive(state, 2.0, VelocityCommand(0, 0.5, 2.0, 0.5))
+    x_m, y_m, heading_rad = state.pose
+    assert heading_rad == pytest.approx(1.0, abs=0.05)
+    assert math.hypot(x_m, y_m - 1.0) == pytest.approx(1.0, abs=0.05)  # a circle of radius v / w = 1 m about (0, 1)
+
+
+def test_stop_does_not_turn_towards_its_heading() -> None:
+    state = TwinState()
+    drive(state, 4.0, VelocityCommand(0, 0.2, 1.0, 0.0))
+    drive(state, 2.0, stop_command(0))
+    assert state.pose[2] == pytest.approx(1.0, abs=0.01)
+    assert state.velocity_mps == 0.0 and is_stop(stop_command(7))
+
+
+def test_watchdog_stops_the_wheels_and_says_so() -> None:
+    state = TwinState()
+    assert state.handle(encode(SetWatchdog(200))) == encode(WatchdogSet(200))
+    drive(state, 1.0, VelocityCommand(0, 0.5, 0.0, 0.0))
+    state.advance(0.14)  # with the 0.05 s of the last command
+    assert not state.watchdog_expired and state.velocity_mps == 0.5
+    state.advance(1.0)
+    assert state.watchdog_expired and state.velocity_mps == 0.0 and state.expiries == 1
+    answers = [state.handle(encode(Velocity(20 + i, stop_command(0)))) for i in range(2)]
+    expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, Status)]
+    assert expired == [True, False]
+
+
+def test_noise_does_not_feed_the_watchdog() -> None:
+    state = TwinState()
+    for _ in range(20):
+        state.handle(b"$V,0,100,0,0*0000\n")
+        state.advance(0.05)
+    assert state.watchdog_expired and state.errors == 20 and state.commands == 0
+
+
+def test_gap_in_seq_is_an_error_but_obeyed() -> None:
+    state = TwinState()
+    command = VelocityCommand(0, 0.2, 0.0, 0.0)
+    for seq, told in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
+        assert state.handle(encode(Velocity(seq, told))) is not None
+    assert state.errors == 1 and state.last_command == command
+
+
+def test_heading_counts_from_where_the_host_connected() -> None:
+    state = TwinState()
+    drive(state, 4.0, VelocityCommand(0, 0.0, 1.0, 0.1))
+    state.handle(encode(SetWatchdog(500)))
+    answer = decode(state.handle(encode(Velocity(0, stop_command(0)))) or b"")
+    assert isinstance(answer, Status) and answer.status.heading_rad == 0.0
+    assert state.pose[2] == pytest.approx(1.0, abs=0.01)
+
+
+def test_twin_survives_any_line() -> None:
+    rng, state = random.Random(5), TwinState()
+    for _ in range(1000):
+        assert state.handle(rng.randbytes(rng.randint(0, 40))) is None
+    assert state.errors == 1000
+
+
+@pytest.mark.parametrize("dt_s", [-0.1, math.nan, math.inf, 61.0])
+def test_twin_refuses_odd_times(dt_s: float) -> None:
+    with pytest.raises(DriverError, match="cannot advance"):
+        TwinState().advance(dt_s)
+
+
+# The serial motor and the twin over a pty
+
+
+def test_commands_arrive_and_are_answered(twin: SimulatedMotor) -> None:
+    motor: MotorDriver = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
+    command = VelocityCommand(123, 0.5, 0.0, 0.0)
+    assert until(lambda: motor.send(command).velocity_mps == 0.5)
+    assert twin.pose[0] > 0.0
+    assert twin.last_command == VelocityCommand(0, 0.5, 0.0, 0.0)
+    assert motor.send(command) == MotorStatus(0.5, 0.0, 0.0, False, 0, 12.0)
+    motor.close()
+    assert twin.errors == 0 and twin.state.watchdog_ms == 10_000
+
+
+def test_close_stops_the_wheels(twin: SimulatedMotor) -> None:
+    motor = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
+    motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
+    motor.close()
+    motor.close()
+    assert twin.last_command == stop_command(0) and twin.commands == 1 + serial_motor.STOPS_AT_CLOSE
+    assert until(lambda: twin.state.velocity_mps == 0.0) and not twin.watchdog_expired
+
+
+def test_silent_host_is_stopped_by_the_watchdog(twin: SimulatedMotor) -> None:
+    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=20)) as motor:
+        motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
+        assert until(lambda: twin.watchdog_expired and twin.state.velocity_mps == 0.0)
+        assert motor.send(stop_command(0)).watchdog_expired
+
+
+def test_many_commands_over_the_end_of_seq(twin: SimulatedMotor) -> None:
+    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor:
+        motor._seq = 65500
+        for i in range(100):
+            motor.send(VelocityCommand(i, 0.001 * i, 0.01 * i, -0.02 * i))
+        assert twin.commands == 100 and twin.errors == 0 and motor.garbage == motor.bad_lines == 0
+
+
+def test_unsendable_command_sends_nothing(twin: SimulatedMotor) -> None:
+    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor:
+        with pytest.raises(DriverError, match="velocity is nan"):
+            motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
+        motor.send(stop_command(0))
+        assert twin.commands == 1 and twin.errors == 0
+
+
+def test_port_is_for_one_program(twin: SimulatedMotor) -> None:
+    with (
+        contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)),
+        pytest.raises(DriverError, match=r"cannot be opened .*lock"),
+    ):
+        SerialMotor(twin.port)
+
+
+@pytest.mark.parametrize("port", ["/dev/no-such-motor", "/dev/null", "/", ""])
+def test_open_failure_names_port_and_group(port: str) -> None:
+    with pytest.raises(DriverError, match="dialout") as caught:
+        SerialMotor(port)
+    assert f"motor port {port} " in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("watchdog_ms", "timeout_s"), [(0, 0.05), (20_000, 0.05), (500, 0.0), (500, math.nan)])
+def test_settings_must_make_sense(twin: SimulatedMotor, watchdog_ms: int, timeout_s: float) -> None:
+    with pytest.raises(DriverError, match=r"watchdog|timeout"):
+        SerialMotor(twin.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
+
+
+class Stubborn(TwinState):
+    """A controller that keeps its own watchdog time."""
+
+    def handle(self, line: bytes) -> bytes | None:
+        """The answer of the twin, but with 1000 ms in force."""
+        answer = super().handle(line)
+        return encode(WatchdogSet(1000)) if answer and answer.startswith(b"$A") else answer
+
+
+def test_watchdog_in_force_is_verified() -> None:
+    with (
+        contextlib.closing(SimulatedMotor(Stubborn())) as twin,
+        pytest.raises(DriverError, match="500 ms asked, 1000 ms in force"),
+    ):
+        SerialMotor(twin.port, timeout_s=ANSWER_S)
+
+
+class Deaf(TwinState):
+    """A controller that answers nothing after `hearing` lines."""
+
+    def __init__(self, hearing: int) -> None:
+        super().__init__()
+        self.hearing = hearing
+
+    def handle(self, line: bytes) -> bytes | None:
+        """The answer of the twin while it hears."""
+        self.hearing -= 1
+        return super().handle(line) if self.hearing >= 0 else None
+
+
+def test_silence_at_connect() -> None:
+    with contextlib.closing(SimulatedMotor(Deaf(0))) as twin, pytest.raises(DriverError, match="confirmed no watchdog"):
+        SerialMotor(twin.port, connect_s=0.1)
+
+
+def test_silence_later_ends_in_an_error_and_close_returns() -> None:
+    with contextlib.closing(SimulatedMotor(Deaf(1))) as twin:
+        motor = SerialMotor(twin.port, connect_s=PATIENCE_S)
+        with pytest.raises(DriverError, match="no answer to 3 commands"):
+            motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
+        motor.close()
+
+
+def test_unplugged_motor_is_an_error_and_close_returns() -> None:
+    twin = SimulatedMotor()
+    motor = SerialMotor(twin.port, timeout_s=ANSWER_S)
+    twin.close()
+    twin.close()
+    with pytest.raises(DriverError, match="is gone"):
+        motor.send(stop_command(0))
+    motor.close()
+
+
+class Echo(TwinState):
+    """Two crossed wires: what is sent comes back."""
+
+    def handle(self, line: bytes) -> bytes | None:
+        """The line itself."""
+        return line
+
+
+def test_echo_is_not_taken_for_an_answer() -> None:
+    with contextlib.closing(SimulatedMotor(Echo())) as twin, pytest.raises(DriverError, match="confirmed no watchdog"):
+        SerialMotor(twin.port, connect_s=0.1)
+
+
+class Noisy(TwinState):
+    """A controller behind a bad cable: noise and stale answers before each good one."""
+
+    def handle(self, line: bytes) -> bytes | None:
+        """The twin's answer behind noise, a broken line and an old status."""
+        answer = super().handle(line) or b""
+        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + encode(Status(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0))) + answer
+
+
+def test_noise_before_the_answer_is_skipped_and_counted() -> None:
+    with (
+        contextlib.closing(SimulatedMotor(Noisy())) as twin,
+        contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor,
+    ):
+        assert motor.send(stop_command(0)).fault == 0
+        assert motor.bad_lines == 2 and motor.garbage == 2 * 6
+
+
+def test_twin_counts_what_is_not_of_the_protocol(twin: SimulatedMotor) -> None:
+    descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
+    os.write(descriptor, b"hello\n$V,1,2,3,4*0000\n" + encode(Velocity(5, stop_command(0))))
+    assert until(lambda: twin.commands == 1)
+    assert twin.errors == 5 + 1
+    os.close(descriptor)
+
+
+def test_twin_outlives_a_host_that_never_reads(twin: SimulatedMotor) -> None:
+    descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
+    for seq in range(2000):
+        os.write(descriptor, encode(Velocity(seq, stop_command(0))))
+    assert until(lambda: twin.commands == 2000) and twin.unsent > 0
+    os.close(descriptor)
