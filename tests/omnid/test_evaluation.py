@@ -73,6 +73,11 @@ def test_known_errors() -> None:
     assert metrics.rpe_rotation_rmse_rad == pytest.approx(0.02 / math.sqrt(10))
 
 
+def test_step_error_is_per_step() -> None:
+    metrics = evaluate(straight(11, 0.099), straight(11, 0.1))
+    assert metrics.rpe_translation_rmse_m == pytest.approx(0.001) and metrics.rpe_rotation_rmse_rad == 0.0
+
+
 def test_worst_is_not_the_end() -> None:
     estimate = straight(11, 0.1)
     estimate.T[4, 1, 3] = 0.3

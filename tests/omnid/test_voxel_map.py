@@ -73,7 +73,7 @@ def test_min_frames_and_age() -> None:
         voxels.insert(row(0, 3 if seq < 4 else 1), var(3 if seq < 4 else 1), seq)
     assert voxels.points(5).age.tolist() == [0]
     assert voxels.points(4).age.tolist() == [0, 6, 6]
-    voxels.insert(row(1, 1), var(1), 7)  # a late frame makes nothing younger than it is
+    voxels.insert(row(0, 2), var(2), 7)  # a late frame makes nothing older, and nothing younger than itself
     assert voxels.points(4).age.tolist() == [0, 2, 6]
 
 
