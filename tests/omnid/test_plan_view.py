@@ -12,6 +12,7 @@ from omnid.core.voxel_map import MapPoints
 
 MARGIN_PX = 64
 NO_PATH = np.empty((0, 2))
+OVERFLOWING = np.array([[1e308, 0.0], [-1e308, 0.0]])
 
 
 def points(xyz: NDArray[np.float64], confidence: float = 0.8) -> MapPoints:
@@ -95,7 +96,7 @@ def test_path_is_seen_on_a_dark_map() -> None:
     assert rim.size >= 2 and rim.min() < grey.shape[0] // 2 < rim.max()
 
 
-@pytest.mark.parametrize("path", [NO_PATH, np.zeros((1, 2)), np.full((3, 2), np.nan), np.array([[1e308, 0.0], [-1e308, 0.0]])])
+@pytest.mark.parametrize("path", [NO_PATH, np.zeros((1, 2)), np.full((3, 2), np.nan), OVERFLOWING])
 def test_next_to_nothing_is_still_a_picture(path: NDArray[np.float64]) -> None:
     image = plan_view(EMPTY, path)
     assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
