@@ -1,0 +1,110 @@
+"""Heading hold: a setpoint of speed and heading becomes a bounded speed and yaw rate, one tick at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from omnid.errors import OmnidError
+
+LONGEST_TICK_S = 0.2  # a late tick does not earn a larger jump
+HALF_TURN_RAD = 0.2  # within this of half a turn, noise would flip the side to turn to
+BRAKING_SHARE = 0.8  # of the yaw acceleration is planned for slowing down; the rest is for lag
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingLimits:
+    """What the base may be asked for, in magnitude, and the gain of the heading."""
+
+    velocity_mps: float = 0.5
+    acceleration_mps2: float = 0.5
+    yaw_rate_radps: float = 1.0
+    yaw_acceleration_radps2: float = 3.0
+    gain_hz: float = 1.5
+
+    def __post_init__(self) -> None:
+        """OmnidError unless each number is finite and above 0."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value > 0):
+                raise OmnidError(f"heading hold: {field.name} is {value}; give a finite number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """What is wanted: a speed, and a heading in odom or, where that is None, a yaw rate."""
+
+    velocity_mps: float
+    heading_rad: float | None = None
+    yaw_rate_radps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What the base is told: forward speed and yaw rate, counter-clockwise."""
+
+    velocity_mps: float = 0.0
+    yaw_rate_radps: float = 0.0
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """The same direction within -pi .. pi; NaN of what is not finite."""
+    return math.remainder(angle_rad, math.tau) if math.isfinite(angle_rad) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingHold:
+    """A proportional heading controller that never leaves its limits, whatever it is given.
+
+    Rate and acceleration are bounded; near the goal the rate follows sqrt(2 a e), from which it can still brake.
+    """
+
+    limits: HeadingLimits = HeadingLimits()
+
+    def step(self, setpoint: Setpoint, heading_rad: float, dt_s: float, previous: Drive) -> Drive:
+        """The drive dt_s after `previous`; heading_rad is measured, in odom.
+
+        A setpoint or heading that is not finite: stops as fast as the limits allow. A time or a previous drive
+        that is not finite: stands still at once, for there is nothing to slow down from.
+        """
+        if not all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
+            return Drive()
+        limits = self.limits
+        dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S)
+        velocity_mps = _clamp(previous.velocity_mps, limits.velocity_mps)
+        yaw_rate_radps = _clamp(previous.yaw_rate_radps, limits.yaw_rate_radps)
+        wanted = self._wanted(setpoint, heading_rad, yaw_rate_radps)
+        return Drive(
+            _towards(velocity_mps, wanted.velocity_mps, limits.acceleration_mps2 * dt_s),
+            _towards(yaw_rate_radps, wanted.yaw_rate_radps, limits.yaw_acceleration_radps2 * dt_s),
+        )
+
+    def _wanted(self, setpoint: Setpoint, heading_rad: float, yaw_rate_radps: float) -> Drive:
+        """The drive without acceleration limits; a stop where a number is not finite."""
+        goal_rad = 0.0 if setpoint.heading_rad is None else setpoint.heading_rad
+        numbers = (setpoint.velocity_mps, setpoint.yaw_rate_radps, goal_rad, heading_rad)
+        if not all(map(math.isfinite, numbers)):
+            return Drive()
+        rate_radps = setpoint.yaw_rate_radps
+        if setpoint.heading_rad is not None:
+            rate_radps = self._rate(wrap_angle(wrap_angle(goal_rad) - wrap_angle(heading_rad)), yaw_rate_radps)
+        limits = self.limits
+        return Drive(_clamp(setpoint.velocity_mps, limits.velocity_mps), _clamp(rate_radps, limits.yaw_rate_radps))
+
+    def _rate(self, error_rad: float, yaw_rate_radps: float) -> float:
+        """The yaw rate for a heading error; near half a turn it goes on the way it turns."""
+        size_rad = abs(error_rad)
+        braking_radps = math.sqrt(2 * BRAKING_SHARE * self.limits.yaw_acceleration_radps2 * size_rad)
+        side = error_rad
+        if size_rad > math.pi - HALF_TURN_RAD and yaw_rate_radps != 0.0:
+            side = yaw_rate_radps
+        return math.copysign(min(self.limits.gain_hz * size_rad, braking_radps), side)
+
+
+def _clamp(value: float, magnitude: float) -> float:
+    return max(-magnitude, min(magnitude, value))
+
+
+def _towards(value: float, goal: float, reach: float) -> float:
+    """The value moved towards the goal by at most reach."""
+    return value + _clamp(goal - value, reach)
