@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from calib.camera import Array, Mask
 
 AZIMUTHS = 720
-# The rim must stand out from the dark by so many grey levels at least, as must a single azimuth's edge.
+MIN_SIDE_PX = 64
+# The world must stand out from the dark by so many grey levels; at an azimuth's edge, within a few pixels, by MIN_STEP.
 MIN_CONTRAST = 25.0
+MIN_STEP = 12.0
 # The edge lies between the dark and the light level, nearer the dark: the world at the rim is often dark too.
 EDGE_FRACTION = 0.25
 # Pixels on either side over which the edge is judged, and how far beyond it the dark has to last.
@@ -23,9 +25,11 @@ MIN_ARC = 0.4
 FIT_ROUNDS = 200
 # What is cut off inside the rim and outside the hub: blur and the last reflections at the edge.
 SAFETY_PX = 1.5
+# A hub ends within this part of the rim's radius, at a ring dark all around after rings mostly dark (a lens glints),
+# and the world begins within a few pixels: the dark part of the ring drops.
 MAX_HUB = 0.4
 HUB_RING_PX = 5
-HUB_SUPPORT = 0.9
+HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2
 
 
 def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
@@ -34,7 +38,7 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
     center_guess (u, v) [px] may be off by a tenth of the radius. A picture that is bright all around (or the maximum of
     several) gives the best rim. None: dark or full-frame pictures, noise, soft vignettes.
     """
-    levels = _levels(image)
+    levels = _levels(image) if min(image.shape) >= MIN_SIDE_PX else None
     if levels is None:
         return None
     edges = _edges(image, center_guess, levels)
@@ -72,8 +76,8 @@ def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[
     polar = _polar(image, center, int(np.hypot(*image.shape)))
     found = [(index, radius) for index, profile in enumerate(polar) if (radius := _last_edge(profile, threshold)) > 0]
     azimuth = 2 * np.pi * np.array([index for index, _ in found]) / AZIMUTHS
-    radius = np.array([radius for _, radius in found])
-    return np.column_stack([center[0] + radius * np.cos(azimuth), center[1] + radius * np.sin(azimuth)])
+    reach = np.array([radius for _, radius in found])
+    return np.column_stack([center[0] + reach * np.cos(azimuth), center[1] + reach * np.sin(azimuth)])
 
 
 def _last_edge(profile: Array, threshold: float) -> float:
@@ -84,11 +88,11 @@ def _last_edge(profile: Array, threshold: float) -> float:
     if last < EDGE_PX or last + 2 * EDGE_PX >= len(profile):
         return 0.0
     inside, outside = profile[last - EDGE_PX + 1:last + 1].mean(), profile[last + EDGE_PX:last + 2 * EDGE_PX].mean()
-    if inside - outside < MIN_CONTRAST:
+    if inside - outside < MIN_STEP:
         return 0.0
     half = (inside + outside) / 2
     at = last - EDGE_PX + 1 + int(np.flatnonzero(profile[last - EDGE_PX + 1:last + 1] >= half)[-1])
-    return at + float((profile[at] - half) / (profile[at] - profile[at + 1]))
+    return at + float(profile[at] - half) / float(profile[at] - profile[at + 1])
 
 
 def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
@@ -134,6 +138,7 @@ def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, t
     """The radius [px] of a dark disc or ring about the centre, as a camera's own lens shows in its mirror; 0: none."""
     polar = _polar(image, center, int(MAX_HUB * rim_px))
     dark = np.mean(polar < threshold, axis=0)
-    rings = np.convolve(dark >= HUB_SUPPORT, np.ones(HUB_RING_PX), "valid") == HUB_RING_PX
-    ends = np.flatnonzero(rings[:-1] & ~rings[1:]) + HUB_RING_PX
-    return float(ends[-1]) if ends.size else 0.0
+    inside = np.convolve(dark, np.ones(HUB_RING_PX) / HUB_RING_PX, "valid")[:-HUB_RING_PX]
+    edge, beyond = dark[HUB_RING_PX - 1:-HUB_RING_PX], dark[2 * HUB_RING_PX - 1:]
+    ends = np.flatnonzero((edge >= HUB_EDGE_DARK) & (inside >= HUB_INSIDE_DARK) & (beyond <= edge - HUB_DROP))
+    return float(ends[-1] + HUB_RING_PX) if ends.size else 0.0

@@ -34,6 +34,12 @@ def read_transform(path: Path) -> Array:
     return Table({KEY: rows}, str(path)).transform(KEY)
 
 
+def transform_toml(T_lower_upper: Array) -> str:
+    """The text of a transform file: p_lower = T_lower_upper @ p_upper."""
+    rows = "".join(f"    {[float(value) for value in row]},\n" for row in T_lower_upper)
+    return f"{KEY} = [\n{rows}]\n"
+
+
 def straight_up(baseline_m: float) -> Array:
     """T_lower_upper of an upper camera straight above the lower one and turned alike, both looking up.
 
