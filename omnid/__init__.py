@@ -1,3 +1,3 @@
-"""The daemon: stages, their wiring, the bus and the command line of a robot with two stacked omnidirectional cameras."""
+"""The daemon of a robot with two stacked omnidirectional cameras: stages, their wiring, the bus, the command line."""
 
 __version__ = "0.1.0"

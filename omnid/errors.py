@@ -2,4 +2,4 @@
 
 
 class OmnidError(Exception):
-    """What was asked, what was found and what to do about it, in one line: the command line prints it and exits with 2."""
+    """What was asked, what was found and what to do, in one line: the command line prints it and exits with 2."""

@@ -65,7 +65,7 @@ def _bin(duration_s: float) -> int:
 
 
 def _centre_s(index: int) -> float:
-    return _LOW_S * math.exp(max(index - 0.5, 0.0) / _BINS_PER_E)
+    return min(_LOW_S * math.exp(max(index - 0.5, 0.0) / _BINS_PER_E), _HIGH_S)
 
 
 @dataclass(slots=True)

@@ -1,0 +1,305 @@
+"""Frozen dataclasses from strict TOML and back: a key that nobody reads is an error, not a surprise.
+
+    @dataclass(frozen=True, slots=True)
+    class Stereo:
+        window_px: int = knob(11, "side of the matching window, px", low=3, high=31)
+
+    @dataclass(frozen=True, slots=True)
+    class Config:
+        stereo: Stereo = field(default_factory=Stereo)
+
+    config = load(Config, "omnid.toml", ["stereo.window_px=9"])
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from os import PathLike
+from typing import Any, Final, TypeVar, cast, get_args, get_origin, get_type_hints
+
+from omnid.errors import OmnidError
+
+T = TypeVar("T")
+_MAX_BYTES: Final = 1 << 20
+_SHOWN: Final = 60  # characters of a foreign value in a message
+_MISFIT: Final = object()
+_KINDS: Final[dict[Any, tuple[str, str]]] = {
+    bool: ("true or false", "booleans"),
+    int: ("an integer", "integers"),
+    float: ("a number", "numbers"),
+    str: ("a string", "strings"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Knob:
+    """What a setting is and which values it takes; in a tuple, each element."""
+
+    doc: str
+    low: float | None  # inclusive, as is high
+    high: float | None
+    choices: tuple[Any, ...]
+    finite: bool
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value of the right type is in range."""
+        if isinstance(value, float) and not math.isfinite(value):
+            return not self.finite
+        if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+            return False  # an argument that was not UTF-8
+        if self.choices:
+            return value in self.choices
+        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+
+    @property
+    def bounds(self) -> str:
+        """The range in words, with a leading blank; empty where all values are taken."""
+        if self.choices:
+            return ", one of " + ", ".join(repr(choice) for choice in self.choices)
+        if self.low is None:
+            return "" if self.high is None else f" of at most {self.high}"
+        return f" of at least {self.low}" if self.high is None else f" from {self.low} to {self.high}"
+
+
+def knob(
+    default: T,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: Sequence[Any] = (),
+    finite: bool = True,
+) -> T:
+    """A dataclass field: its default, what it is with its unit, the values it takes (`finite=False`: also inf, nan)."""
+    return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
+
+
+def load(root: type[T], path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> T:
+    """The settings of a TOML file, or the defaults without one, with overrides such as "stereo.window_px=11" on top.
+
+    OmnidError for a file that cannot be read and for everything in it that is not exactly as declared.
+    """
+    if path is None:
+        return parse(root, b"", origin="defaults", overrides=overrides)
+    return parse(root, _bytes_of(path), origin=str(path), overrides=overrides)
+
+
+def parse(root: type[T], data: bytes, *, origin: str, overrides: Sequence[str] = ()) -> T:
+    """The settings of TOML bytes, which came from `origin`; else as `load`."""
+    changes = [_parsed_override(root, text) for text in overrides]
+    try:
+        table = _table_of(data)
+        for path, value in changes:
+            _insert(table, path, value)
+        return cast("T", _built(root(), table, (), tuple(_paths(root))))
+    except OmnidError as error:
+        raise OmnidError(f"{origin}: {error}") from None
+
+
+def dump(settings: object) -> str:
+    """Commented TOML with every knob, what it is, its range and its default; `load` gives the same object again."""
+    return "\n".join(_dumped(settings, type(settings)(), ())).strip("\n") + "\n"
+
+
+def _bytes_of(path: str | PathLike[str]) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OmnidError(f"cannot read the settings file {str(path)!r}: {reason}") from None
+    if len(data) > _MAX_BYTES:
+        raise OmnidError(f"the settings file {str(path)!r} has more than {_MAX_BYTES} bytes: is it the right file?")
+    return data
+
+
+def _table_of(data: bytes) -> dict[str, Any]:
+    try:
+        return tomllib.loads(data.decode())
+    except UnicodeDecodeError as error:
+        raise OmnidError(f"expected TOML in UTF-8, found a foreign byte at offset {error.start}") from None
+    except (ValueError, RecursionError) as error:
+        raise OmnidError(f"expected TOML, found: {' '.join(str(error).split())}") from None
+
+
+def _parsed_override(root: type, text: str) -> tuple[tuple[str, ...], object]:
+    name, equals, raw = text.partition("=")
+    path = tuple(part.strip() for part in name.split("."))
+    if not equals:
+        raise OmnidError(f"override {_shown(text)}: expected section.key=value, found no '='")
+    try:
+        kind, entry = _entry_at(root, path)
+        value = _scalar(raw.strip())
+        if kind is str and not isinstance(value, str):
+            value = raw.strip()
+        return path, _checked(kind, entry, value, path)
+    except OmnidError as error:
+        raise OmnidError(f"override {_shown(text)}: {error}") from None
+
+
+def _scalar(raw: str) -> object:
+    try:
+        table = tomllib.loads(f"value = {raw}")
+    except (ValueError, RecursionError):
+        return raw
+    return table["value"] if table.keys() == {"value"} else raw
+
+
+def _entry_at(root: type, path: tuple[str, ...]) -> tuple[Any, Knob]:
+    kind: Any = root
+    for depth, name in enumerate(path):
+        entries = {entry.name: (hint, entry) for entry, hint in _entries(kind)} if is_dataclass(kind) else {}
+        if name not in entries:
+            raise _unknown(path[: depth + 1], tuple(_paths(root)))
+        kind, entry = entries[name]
+    if is_dataclass(kind):
+        raise OmnidError(f"{_dotted(path)} is a section: name one of its keys, such as {next(_paths(root, path))}")
+    return kind, _knob_of(entry)
+
+
+def _insert(table: dict[str, Any], path: tuple[str, ...], value: object) -> None:
+    for depth, name in enumerate(path[:-1]):
+        inner = table.setdefault(name, {})
+        _require_section(inner, path[: depth + 1])
+        table = inner
+    table[path[-1]] = value
+
+
+def _built(default: object, table: dict[str, Any], path: tuple[str, ...], known: tuple[str, ...]) -> object:
+    entries = _entries(type(default))
+    for name in table.keys() - {entry.name for entry, _ in entries}:
+        raise _unknown((*path, name), known)
+    values: dict[str, object] = {}
+    for entry, kind in entries:
+        here, value = (*path, entry.name), getattr(default, entry.name)
+        if is_dataclass(kind):
+            inner = table.get(entry.name, {})
+            _require_section(inner, here)
+            values[entry.name] = _built(value, inner, here, known)
+        else:
+            values[entry.name] = _checked(kind, _knob_of(entry), table.get(entry.name, value), here)
+    return type(default)(**values)
+
+
+def _checked(kind: Any, entry: Knob, value: object, path: tuple[str, ...]) -> object:
+    fitted = _fitted(kind, entry, value)
+    if fitted is _MISFIT:
+        raise OmnidError(f"{_dotted(path)}: expected {_described(kind, entry)}, found {_shown(value)}")
+    return fitted
+
+
+def _fitted(kind: Any, entry: Knob, value: Any) -> object:
+    """The value as the knob's type, or _MISFIT. A bool is no int; an int will do for a float."""
+    if get_origin(kind) is tuple:
+        return _fitted_tuple(get_args(kind), entry, value)
+    if kind is float and type(value) is int and abs(value) < 1 << 1023:
+        value = float(value)
+    return value if type(value) is kind and entry.allows(value) else _MISFIT
+
+
+def _fitted_tuple(kinds: tuple[Any, ...], entry: Knob, value: Any) -> object:
+    if not isinstance(value, (list, tuple)):
+        return _MISFIT
+    if kinds[-1] is Ellipsis:
+        kinds = kinds[:1] * len(value)
+    if len(kinds) != len(value):
+        return _MISFIT
+    fitted = tuple(_fitted(kind, entry, element) for kind, element in zip(kinds, value, strict=True))
+    return _MISFIT if _MISFIT in fitted else fitted
+
+
+def _require_section(value: object, path: tuple[str, ...]) -> None:
+    if not isinstance(value, dict):
+        raise OmnidError(f"{_dotted(path)}: expected a section, found {_shown(value)}")
+
+
+def _unknown(path: tuple[str, ...], known: tuple[str, ...]) -> OmnidError:
+    """The error for a key that nobody reads: meant is a key of the same section, a section, or any key."""
+    section, name = _dotted(path[:-1]), _dotted(path)
+    siblings = [other for other in known if other.rpartition(".")[0] == section]
+    leaves = {other.rpartition(".")[2]: other for other in siblings}
+    sections = {other.rpartition(".")[0]: other.rpartition(".")[0] for other in known}
+    for asked, candidates in ((path[-1], leaves), (name, sections), (name, {other: other for other in known})):
+        for nearest in difflib.get_close_matches(asked[:80], candidates, n=1, cutoff=0.6):
+            return OmnidError(f"unknown key {name}: did you mean {candidates[nearest]}?")
+    return OmnidError(f"unknown key {name}: known are {', '.join(siblings or known)}")
+
+
+def _paths(cls: type, path: tuple[str, ...] = ()) -> Iterator[str]:
+    """The dotted names of all knobs that lie below a path."""
+    for names in _all_paths(cls, ()):
+        if names[: len(path)] == path:
+            yield _dotted(names)
+
+
+def _all_paths(cls: type, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    for entry, kind in _entries(cls):
+        here = (*path, entry.name)
+        if is_dataclass(kind):
+            yield from _all_paths(cast("type", kind), here)
+        else:
+            yield here
+
+
+def _entries(cls: Any) -> list[tuple[Field[Any], Any]]:
+    hints = get_type_hints(cls)
+    return [(entry, hints[entry.name]) for entry in fields(cls)]
+
+
+def _knob_of(entry: Field[Any]) -> Knob:
+    if "knob" not in entry.metadata:
+        raise TypeError(f"'{entry.name}' is neither a knob(...) nor a section, that is a dataclass")
+    return cast("Knob", entry.metadata["knob"])
+
+
+def _described(kind: Any, entry: Knob) -> str:
+    if get_origin(kind) is not tuple:
+        return _KINDS[kind][0] + entry.bounds
+    kinds = get_args(kind)
+    length = "" if kinds[-1] is Ellipsis else f"{len(kinds)} "
+    return f"a list of {length}{_KINDS[kinds[0]][1]}{entry.bounds}"
+
+
+def _shown(value: object) -> str:
+    """A foreign value on one short line."""
+    if isinstance(value, dict):
+        return "a section"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, lists of lists of lists
+        return f"a huge {type(value).__name__}"
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def _dotted(path: Sequence[str]) -> str:
+    return ".".join(part if re.fullmatch(r"[\w-]{1,80}", part) else _shown(part) for part in path)
+
+
+def _dumped(settings: Any, default: Any, path: tuple[str, ...]) -> Iterator[str]:
+    if path:
+        yield from ("", f"[{'.'.join(path)}]")
+    for entry, kind in _entries(type(settings)):
+        if not is_dataclass(kind):
+            about = _knob_of(entry)
+            yield f"# {about.doc}"
+            yield f"# {_described(kind, about)}; default {_toml(getattr(default, entry.name))}"
+            yield f"{entry.name} = {_toml(getattr(settings, entry.name))}"
+    for entry, kind in _entries(type(settings)):
+        if is_dataclass(kind):
+            yield from _dumped(getattr(settings, entry.name), getattr(default, entry.name), (*path, entry.name))
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(element) for element in value) + "]"
+    if isinstance(value, str):  # JSON's escapes are TOML's, except that TOML wants DEL escaped as well
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

@@ -1,0 +1,189 @@
+"""Settings: every value is checked, every fault is named by its dotted path, a dump reads back as the same object."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from omnid.errors import OmnidError
+from omnid.settings import dump, knob, load, parse
+
+
+@dataclass(frozen=True, slots=True)
+class Stereo:
+    window_px: int = knob(11, "side of the matching window, px", low=3, high=31)
+    ratio: float = knob(0.8, "second best over best, 1", low=0.0, high=1.0)
+    method: str = knob("sad", "cost of a match", choices=("sad", "census"))
+    subpixel: bool = knob(True, "whether to refine")
+    horizon_s: float = knob(math.inf, "how long a match is kept, s", low=0.0, finite=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Serial:
+    port: str = knob('/dev/"omnid"\t\x7f\n\\ü', "device of the motor")
+    bauds: tuple[int, ...] = knob((115200, 9600), "rates to try, baud", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Motor:
+    limit_mps: float = knob(1.0, "speed limit, m/s", high=0)
+    serial: Serial = field(default_factory=lambda: Serial(bauds=(57600,)))
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    robot: str = knob("robot", "name on the bus")
+    offset_m: tuple[float, float, float] = knob((0.0, 1e-5, 1e16), "where the rig is, m")
+    topics: tuple[str, ...] = knob((), "topics to record")
+    stereo: Stereo = field(default_factory=Stereo)
+    motor: Motor = field(default_factory=lambda: Motor(limit_mps=-1.0))
+
+
+def written(tmp_path: Path, text: str | bytes) -> Path:
+    path = tmp_path / "omnid.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def refusal(text: str | bytes, *overrides: str) -> str:
+    data = text if isinstance(text, bytes) else text.encode()
+    with pytest.raises(OmnidError) as caught:
+        parse(Config, data, origin="omnid.toml", overrides=overrides)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+    return str(caught.value)
+
+
+def test_without_a_file_the_defaults_hold() -> None:
+    assert load(Config) == Config()
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
+    settings = load(Config, written(tmp_path, "robot = 'r2'\n[stereo]\nratio = 1\n[motor.serial]\nport = 'x'"))
+    assert settings == Config(
+        robot="r2", stereo=Stereo(ratio=1.0), motor=Motor(limit_mps=-1.0, serial=Serial("x", (57600,)))
+    )
+    assert isinstance(settings.stereo.ratio, float)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["stereo.window_px=31", "stereo.subpixel=false", "motor.serial.port=a\\b", "topics=['a', \"it's\"]"],
+        ["motor.serial.bauds=[]", "stereo.horizon_s=2", "offset_m=[1, -2.5e-300, 3]"],
+    ],
+)
+def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[str]) -> None:
+    settings = load(Config, None, overrides)
+    assert load(Config, written(tmp_path, dump(settings))) == settings
+
+
+def test_a_dump_tells_every_knob_its_range_and_its_default() -> None:
+    text = dump(load(Config, None, ["stereo.window_px=5"]))
+    lines = "# side of the matching window, px\n# an integer from 3 to 31; default 11\nwindow_px = 5\n"
+    assert f"[stereo]\n{lines}" in text
+    assert "# a list of 3 numbers; default [0.0, 1e-05, 1e+16]\n" in text
+    assert "# a string, one of 'sad', 'census'; default \"sad\"\n" in text
+    assert "# a number of at most 0; default -1.0\n" in text  # the default of this section here, not of its class
+    assert "# a list of integers of at least 1; default [57600]\n" in text
+
+
+@pytest.mark.parametrize(
+    ("override", "value"),
+    [("robot=seven", "seven"), ("robot=7", "7"), ("robot='7'", "7"), ("robot=true", "true"), ("robot=a=b", "a=b")],
+)
+def test_a_string_may_come_bare_in_an_override(override: str, value: str) -> None:
+    assert load(Config, None, [override]).robot == value
+
+
+def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:
+    path = written(tmp_path, "stereo.window_px = 5")
+    assert load(Config, path, ["stereo.window_px=7", " stereo.window_px = 9 "]).stereo.window_px == 9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
+        ("window_px = 5", "unknown key window_px: did you mean stereo.window_px?"),
+        ("[stero]\nwindow_px = 5", "unknown key stero: did you mean stereo?"),
+        ("[motor.serial]\nprot = 'x'", "unknown key motor.serial.prot: did you mean motor.serial.port?"),
+        ("[stereo]\nzzz = 5", "unknown key stereo.zzz: known are stereo.window_px, "),
+        ('"a\\nb" = 1', "unknown key 'a\\nb': known are robot, "),
+        (f"{'q' * 100_000} = 1", "unknown key 'qqq"),
+        ("stereo = 5", "stereo: expected a section, found 5"),
+        ("robot.name = 'x'", "robot: expected a string, found a section"),
+        ("stereo.window_px = '11'", "stereo.window_px: expected an integer from 3 to 31, found '11'"),
+        ("stereo.window_px = 11.0", "expected an integer from 3 to 31, found 11.0"),
+        ("stereo.window_px = true", "expected an integer from 3 to 31, found True"),
+        ("stereo.window_px = 2", "expected an integer from 3 to 31, found 2"),
+        ("stereo.window_px = 32", "expected an integer from 3 to 31, found 32"),
+        ("stereo.subpixel = 1", "stereo.subpixel: expected true or false, found 1"),
+        ("stereo.ratio = true", "stereo.ratio: expected a number from 0.0 to 1.0, found True"),
+        ("stereo.ratio = nan", "found nan"),
+        ("stereo.ratio = inf", "found inf"),
+        ("motor.limit_mps = 0.5", "motor.limit_mps: expected a number of at most 0, found 0.5"),
+        ("stereo.method = 'ncc'", "stereo.method: expected a string, one of 'sad', 'census', found 'ncc'"),
+        ("robot = 1979-05-27", "robot: expected a string, found datetime.date"),
+        ("offset_m = [1, 2]", "offset_m: expected a list of 3 numbers, found [1, 2]"),
+        ("offset_m = [1, 2, 'x']", "offset_m: expected a list of 3 numbers, found [1, 2, 'x']"),
+        ("offset_m = [1, 2, 1e999]", "offset_m: expected a list of 3 numbers, found [1, 2, inf]"),
+        ("topics = 'a'", "topics: expected a list of strings, found 'a'"),
+        ("motor.serial.bauds = [0]", "expected a list of integers of at least 1, found [0]"),
+        (f"stereo.ratio = 0x{'f' * 5000}", "expected a number from 0.0 to 1.0, found a huge int"),
+        (f"stereo.window_px = {'9' * 5000}", "expected TOML, found: "),
+        (f"topics = {'[' * 20_000}", "expected TOML, found: "),
+        ("stereo.window_px 5", "expected TOML, found: "),
+        ("robot = 1\nrobot = 2", "expected TOML, found: "),
+        (b"robot = '\xff'", "expected TOML in UTF-8, found a foreign byte at offset 9"),
+        (bytes(range(256)), "omnid.toml: expected TOML"),
+    ],
+)
+def test_what_is_not_as_declared_is_refused_by_name(text: str | bytes, said: str) -> None:
+    message = refusal(text)
+    assert message.startswith("omnid.toml: ")
+    assert said in message
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("stereo.window_px", "expected section.key=value, found no '='"),
+        ("stereo=5", "stereo is a section: name one of its keys, such as stereo.window_px"),
+        ("stereo.window=5", "did you mean stereo.window_px?"),
+        ("robot.name=5", "unknown key robot.name: did you mean robot?"),
+        ("stereo.window_px=99", "stereo.window_px: expected an integer from 3 to 31, found 99"),
+        ("stereo.window_px=5\nrobot='x'", "expected an integer from 3 to 31, found \"5\\nrobot='x'\""),
+        ("stereo.subpixel=yes", "stereo.subpixel: expected true or false, found 'yes'"),
+        ("=5", "unknown key"),
+        ("robot=a\udcff", "robot: expected a string, found 'a\\udcff'"),
+    ],
+)
+def test_a_wrong_override_is_refused_by_name(override: str, said: str) -> None:
+    message = refusal("", override)
+    assert message.startswith("override ")
+    assert said in message
+
+
+def test_an_override_below_a_value_of_the_file_is_refused() -> None:
+    assert "stereo: expected a section, found 5" in refusal("stereo = 5", "stereo.window_px=5")
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (1 << 20) + b"#")):
+        with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):
+            load(Config, path)
+
+
+@dataclass(frozen=True, slots=True)
+class Bare:
+    speed_mps: float = 1.0
+
+
+def test_a_field_that_is_no_knob_is_a_mistake_of_the_programmer() -> None:
+    with pytest.raises(TypeError, match="speed_mps"):
+        load(Bare)
