@@ -83,6 +83,16 @@ def log(T: ArrayLike) -> Array:
     return np.concatenate([np.linalg.solve(V, T[..., :3, 3:])[..., 0], w], axis=-1)
 
 
+def adjoint(T: ArrayLike) -> Array:
+    """Matrix (..., 6, 6) that carries a small motion [translation; rotation] in frame b into frame a, for T_a_b."""
+    T = np.asarray(T, float)
+    R = T[..., :3, :3]
+    A = np.zeros((*T.shape[:-2], 6, 6))
+    A[..., :3, :3] = A[..., 3:, 3:] = R
+    A[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return A
+
+
 def interpolate(T_a: ArrayLike, T_b: ArrayLike, s: float) -> Array:
     """The pose at fraction s of the screw motion from T_a (s = 0) to T_b (s = 1)."""
     T_a = np.asarray(T_a, float)

@@ -1,0 +1,86 @@
+"""Corners to track: strong, apart from each other, and spread all around the panorama."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.klt import Klt, Wrapped, track
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+CELL_PX = 48  # side of the cells among which the corners are shared out evenly
+
+
+def corners(lower: Wrapped, usable: Flags, most: int, apart_px: int = 9, weakest: float = 2e-4) -> Array:
+    """Up to `most` corners (N, 2) = (column, row) of the panorama where usable (H, W), strongest first in each cell.
+
+    A corner is a maximum of the smaller eigenvalue (Shi and Tomasi 1994) within apart_px. Cells of CELL_PX take turns,
+    so that one poster full of contrast does not take all.
+    """
+    response = cv2.cornerMinEigenVal(lower.image, 5)
+    peaks = cv2.dilate(response, np.ones((apart_px, apart_px), np.uint8))
+    inner = slice(lower.pad_px, lower.pad_px + lower.width)
+    is_peak = (response[:, inner] >= peaks[:, inner]) & (response[:, inner] > weakest) & usable
+    rows, columns = np.nonzero(is_peak)
+    strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
+    rows, columns = rows[strongest], columns[strongest]
+    turn = _rank_within((rows // CELL_PX) * 4096 + columns // CELL_PX)
+    chosen = np.argsort(turn, kind="stable")[:most]
+    return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
+
+
+def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The position (N,) of each element among those of its own group, in the order given."""
+    order = np.argsort(group, kind="stable")
+    sorted_group = group[order]
+    first = np.searchsorted(sorted_group, sorted_group, side="left")
+    rank = np.empty(len(group), np.intp)
+    rank[order] = np.arange(len(group)) - first
+    return rank
+
+
+def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
+    """usable (H, W) without the discs about points (N, 2), so that no landmark is taken twice."""
+    free = usable.astype(np.uint8)
+    for column, row in np.rint(points).astype(int).tolist():
+        cv2.circle(free, (column, row), radius_px, 0, -1)
+    return free.astype(bool)
+
+
+def rows_in_upper(pair: tuple[Wrapped, Wrapped], points: Array, guess: Array, klt: Klt, cross_px: float = 0.7) -> Array:
+    """Rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN where they do not match.
+
+    guess (N,) rows. A match must lie in the same column within cross_px, not above the point, and come back.
+    """
+    lower, upper = pair
+    start = np.column_stack([points[:, 0], guess])
+    finite = np.flatnonzero(np.isfinite(guess))
+    there, good = track(lower, upper, points[finite], start[finite], klt)
+    aside = (there[:, 0] - points[finite, 0] + lower.width / 2) % lower.width - lower.width / 2
+    good &= (np.abs(aside) < cross_px) & (there[:, 1] > points[finite, 1])
+    rows = np.full(len(points), np.nan)
+    rows[finite[good]] = there[good, 1]
+    return rows
+
+
+def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: int = 3) -> Array:
+    """Median disparity (N,) of the located pixels within reach_px of points (N, 2); NaN where there is none.
+
+    A feature counts as located if a located point lies close to it: Dang et al. 2012, eq. (8).
+    """
+    height, width = disparity.shape
+    offsets = np.arange(-reach_px, reach_px + 1)
+    columns = (np.rint(points[:, 0]).astype(int)[:, None, None] + offsets[None, None, :]) % width
+    rows = np.clip(np.rint(points[:, 1]).astype(int)[:, None, None] + offsets[None, :, None], 0, height - 1)
+    around = disparity[rows, columns].reshape(len(points), -1)
+    return _nanmedian(around)
+
+
+def _nanmedian(values: NDArray[np.float32]) -> Array:
+    """Lower median (N,) of the numbers in each row of (N, K); NaN where there are none."""
+    ordered = np.sort(values, axis=1)  # NaN last
+    count = np.isfinite(ordered).sum(axis=1)
+    return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2], float)

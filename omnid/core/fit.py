@@ -1,0 +1,28 @@
+"""A pose and what speaks for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A pose T_odom_rect, its covariance given the landmarks, and how many landmarks were tried, tracked and agree."""
+
+    T_odom_rect: Array
+    covariance: Array  # (6, 6) [t; r] in the rectified frame
+    visible: int
+    tracked: int
+    agreeing: int
+    landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # indices into the local map
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (agreeing, 2) where they are seen
+
+    @property
+    def share(self) -> float:
+        """Agreeing landmarks among those tracked."""
+        return self.agreeing / max(1, self.tracked)

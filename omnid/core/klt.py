@@ -1,0 +1,75 @@
+"""Kanade-Lucas-Tomasi tracking on panoramas that wrap around, with the forward-backward check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Wrapped:
+    """A panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
+
+    image: Image  # (H, W + 2 pad) uint8
+    pad_px: int
+
+    @property
+    def width(self) -> int:
+        """Columns of one full turn [px]."""
+        return self.image.shape[1] - 2 * self.pad_px
+
+    @property
+    def panorama(self) -> Image:
+        """The panorama itself (H, W), a view."""
+        return self.image[:, self.pad_px : self.pad_px + self.width]
+
+
+@dataclass(frozen=True, slots=True)
+class Klt:
+    """Window [px], pyramid levels above the image, largest forward-backward error [px]."""
+
+    window_px: int = 15
+    levels: int = 3
+    max_error_px: float = 0.5
+    iterations: int = 20
+
+
+def track(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple[Array, NDArray[np.bool_]]:
+    """Where points (N, 2) of a are in b, from a guess (N, 2), and which of them come back to where they started.
+
+    Columns may be given and are returned in [0, width). LK's own status is no evidence: only the way back counts.
+    """
+    if not len(points):
+        return points.copy(), np.zeros(0, bool)
+    there, found = flow(a, b, points, guess, klt)
+    back, returned = flow(b, a, there, points, klt)
+    error = back - points
+    error[:, 0] = (error[:, 0] + a.width / 2) % a.width - a.width / 2
+    close = (error**2).sum(axis=1) < klt.max_error_px**2
+    return there, found & returned & close
+
+
+def flow(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple[Array, NDArray[np.bool_]]:
+    """One way of pyramidal Lucas-Kanade from a guess; found (N,) where it converged inside the picture."""
+    start, target = _padded(points, a), _padded(guess, b)
+    # A point near the seam has two images in the padded picture; take the guess on the start's own side of it.
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, 0.01)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        a.image, b.image, start, target, winSize=(klt.window_px, klt.window_px), maxLevel=klt.levels,
+        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4)
+    moved = there.reshape(-1, 2).astype(float)
+    inside = (moved[:, 1] >= 0) & (moved[:, 1] <= b.image.shape[0] - 1)
+    moved[:, 0] = (moved[:, 0] - b.pad_px) % b.width
+    return moved, (status.ravel() > 0) & inside & np.isfinite(moved).all(axis=1)
+
+
+def _padded(points: Array, wrapped: Wrapped) -> NDArray[np.float32]:
+    """Points (N, 1, 2) float32 in the padded picture, columns first brought into [0, width)."""
+    columns = points[:, 0] % wrapped.width + wrapped.pad_px
+    return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)

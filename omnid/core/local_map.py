@@ -1,0 +1,114 @@
+"""A small map of landmarks about the robot, each anchored in the keyframe that saw it first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.klt import Klt, Wrapped, track
+from omnid.core.motion import StereoModel
+from omnid.core.triangulation import point_covariance, triangulate, view
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+EDGE_ROWS = 3  # a landmark predicted nearer than this to the panorama's upper or lower edge is not looked for
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A panorama that landmarks are anchored in; T_odom_rect places its rectified frame, covariance (6, 6) in it."""
+
+    seq: int
+    lower: Wrapped
+    T_odom_rect: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Landmarks found in a new panorama: their indices (M,), pixels (M, 2), predicted views (M, 3); how many to see."""
+
+    index: Indices
+    pixels: Array
+    predicted: Array
+    visible: int
+
+
+class LocalMap:
+    """Landmarks (N) with position in odom, covariance, keyframe and pixel there; bounded by keyframes and count."""
+
+    def __init__(self, model: StereoModel, klt: Klt, max_keyframes: int = 5, max_misses: int = 3) -> None:
+        self._model, self._klt = model, klt
+        self._max_keyframes, self._max_misses = max_keyframes, max_misses
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        self.keyframes: dict[int, Keyframe] = {}
+        self.points = np.zeros((0, 3))  # (N, 3) m in odom
+        self.covariance = np.zeros((0, 3, 3))  # (N, 3, 3) m^2 in odom
+        self.pixels = np.zeros((0, 2))  # (N, 2) px in the keyframe's panorama
+        self.anchor = np.zeros(0, np.intp)  # (N,) seq of the keyframe
+        self._misses = np.zeros(0, np.intp)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def add(self, keyframe: Keyframe, views: Array) -> None:
+        """Takes a keyframe and the landmarks that it adds, as views (N, 3) = (column, lower row, upper row) [px]."""
+        points = triangulate(views, self._model.cylinder, self._model.baseline_m)
+        views, points = views[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
+        covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px)
+        R = keyframe.T_odom_rect[:3, :3]
+        self.keyframes[keyframe.seq] = keyframe
+        self.points = np.concatenate([self.points, se3.apply(keyframe.T_odom_rect, points)])
+        self.covariance = np.concatenate([self.covariance, R @ covariance @ R.T])
+        self.pixels = np.concatenate([self.pixels, views[:, :2]])
+        self.anchor = np.concatenate([self.anchor, np.full(len(points), keyframe.seq)])
+        self._misses = np.concatenate([self._misses, np.zeros(len(points), np.intp)])
+        self._forget_oldest()
+
+    def track(self, lower: Wrapped, T_odom_rect: Array, sample: int = 0) -> Tracks:
+        """Looks for the landmarks in a panorama, from where a guessed pose predicts them.
+
+        sample > 0: only about so many, evenly chosen, to compare guesses.
+        """
+        predicted = view(se3.apply(se3.inverse(T_odom_rect), self.points), self._model.cylinder, self._model.baseline_m)
+        height = self._model.cylinder.height
+        visible = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < height - 1 - EDGE_ROWS))
+        if sample:
+            visible = visible[:: max(1, len(visible) // sample)]
+        pixels, found = np.empty((len(visible), 2)), np.zeros(len(visible), bool)
+        for seq, keyframe in self.keyframes.items():
+            at = np.flatnonzero(self.anchor[visible] == seq)
+            of = visible[at]
+            pixels[at], found[at] = track(keyframe.lower, lower, self.pixels[of], predicted[of, :2], self._klt)
+        index = visible[found]
+        return Tracks(index, pixels[found], predicted[index], len(visible))
+
+    def anchor_shares(self, index: Indices) -> dict[int, float]:
+        """For each keyframe the share of the landmarks (indices) that it anchors."""
+        anchors, counts = np.unique(self.anchor[index], return_counts=True)
+        return {int(a): float(n) / len(index) for a, n in zip(anchors, counts, strict=True)}
+
+    def keep(self, seen: Indices) -> None:
+        """Drops the landmarks that were missed several times running; seen: indices of those that were not."""
+        self._misses += 1
+        self._misses[seen] = 0
+        self._select(self._misses < self._max_misses)
+
+    def _forget_oldest(self) -> None:
+        while len(self.keyframes) > self._max_keyframes:
+            self.keyframes.pop(min(self.keyframes))
+        self._select(np.isin(self.anchor, list(self.keyframes)))
+
+    def _select(self, kept: Flags) -> None:
+        self.points, self.covariance, self.pixels = self.points[kept], self.covariance[kept], self.pixels[kept]
+        self.anchor, self._misses = self.anchor[kept], self._misses[kept]
+        anchors = set(self.anchor.tolist())
+        self.keyframes = {seq: k for seq, k in self.keyframes.items() if seq in anchors}

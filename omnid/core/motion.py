@@ -1,0 +1,120 @@
+"""Ego-motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.triangulation import triangulate, view, view_jacobian
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class StereoModel:
+    """What turns points into views: the panorama's cylinder, the baseline, and the noise of a tracked corner."""
+
+    cylinder: Cylinder
+    baseline_m: float
+    sigma_px: float = 0.2
+
+    def residual(self, points: Array, views: Array) -> Array:
+        """Views minus predictions (..., N, 3) [px], columns wrapped; views (N, 3), NaN in column 2 without upper."""
+        flat = points.reshape(-1, 3)
+        error = views - view(flat, self.cylinder, self.baseline_m).reshape(points.shape)
+        error[..., 0] = self.cylinder.wrap(error[..., 0])
+        return error
+
+
+def rigid_fit(a: Array, b: Array) -> Array:
+    """T_b_a (..., 4, 4) that moves points a (..., N, 3) onto b with least squares (Kabsch), no reflection."""
+    mean_a, mean_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(b - mean_b, -1, -2) @ (a - mean_a))
+    U[..., :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
+    R = U @ Vt
+    return se3.transform(R, (mean_b[..., 0, :, None] - R @ mean_a[..., 0, :, None])[..., 0])
+
+
+def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Generator, hypotheses: int = 200,
+           threshold_px: float = 2.0) -> tuple[Array, Flags]:
+    """The motion T_curr_ref that most landmarks (N, 3) agree with, and which do (N,).
+
+    Three points of those seen in both cameras make a motion; consensus by the views' errors [px]. Dang et al. 2012,
+    section IV.B, with the distance measured in the pictures, where the noise is even.
+    """
+    seen = triangulate(views, model.cylinder, model.baseline_m)
+    usable = np.flatnonzero(np.isfinite(seen).all(axis=1))
+    if len(usable) < 3:
+        return np.eye(4), np.zeros(len(landmarks), bool)
+    triples = usable[rng.random((hypotheses, len(usable))).argpartition(2, axis=1)[:, :3]]
+    motions = rigid_fit(landmarks[triples], seen[triples])
+    errors = model.residual(se3.apply(motions, landmarks), views)
+    agree = np.nanmax(np.abs(errors), axis=-1) < threshold_px
+    best = int(agree.sum(axis=1).argmax())
+    return motions[best], agree[best]
+
+
+def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel) -> Array:
+    """Matrices (N, 3, 3) W with W S W^T = I for the covariance S of each view's error: corner noise and landmark noise.
+
+    A view without the upper row (NaN) gets a row of zeros there.
+    """
+    J = view_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m) @ T[:3, :3]
+    S = J @ covariance @ np.swapaxes(J, -1, -2) + model.sigma_px**2 * np.eye(3)
+    lower_only = np.isnan(views[:, 2])
+    S[lower_only, 2, :], S[lower_only, :, 2] = 0.0, 0.0
+    S[lower_only, 2, 2] = 1.0
+    W = np.linalg.inv(np.linalg.cholesky(S))
+    W[lower_only, 2, :] = 0.0
+    return np.asarray(W)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and each view's squared error in deviations."""
+
+    T: Array
+    covariance: Array
+    squared: Array  # (N,) Mahalanobis distance squared
+
+
+def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
+                 steps: int = 8) -> Estimate:
+    """The motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
+
+    Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Geman-McClure-like Cauchy kernel,
+    S the covariance of corner and landmark. Stands where Dang et al. 2012 has eq. (9), which measures in 3-D and is
+    biased short.
+    """
+    W = whitening(landmarks, covariance, views, T, model)
+    clean = np.where(np.isnan(views), 0.0, views)
+    for _ in range(steps):
+        H, g, _ = _normal_equations(landmarks, clean, T, W, model)
+        step = np.linalg.solve(H, g)
+        T = se3.exp(step) @ T
+        if np.abs(step).max() < 1e-7:
+            break
+    H, _, squared = _normal_equations(landmarks, clean, T, W, model)
+    return Estimate(T, np.linalg.inv(H), squared)
+
+
+def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel
+                      ) -> tuple[Array, Array, Array]:
+    points = se3.apply(T, landmarks)
+    error = (W @ model.residual(points, views)[:, :, None])[:, :, 0]
+    squared = (error**2).sum(axis=1)
+    weight = 1 / (1 + squared / KERNEL_WIDTH**2)
+    by_point = W @ view_jacobian(points, model.cylinder, model.baseline_m)
+    J = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=2)
+    J = J.reshape(-1, 6)
+    weighted = J * np.repeat(weight, 3)[:, None]
+    return weighted.T @ J + 1e-9 * np.eye(6), weighted.T @ error.ravel(), squared
+
+
+# Errors beyond this many deviations lose their say (Cauchy).
+KERNEL_WIDTH = 2.5

@@ -1,0 +1,45 @@
+"""Guesses of a turn between two panoramas: on a cylinder a turn is a shift of the columns."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
+
+
+def steps() -> list[float]:
+    """The paper's turns [rad]: 0, 18, 36, ... 342 degrees, in its own order."""
+    return [k * STEP_RAD for k in range(20)]
+
+
+def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = 3) -> list[float]:
+    """The likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, within [-pi, pi).
+
+    Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded; what
+    turns with the camera must be left out by usable (H, W), for it holds the peak at zero.
+    """
+    spectrum = np.conj(_spectrum(before, usable)) * _spectrum(after, usable)
+    width = before.shape[1]
+    score = np.fft.irfft(spectrum.sum(axis=0), width)
+    apart = width // 36
+    peaks = []
+    for _ in range(most):
+        shift = int(score.argmax())
+        peaks.append(((shift + width / 2) % width - width / 2) * 2 * math.pi / width)
+        score[np.arange(shift - apart, shift + apart + 1) % width] = -np.inf
+    return peaks
+
+
+def _spectrum(image: Image, usable: Flags) -> NDArray[np.complex64]:
+    """Spectrum over azimuth of the horizontal gradient, half the rows, strong edges cut so that none rules alone."""
+    wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
+    gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
+    limited = np.clip(gradient, -100, 100) * usable
+    return np.fft.rfft(limited[::2], axis=1)
