@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from calib.camera import Array
 from tests.scenes import textures
-from tests.scenes.surfaces import Rectangle, Scene
+from tests.scenes.surfaces import Rectangle, Scene, Texture
 
 PX_PER_M = 320.0  # finer than a 768 pixel camera resolves at 0.6 m
 CEILING_M = 2.6
@@ -13,7 +14,7 @@ Random = np.random.Generator
 Point = tuple[float, float]
 
 
-def _texture(rng: Random, kind: str, size_m: Point) -> textures.Texture:
+def _texture(rng: Random, kind: str, size_m: Point) -> Texture:
     size = (max(8, round(size_m[0] * PX_PER_M)), max(8, round(size_m[1] * PX_PER_M)))
     return textures.PAINTERS[kind](rng, size, PX_PER_M)
 
@@ -60,7 +61,7 @@ def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad:
     return [Rectangle(a, u, v, _face(rng, u, v), "box") for a, u, v in faces]
 
 
-def _face(rng: Random, u: textures.Array, v: textures.Array) -> textures.Texture:
+def _face(rng: Random, u: Array, v: Array) -> Texture:
     size = tuple(max(8, round(float(np.linalg.norm(e)) * PX_PER_M)) for e in (u, v))
     return textures.poster(rng, (size[0], size[1]))
 

@@ -102,9 +102,8 @@ def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supers
         for number, rectangle in enumerate(scene.rectangles):
             _cast(table, rectangle, T_world_cam, (hits, number))
     height, width = table.shape
-    canvas = np.zeros(height * width * supersample**2, np.float32)
-    canvas[table.index] = _shade(table, scene, hits, T_world_cam)
-    canvas = canvas.reshape(height * supersample, width * supersample)
+    canvas = np.zeros((height * supersample, width * supersample), np.float32)
+    canvas.ravel()[table.index] = _shade(table, scene, hits, T_world_cam)
     return np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
@@ -119,8 +118,8 @@ class _Hits:
 
     @staticmethod
     def nothing(count: int) -> _Hits:
-        empty = (np.empty(count, np.float32) for _ in range(2))
-        return _Hits(np.full(count, np.inf, np.float32), *empty, np.full(count, -1, np.int16))
+        u, v = np.empty((2, count), np.float32)
+        return _Hits(np.full(count, np.inf, np.float32), u, v, np.full(count, -1, np.int16))
 
 
 def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tuple[_Hits, int]) -> None:

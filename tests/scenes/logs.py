@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from calib.camera import Array, OmniCamera
 from calib.rig import MountedCamera, Rig
+from calib.rig_file import write_rig
 from calib.unified import UnifiedCamera
 from tests.scenes.caster import render_grey
 from tests.scenes.sensor import Exposure, Sensor
@@ -23,6 +25,7 @@ PERIOD_NS = 100_000_000
 ARRIVAL_NS = 3_000_000  # a picture reaches the recorder this long after its stamp
 SKEW_NS = 2_000_000  # the two cameras' stamps differ by at most this
 SCHEMA = "sensor_msgs/msg/CompressedImage"
+Stamps = NDArray[np.int64]  # [ns]
 Pictures = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
 
 
@@ -30,16 +33,21 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
               supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
     """Renders both cameras at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder.
 
-    Both pictures of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
+    rig.toml knows the rims only; where struts or a hub hide something, rig_masked.toml knows those too. Both pictures
+    of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stamps = START_NS + PERIOD_NS * np.arange(len(poses))
+    stamps: Stamps = START_NS + PERIOD_NS * np.arange(len(poses), dtype=np.int64)
     (folder / "truth.txt").write_text(tum(stamps, poses))
     (folder / "camchain.yaml").write_text(camchain(rig))
-    _write_rig_toml(folder / "rig.toml", rig)
+    write_rig(folder / "rig.toml", rig)
     rng = np.random.default_rng([seed, 6])
-    skews = rng.integers(-SKEW_NS, SKEW_NS + 1, len(poses))
-    exposures = [Exposure.of(sensor or Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+    skews: Stamps = rng.integers(-SKEW_NS, SKEW_NS + 1, len(poses), dtype=np.int64)
+    sensor = sensor or Sensor()
+    exposures = [Exposure.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+    if any(e.hidden.any() for e in exposures):
+        lower, upper = (_masked(m, e) for m, e in zip((rig.lower, rig.upper), exposures, strict=True))
+        write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
 
     def pictures() -> Pictures:
         for i, T_world_rig in enumerate(poses):
@@ -49,10 +57,12 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
             if progress:
                 progress(i + 1, len(poses))
 
-    _write_mcap(folder / "log.mcap", rig, (stamps, stamps + skews), pictures())
+    # Whoever finds log.mcap finds it whole.
+    _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), pictures())
+    (folder / "log.mcap.part").replace(folder / "log.mcap")
 
 
-def _write_mcap(path: Path, rig: Rig, stamps: tuple[Array, Array], pictures: Pictures) -> None:
+def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], pictures: Pictures) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     Image, Header = store.types[SCHEMA], store.types["std_msgs/msg/Header"]
     Time = store.types["builtin_interfaces/msg/Time"]
@@ -69,10 +79,10 @@ def _write_mcap(path: Path, rig: Rig, stamps: tuple[Array, Array], pictures: Pic
                 message = Image(header, "jpeg", np.frombuffer(jpegs[k], np.uint8))
                 data = bytes(store.serialize_cdr(message, SCHEMA))
                 writer.add_message(channels[k], stamp + ARRIVAL_NS, data, stamp, 2 * i + k)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
-def tum(stamps_ns: Array, poses: Array) -> str:
+def tum(stamps_ns: Stamps, poses: Array) -> str:
     """The trajectory as TUM text: t x y z qx qy qz qw."""
     rows = []
     for stamp, T in zip(stamps_ns, poses, strict=True):
@@ -112,7 +122,7 @@ def _unified(camera: OmniCamera) -> UnifiedCamera:
     return camera
 
 
-def _write_rig_toml(path: Path, rig: Rig) -> None:
-    """rig.toml by the product's own writer, where it has one."""
-    if importlib.util.find_spec("calib.rig_file"):
-        importlib.import_module("calib.rig_file").write_rig(path, rig)
+def _masked(mounted: MountedCamera, exposure: Exposure) -> MountedCamera:
+    """The camera with a mask that leaves out struts and hub."""
+    clear = (255 * (exposure.hidden == 0)).astype(np.uint8)
+    return replace(mounted, mask=replace(mounted.visible, image=clear))

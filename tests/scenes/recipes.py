@@ -31,14 +31,14 @@ class Run:
 Recipe = Callable[[int, int, int], Run]  # (seed, picture size, pairs)
 
 
-def mild_rig(seed: int, size: int, **how: float) -> Rig:
+def mild_rig(seed: int, size: int) -> Rig:
     """A rig with a mirror scale, a baseline and a little crookedness of its own per seed."""
     rng = np.random.default_rng([seed, 7])
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
     turned, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
     x, y = rng.uniform(-4, 4, 2)
     return make_rig(size=size, scale=float(scale), baseline_m=float(baseline), offset_mm=(x, y),
-                    crooked_deg=(turned[0], turned[1], turned[2]), lower_crooked_deg=(lower[0], lower[1], 0.0), **how)
+                    crooked_deg=(turned[0], turned[1], turned[2]), lower_crooked_deg=(lower[0], lower[1], 0.0))
 
 
 def two_walls(seed: int, size: int, pairs: int) -> Run:
@@ -85,9 +85,28 @@ def rooms(seed: int, size: int, pairs: int) -> Run:
     return Run(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
 
 
+def back(seed: int, size: int, pairs: int) -> Run:
+    """Stands, drives on, and comes back backwards over the same poses, then stands: what drifts shows at the end."""
+    there = paths.spline_path(seed, max(1, pairs // 2 - 4), 0.06)
+    poses = np.concatenate([there[[0] * 5], paths.back_again(there), there[[0] * 5]])[:pairs]
+    return Run(mild_rig(seed, size), poses, corridor(seed))
+
+
+def plain(seed: int, size: int, pairs: int) -> Run:
+    """two_walls without texture but two pictures: what must be called degraded or lost, never guessed."""
+    scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, pictures=2)
+    return Run(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.05), scene)
+
+
+def spin(seed: int, size: int, pairs: int) -> Run:
+    """Turns on the spot, 12 degrees a pair."""
+    return Run(mild_rig(seed, size), paths.turns([12.0] * (pairs - 1), 0.0), corridor(seed))
+
+
 RECIPES: dict[str, tuple[Recipe, int]] = {  # and how many pairs it has unless told otherwise
     "two_walls": (two_walls, 99), "crooked": (crooked, 33), "turns": (turns, 11), "struts": (struts, 99),
     "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
+    "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
 }
 
 

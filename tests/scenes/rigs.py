@@ -24,9 +24,9 @@ def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, ri
              centre_px: tuple[float, float] = (0, 0)) -> Rig:
     """A rig whose frame is the lower viewpoint's, z up, unless lower_* says otherwise.
 
-    crooked_deg: rotation vector, in the rig frame, that turns the upper camera about its viewpoint, which lies offset_mm
-    (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves the optical
-    centre (and the rim) off the picture's centre.
+    crooked_deg: rotation vector, in the rig frame, that turns the upper camera about its viewpoint, which lies
+    offset_mm (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves
+    the optical centre (and the rim) off the picture's centre.
     """
     focal = HORIZON * size * scale * (xi if xi > 0 else 1.0)
     centre = ((size - 1) / 2 + centre_px[0], (size - 1) / 2 + centre_px[1])

@@ -39,14 +39,14 @@ def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
     for angle in np.deg2rad(sensor.strut_angles_deg):
         along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
         hidden |= (along > 0) & (np.abs(across) <= sensor.strut_width * width / 2)
-    return cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
     """Brightness factor (H, W): 1 in the middle, 1 - vignette at the rim, falling with the square of the radius."""
     x, y = np.meshgrid(np.arange(size[0]) - mask.center[0], np.arange(size[1]) - mask.center[1])
     rim_px = min(mask.outer_px, size[0] / 2)
-    return (1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1)).astype(np.float32)
+    return np.asarray(1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1), np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,8 @@ class Rectangle:
         levels = [self.texture.astype(np.float32)]
         while min(levels[-1].shape) >= 8:
             height, width = levels[-1].shape
-            levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+            half = cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+            levels.append(half.astype(np.float32))
         return levels
 
     def picture(self, texture: Texture, place_m: tuple[float, float, float, float], name: str = "") -> Rectangle:

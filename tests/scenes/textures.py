@@ -29,7 +29,7 @@ def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float 
         grid = rng.standard_normal(cells[::-1]).astype(np.float32)
         total += weight * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
         coarsest_px, weight = coarsest_px / 2, weight * persistence
-    return (total - total.mean()) / max(float(total.std()), 1e-6)
+    return np.asarray((total - total.mean()) / max(float(total.std()), 1e-6), np.float32)
 
 
 def brick(rng: Random, size: Size, px_per_m: float) -> Texture:

@@ -1,0 +1,120 @@
+"""A rendered corner lies where the camera model says, and not where a swapped or inverted transform would put it."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.rig import MountedCamera, Rig
+from tests.scenes import Rectangle, Scene, build, make_rig, render
+from tests.scenes.builders import wall
+from tests.scenes.paths import planar_poses
+
+SIZE = 192
+SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
+RIGS = {
+    "straight": make_rig(size=SIZE),
+    "crooked": make_rig(size=SIZE, scale=0.9, baseline_m=0.24, crooked_deg=(5, -4, 31), offset_mm=(12, -20),
+                        lower_crooked_deg=(-3, 6, -50), lower_offset_mm=(40, 25), centre_px=(2.3, -1.6)),
+    "xi 0.8, distorted": make_rig(size=SIZE, xi=0.8, distortion=(-0.03, 0.004, 0.002, -0.003), centre_px=(-1.2, 2.7),
+                                  crooked_deg=(2, 3, 20), lower_crooked_deg=(-1, 2, 70)),
+}
+POSE = se3.exp([0.31, -0.22, 1.17, 0.05, -0.04, 0.7])
+
+
+def chessboards(pose: np.ndarray, count: int = 4) -> Scene:
+    """Chessboards all around the pose, at its height and each tilted a little."""
+    board = np.kron(np.indices((SQUARES, SQUARES)).sum(axis=0) % 2, np.ones((100, 100)))
+    texture = (40 + 180 * board).astype(np.uint8)
+    sheets = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        R = se3.rotation_exp([0, 0, angle]) @ se3.rotation_exp([0.1 * (-1) ** i, 0.25, 0.2])
+        u, v = R @ [0, -1.0, 0] * SQUARES * SQUARE_M, R @ [0, 0, -1.0] * SQUARES * SQUARE_M
+        centre = pose[:3, 3] + DISTANCE_M * np.array([np.cos(angle), np.sin(angle), -0.2])
+        sheets.append(Rectangle(centre - (u + v) / 2, u, v, texture))
+    return Scene(tuple(sheets))
+
+
+def inner_corners(sheet: Rectangle) -> np.ndarray:
+    steps = np.arange(1, SQUARES) / SQUARES
+    return sheet.points(np.array(list(itertools.product(steps, steps))))
+
+
+def project(mounted: MountedCamera, points: np.ndarray) -> np.ndarray:
+    return mounted.camera.project(se3.apply(mounted.T_cam_rig @ se3.inverse(POSE), points))
+
+
+def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
+    """Distance of every visible corner found in the picture from where project() puts it."""
+    scene = chessboards(POSE)
+    picture = render(scene, mounted, POSE, 3)
+    expected = project(mounted, np.concatenate([inner_corners(s) for s in scene.rectangles]))
+    expected = expected[mounted.visible.contains(expected, 8)]
+    start = np.ascontiguousarray(expected + 0.7, np.float32)
+    enough = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+    found = cv2.cornerSubPix(picture, start, (3, 3), (-1, -1), enough)
+    return np.asarray(np.linalg.norm(found.reshape(-1, 2) - expected, axis=1))
+
+
+@pytest.mark.parametrize("which", ["lower", "upper"])
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
+def test_corners_lie_where_the_model_projects_them(rig: Rig, which: str) -> None:
+    errors = corner_errors_px(getattr(rig, which))
+    assert len(errors) >= 15
+    assert np.median(errors) < 0.1
+    assert errors.max() < 0.3
+
+
+def spot(bearing: tuple[float, float, float]) -> tuple[float, float]:
+    """Where a straight rig's lower camera sees a white spot 2 m away in direction (x, y, z) of the rig."""
+    centre = 2 * np.array(bearing) / np.linalg.norm(bearing)
+    side = np.cross(bearing, [0.3, 0.2, 1.0])
+    side *= 0.1 / np.linalg.norm(side)
+    up = np.cross(side, bearing)
+    up *= 0.1 / np.linalg.norm(up)
+    sheet = Rectangle(centre - (side + up) / 2, side, up, np.full((8, 8), 255, np.uint8))
+    picture = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4)).astype(float)
+    rows, columns = np.indices(picture.shape)
+    return float((columns * picture).sum() / picture.sum()), float((rows * picture).sum() / picture.sum())
+
+
+def test_forward_is_up_and_left_is_right_as_in_a_mirror() -> None:
+    """Worked by hand for a paraboloid: radius = f tan(theta / 2), theta from straight down."""
+    middle, horizon = (SIZE - 1) / 2, 207.5676 / 768 * SIZE
+    assert spot((1, 0, 0)) == pytest.approx((middle, middle - horizon), abs=0.3)
+    assert spot((0, 1, 0)) == pytest.approx((middle + horizon, middle), abs=0.3)
+    below = horizon * np.tan(np.pi / 8)
+    assert spot((-1, 0, -1)) == pytest.approx((middle, middle + below), abs=0.3)
+
+
+def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
+    rng = np.random.default_rng(0)
+    far, near = (wall(rng, "plain", (x, 1.0), (x, -1.0)) for x in (2.0, 1.5))
+    dark = Rectangle(near.origin, near.edge_u, near.edge_v, np.full((8, 8), 10, np.uint8))
+    pose, camera = planar_poses(np.zeros((1, 2)), np.zeros(1))[0], RIGS["straight"].lower
+    one, other = (render(Scene(order), camera, pose) for order in ((far, dark), (dark, far)))
+    assert np.array_equal(one, other)
+    assert np.array_equal(one, render(Scene((dark,)), camera, pose))
+
+
+def test_outside_the_rim_is_black_and_inside_nothing_is_missing() -> None:
+    run = build("two_walls", 3, SIZE)
+    mask = run.rig.lower.visible
+    picture = render(run.scene, run.rig.lower, run.poses[0])
+    rows, columns = np.indices(picture.shape)
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    inside = mask.contains(pixels, 1.0).reshape(picture.shape)
+    assert (picture[~mask.contains(pixels, -1.0).reshape(picture.shape)] == 0).all()
+    assert (picture[inside] > 0).mean() > 0.999
+
+
+def test_texture_far_away_is_averaged_not_sampled() -> None:
+    """A fine chessboard far away is grey; sampled without a pyramid it would be noise that moves."""
+    board = (255 * (np.indices((600, 600)).sum(axis=0) % 2)).astype(np.uint8)
+    sheet = Rectangle(np.array([3.0, 1, 1]), np.array([0, -2.0, 0]), np.array([0, 0, -2.0]), board)
+    picture = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4))
+    inner = cv2.erode((picture > 0).astype(np.uint8), np.ones((5, 5))) > 0
+    assert inner.sum() > 100
+    assert picture[inner].std() < 3
