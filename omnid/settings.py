@@ -21,11 +21,12 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from os import PathLike
-from typing import Any, Final, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from omnid.errors import OmnidError
 
 T = TypeVar("T")
+_Path: TypeAlias = tuple[str, ...]
 _MAX_BYTES: Final = 1 << 20
 _SHOWN: Final = 60  # characters of a foreign value in a message
 _MISFIT: Final = object()
@@ -128,7 +129,7 @@ def _table_of(data: bytes) -> dict[str, Any]:
         raise OmnidError(f"expected TOML, found: {' '.join(str(error).split())}") from None
 
 
-def _parsed_override(root: type, text: str) -> tuple[tuple[str, ...], object]:
+def _parsed_override(root: type, text: str) -> tuple[_Path, object]:
     name, equals, raw = text.partition("=")
     path = tuple(part.strip() for part in name.split("."))
     if not equals:
@@ -151,19 +152,22 @@ def _scalar(raw: str) -> object:
     return table["value"] if table.keys() == {"value"} else raw
 
 
-def _entry_at(root: type, path: tuple[str, ...]) -> tuple[Any, Knob]:
+def _entry_at(root: type, path: _Path) -> tuple[Any, Knob]:
     kind: Any = root
     for depth, name in enumerate(path):
-        entries = {entry.name: (hint, entry) for entry, hint in _entries(kind)} if is_dataclass(kind) else {}
+        if not is_dataclass(kind):
+            raise OmnidError(f"{_dotted(path[:depth])} is a key, not a section: it has no {_dotted(path[depth:])}")
+        entries = {entry.name: (hint, entry) for entry, hint in _entries(kind)}
         if name not in entries:
             raise _unknown(path[: depth + 1], tuple(_paths(root)))
         kind, entry = entries[name]
     if is_dataclass(kind):
-        raise OmnidError(f"{_dotted(path)} is a section: name one of its keys, such as {next(_paths(root, path))}")
+        first = next(_paths(cast("type", kind), path))
+        raise OmnidError(f"{_dotted(path)} is a section: name one of its keys, such as {_dotted(first)}")
     return kind, _knob_of(entry)
 
 
-def _insert(table: dict[str, Any], path: tuple[str, ...], value: object) -> None:
+def _insert(table: dict[str, Any], path: _Path, value: object) -> None:
     for depth, name in enumerate(path[:-1]):
         inner = table.setdefault(name, {})
         _require_section(inner, path[: depth + 1])
@@ -171,7 +175,7 @@ def _insert(table: dict[str, Any], path: tuple[str, ...], value: object) -> None
     table[path[-1]] = value
 
 
-def _built(default: object, table: dict[str, Any], path: tuple[str, ...], known: tuple[str, ...]) -> object:
+def _built(default: object, table: dict[str, Any], path: _Path, known: tuple[_Path, ...]) -> object:
     entries = _entries(type(default))
     for name in table.keys() - {entry.name for entry, _ in entries}:
         raise _unknown((*path, name), known)
@@ -187,7 +191,7 @@ def _built(default: object, table: dict[str, Any], path: tuple[str, ...], known:
     return type(default)(**values)
 
 
-def _checked(kind: Any, entry: Knob, value: object, path: tuple[str, ...]) -> object:
+def _checked(kind: Any, entry: Knob, value: object, path: _Path) -> object:
     fitted = _fitted(kind, entry, value)
     if fitted is _MISFIT:
         raise OmnidError(f"{_dotted(path)}: expected {_described(kind, entry)}, found {_shown(value)}")
@@ -214,35 +218,27 @@ def _fitted_tuple(kinds: tuple[Any, ...], entry: Knob, value: Any) -> object:
     return _MISFIT if _MISFIT in fitted else fitted
 
 
-def _require_section(value: object, path: tuple[str, ...]) -> None:
+def _require_section(value: object, path: _Path) -> None:
     if not isinstance(value, dict):
         raise OmnidError(f"{_dotted(path)}: expected a section, found {_shown(value)}")
 
 
-def _unknown(path: tuple[str, ...], known: tuple[str, ...]) -> OmnidError:
-    """The error for a key that nobody reads: meant is a key of the same section, a section, or any key."""
-    section, name = _dotted(path[:-1]), _dotted(path)
-    siblings = [other for other in known if other.rpartition(".")[0] == section]
-    leaves = {other.rpartition(".")[2]: other for other in siblings}
-    sections = {other.rpartition(".")[0]: other.rpartition(".")[0] for other in known}
-    for asked, candidates in ((path[-1], leaves), (name, sections), (name, {other: other for other in known})):
-        for nearest in difflib.get_close_matches(asked[:80], candidates, n=1, cutoff=0.6):
-            return OmnidError(f"unknown key {name}: did you mean {candidates[nearest]}?")
-    return OmnidError(f"unknown key {name}: known are {', '.join(siblings or known)}")
+def _unknown(path: _Path, known: tuple[_Path, ...]) -> OmnidError:
+    """The error for a key that nobody reads: likely meant is a neighbour of it, else a key elsewhere."""
+    depth = len(path)
+    neighbours = {other[depth - 1]: other[:depth] for other in known if other[: depth - 1] == path[:-1]}
+    for candidates in (neighbours, {other[-1]: other for other in known}):
+        for nearest in difflib.get_close_matches(path[-1][:80], candidates, n=1, cutoff=0.6):
+            return OmnidError(f"unknown key {_dotted(path)}: did you mean {_dotted(candidates[nearest])}?")
+    return OmnidError(f"unknown key {_dotted(path)}: known are {', '.join(map(_dotted, neighbours.values()))}")
 
 
-def _paths(cls: type, path: tuple[str, ...] = ()) -> Iterator[str]:
-    """The dotted names of all knobs that lie below a path."""
-    for names in _all_paths(cls, ()):
-        if names[: len(path)] == path:
-            yield _dotted(names)
-
-
-def _all_paths(cls: type, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:
+    """The paths of all knobs."""
     for entry, kind in _entries(cls):
         here = (*path, entry.name)
         if is_dataclass(kind):
-            yield from _all_paths(cast("type", kind), here)
+            yield from _paths(cast("type", kind), here)
         else:
             yield here
 
@@ -281,7 +277,7 @@ def _dotted(path: Sequence[str]) -> str:
     return ".".join(part if re.fullmatch(r"[\w-]{1,80}", part) else _shown(part) for part in path)
 
 
-def _dumped(settings: Any, default: Any, path: tuple[str, ...]) -> Iterator[str]:
+def _dumped(settings: Any, default: Any, path: _Path) -> Iterator[str]:
     if path:
         yield from ("", f"[{'.'.join(path)}]")
     for entry, kind in _entries(type(settings)):

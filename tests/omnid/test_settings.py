@@ -155,7 +155,7 @@ def test_what_is_not_as_declared_is_refused_by_name(text: str | bytes, said: str
         ("stereo.window_px", "expected section.key=value, found no '='"),
         ("stereo=5", "stereo is a section: name one of its keys, such as stereo.window_px"),
         ("stereo.window=5", "did you mean stereo.window_px?"),
-        ("robot.name=5", "unknown key robot.name: did you mean robot?"),
+        ("robot.name=5", "robot is a key, not a section: it has no name"),
         ("stereo.window_px=99", "stereo.window_px: expected an integer from 3 to 31, found 99"),
         ("stereo.window_px=5\nrobot='x'", "expected an integer from 3 to 31, found \"5\\nrobot='x'\""),
         ("stereo.subpixel=yes", "stereo.subpixel: expected true or false, found 'yes'"),
