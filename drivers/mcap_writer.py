@@ -82,11 +82,9 @@ class LogWriter:
         try:
             return self._path.open("wb")
         except OSError as error:
-            raise self._failure("create", error) from error
-
-    def _failure(self, verb: str, error: Exception) -> DriverError:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        return DriverError(f"cannot {verb} the log {str(self._path)!r}: {reason}; give a path that can be written")
+            raise DriverError(
+                f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
+            ) from error
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -98,7 +96,10 @@ class LogWriter:
         except (OSError, McapError) as error:
             self._usable = False
             self._abandon()
-            raise self._failure("write", error) from error
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+            raise DriverError(
+                f"cannot write the log {str(self._path)!r}: {reason}; free the disk or log elsewhere"
+            ) from error
 
     def _abandon(self) -> None:
         """Closes the file; what cannot be flushed has been reported already."""

@@ -1,7 +1,7 @@
 """sensor_msgs/msg/Image and CompressedImage out of CDR bytes, without copying the picture.
 
 Written out here, not left to a general deserialiser, because these two messages are nearly all of a log and must
-survive any bytes. The layout is that of the OMG's CDR (RTPS 2.2, 10.2): a 4-byte encapsulation header, then each number aligned
+survive any bytes. The layout is that of the OMG's CDR (RTPS 2.2, 10.2): a 4-byte header, then each number aligned
 to its own size counted from the end of that header.
 """
 

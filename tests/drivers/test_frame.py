@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import random
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.errors import BrokenFrame
+from drivers.frame import Frame, gray
+
+WIDTH, HEIGHT = 37, 23
+COLOURS = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8)
+SMOOTH = cv2.GaussianBlur(COLOURS, (0, 0), 3)
+
+
+def frame(encoding: str, data: object, **fields: object) -> Frame:
+    layout = {"width": WIDTH, "height": HEIGHT} | fields
+    return Frame(7, 1, "lower", encoding, data, **layout)  # type: ignore[arg-type]
+
+
+def encoded(suffix: str, picture: NDArray[Any] = SMOOTH[..., :3]) -> bytes:
+    return cv2.imencode(suffix, picture)[1].tobytes()
+
+
+def padded_rows(pixels: NDArray[Any], padding: int) -> tuple[bytes, int]:
+    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(HEIGHT, -1)
+    return np.pad(rows, ((0, 0), (0, padding)), constant_values=99).tobytes(), rows.shape[1] + padding
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channels", "code"),
+    [
+        ("bgr8", 3, cv2.COLOR_BGR2GRAY),
+        ("rgb8", 3, cv2.COLOR_RGB2GRAY),
+        ("bgra8", 4, cv2.COLOR_BGRA2GRAY),
+        ("rgba8", 4, cv2.COLOR_RGBA2GRAY),
+    ],
+)
+@pytest.mark.parametrize("padding", [0, 5])
+def test_colours_are_weighed_as_opencv_does(encoding: str, channels: int, code: int, padding: int) -> None:
+    pixels = np.ascontiguousarray(COLOURS[..., :channels])
+    data, step = padded_rows(pixels, padding)
+    np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), cv2.cvtColor(pixels, code))
+
+
+@pytest.mark.parametrize("padding", [0, 3])
+def test_mono8_is_taken_as_it_is(padding: int) -> None:
+    data, step = padded_rows(COLOURS[..., 0], padding)
+    np.testing.assert_array_equal(gray(frame("mono8", memoryview(data), step=step)), COLOURS[..., 0])
+
+
+@pytest.mark.parametrize(("order", "bigendian"), [("<u2", False), (">u2", True)])
+@pytest.mark.parametrize("padding", [0, 3])
+def test_mono16_keeps_its_upper_byte(order: str, bigendian: bool, padding: int) -> None:
+    values = (COLOURS[..., 0].astype(np.uint16) << 8) | COLOURS[..., 1]
+    data, step = padded_rows(values.astype(order), padding)
+    np.testing.assert_array_equal(gray(frame("mono16", data, step=step, bigendian=bigendian)), COLOURS[..., 0])
+
+
+def test_the_last_row_needs_no_padding() -> None:
+    data, step = padded_rows(COLOURS[..., 0], 6)
+    np.testing.assert_array_equal(gray(frame("mono8", data[:-6], step=step)), COLOURS[..., 0])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("padding", [0, 1, 5000])
+def test_compressed_pictures_and_the_padding_of_cameras(suffix: str, padding: int) -> None:
+    data = encoded(suffix)
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    encoding = {".jpg": "jpeg", ".png": "png"}[suffix]
+    np.testing.assert_array_equal(gray(Frame(0, 0, "upper", encoding, data + bytes(padding))), expected)
+
+
+def test_an_orientation_in_exif_does_not_turn_the_picture() -> None:
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    data = encoded(".jpg")
+    turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:]
+    turned_by_opencv: Any = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert turned_by_opencv.shape == (WIDTH, HEIGHT)
+    np.testing.assert_array_equal(gray(frame("jpeg", turned)), gray(frame("jpeg", data)))
+
+
+@pytest.mark.parametrize("encoding", ["jpeg", "mono8", "mono16", "bgr8", "rgba8"])
+def test_the_picture_is_read_only_and_nobody_can_change_it_later(encoding: str) -> None:
+    buffer = np.frombuffer(encoded(".jpg") if encoding == "jpeg" else COLOURS.tobytes(), np.uint8).copy()
+    picture = gray(frame(encoding, buffer))
+    before = picture.copy()
+    buffer[:] = 0
+    assert picture.flags.c_contiguous and not picture.flags.writeable and picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture, before)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_cut_picture_is_broken_wherever_it_is_cut(suffix: str) -> None:
+    data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
+    for size in range(len(data)):
+        with pytest.raises(BrokenFrame):
+            gray(frame(encoding, data[:size]))
+
+
+def test_the_padding_does_not_hide_a_cut() -> None:
+    with pytest.raises(BrokenFrame, match="end is missing"):
+        gray(frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)))
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [
+        (frame("mono8", bytes(WIDTH * HEIGHT - 1)), "bytes"),
+        (frame("bgr8", bytes(WIDTH * HEIGHT)), "bytes"),
+        (frame("mono16", bytes(WIDTH * HEIGHT * 2), step=WIDTH), "step"),
+        (frame("mono8", bytes(100), width=0), "size"),
+        (frame("mono8", bytes(100), width=-3), "size"),
+        (frame("mono8", bytes(100), width=2**31, height=2**31), "size"),
+        (frame("mono8", bytes(10**4), step=2**62), "bytes"),
+        (frame("bayer_rggb8", bytes(10**4)), "known encodings"),
+        (frame("jpeg", b""), "nothing"),
+        (frame("jpeg", b"BM" + bytes(100)), "starts with"),
+        (frame("png", encoded(".jpg")), "starts with"),
+        (frame("mono8", np.zeros((HEIGHT, 2 * WIDTH), np.uint8)[:, ::2]), "contiguous"),
+    ],
+)
+def test_malformed_frames_are_broken_in_one_line(broken: Frame, reason: str) -> None:
+    with pytest.raises(BrokenFrame, match=reason) as caught:
+        gray(broken)
+    assert "\n" not in str(caught.value) and "lower frame 7" in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_an_absurd_size_is_refused_before_it_is_decoded(suffix: str) -> None:
+    data = bytearray(encoded(suffix))
+    if suffix == ".png":
+        data[16:24] = struct.pack(">II", 60000, 60000)
+    else:
+        start = data.index(b"\xff\xc0")
+        data[start + 5 : start + 9] = struct.pack(">HH", 60000, 60000)
+    with pytest.raises(BrokenFrame, match="60000 x 60000"):
+        gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data)))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_damaged_pictures_decode_or_are_broken_and_nothing_else(suffix: str) -> None:
+    chance, whole = random.Random(3), encoded(suffix)
+    for _ in range(300):
+        data = bytearray(whole)
+        for _ in range(chance.randint(1, 4)):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+        try:
+            assert gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data))).ndim == 2
+        except BrokenFrame:
+            continue

@@ -1,0 +1,224 @@
+"""No bytes whatever give more than DriverError, a wrong frame or much memory."""
+
+from __future__ import annotations
+
+import os
+import random
+import struct
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+
+from drivers.errors import BrokenFrame, DriverError
+from drivers.mcap_reader import LogReader
+from drivers.mcap_records import MAGIC
+from drivers.ros_image import parse_image
+from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, image, pairs, picture, write_log
+
+LAYOUTS: list[dict[str, Any]] = [
+    {"compression": CompressionType.LZ4, "chunk_size": 700},
+    {"compression": CompressionType.ZSTD, "chunk_size": 700},
+    {"chunk_size": 700},
+    {"use_chunking": False},
+    BARE | {"chunk_size": 700},
+]
+
+
+def payloads(reader: LogReader) -> list[tuple[str, int, bytes]]:
+    return [(frame.camera, frame.stamp_ns, bytes(frame.data)) for frame in reader.frames()]
+
+
+def survivors(path: Path) -> tuple[list[tuple[str, int, bytes]], LogReader] | None:
+    """What a log that may be damaged gives, None where it is refused; in one line, and without much memory."""
+    try:
+        reader = LogReader(path)
+    except DriverError as error:
+        assert str(error) and str(error).isprintable()
+        return None
+    try:
+        reader.attachments()
+        reader.pair_estimate()
+        return payloads(reader), reader
+    finally:
+        reader.close()
+
+
+def small_log(path: Path, layout: dict[str, Any]) -> tuple[bytes, list[tuple[str, int, bytes]]]:
+    write_log(path, pairs(2), [("rig.toml", b"version = 1")], **layout)
+    return path.read_bytes(), payloads(LogReader(path))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_log_cut_anywhere_gives_what_is_whole_before(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path = tmp_path / "log.mcap"
+    whole, expected = small_log(path, layout)
+    counts = []
+    for size in reversed(range(len(whole))):
+        os.truncate(path, size)
+        found = survivors(path)
+        if found is not None:
+            frames, reader = found
+            assert frames == expected[: len(frames)]
+            assert reader.truncated and "cut or corrupt" in reader.warnings[0]
+        counts.append(0 if found is None else len(found[0]))
+    assert counts == sorted(counts, reverse=True) and set(counts) >= {0, 2, 4}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_flipped_bytes_never_escape(tmp_path: Path, layout: dict[str, Any]) -> None:
+    whole, expected = small_log(tmp_path / "whole.mcap", layout)
+    path, chance = tmp_path / "flipped.mcap", random.Random(5)
+    read = 0
+    for _ in range(300):
+        data = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 1, 4))):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(data)
+        found = survivors(path)
+        read += found is not None
+        if found is not None and layout.get("use_chunking", True):
+            wrong = set(found[0]) - set(expected)
+            assert not wrong, "a chunk's CRC vouches for every frame"
+    assert read > 30
+
+
+def test_noise_after_the_magic_is_refused(tmp_path: Path) -> None:
+    path, chance = tmp_path / "noise.mcap", random.Random(6)
+    for _ in range(300):
+        path.write_bytes(MAGIC + bytes([chance.randrange(16)]) + chance.randbytes(chance.randrange(400)))
+        assert survivors(path) is None
+
+
+@pytest.mark.parametrize("layout", LAYOUTS[:3])
+def test_a_corrupt_chunk_costs_only_its_own_frames(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(30), **layout)
+    expected = payloads(LogReader(path))
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        place = make_reader(file).get_summary().chunk_indexes[9]  # type: ignore[union-attr]
+    data[place.chunk_start_offset + place.chunk_length // 2] ^= 0x55
+    path.write_bytes(data)
+    found = survivors(path)
+    assert found is not None
+    frames, reader = found
+    assert 55 <= len(frames) < 60 and set(frames) < set(expected)
+    assert reader.counts["broken_records"] == 1 and not reader.truncated
+    assert reader.warnings == ["skipped 1 corrupt chunks or records of the file"]
+
+
+def test_a_corrupt_first_chunk_loses_no_channels(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(30), chunk_size=700)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"frame_id")] ^= 0x55
+    path.write_bytes(data)
+    found = survivors(path)
+    assert found is not None and 55 <= len(found[0]) < 60
+
+
+def test_a_corrupt_summary_is_not_believed(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(3))
+    data = bytearray(path.read_bytes())
+    data[data.rindex(LOWER.encode()) + 1] ^= 1
+    path.write_bytes(data)
+    reader = LogReader(path)
+    assert reader.topics == {"lower": LOWER, "upper": UPPER} and reader.pair_estimate() is None
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "it is empty"),
+        (MAGIC[:5], "starts with"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), r"starts with b'\\x89PNG"),
+        (b"SQLite format 3\0" + bytes(50), "ros2 bag convert"),
+        (b"#ROSBAG V2.0\n" + bytes(50), "ROS 1 bag"),
+        (zstandard.compress(bytes(50)), "zstd -d"),
+        (MAGIC, "no topics at all"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(data)
+    with pytest.raises(DriverError, match=message) as caught:
+        LogReader(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(DriverError, match="No such file"):
+        LogReader(tmp_path / "nowhere.mcap")
+    with pytest.raises(DriverError, match="none"):
+        LogReader(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DriverError, match="no regular file"):
+        LogReader(tmp_path / "pipe")
+
+
+def chunk(compression: str, size: int, packed: bytes, crc: int = 0) -> bytes:
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+BOMB = bytes(400 * 2**20)
+HOSTILE = {
+    "a record longer than the file": struct.pack("<BQ", 6, 2**62),
+    "a schema longer than the file": struct.pack("<BQHI", 3, 6, 1, 2**32 - 1),
+    "a chunk's inner length": struct.pack("<BQQQQIIQ", 6, 40, 0, 0, 10, 0, 0, 2**63 + 5),
+    "an lz4 size": chunk("lz4", 2**40, lz4.frame.compress(b"x" * 99)),
+    "a zstd size": chunk("zstd", 2**40, zstandard.compress(b"x" * 99)),
+    "an lz4 bomb": chunk("lz4", 1000, lz4.frame.compress(BOMB)),
+    "a zstd bomb": chunk("zstd", 1000, zstandard.compress(BOMB)),
+    "a message in a chunk": chunk("", 31, struct.pack("<BQHIQQ", 5, 2**61, 1, 0, 0, 0)),
+    "an unknown compression": chunk("rar", 5, b"12345"),
+}
+del BOMB
+
+
+@pytest.mark.parametrize("records", HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_lengths_take_no_memory(tmp_path: Path, records: bytes) -> None:
+    whole = write_log(tmp_path / "log.mcap", pairs(2)).read_bytes()
+    path = tmp_path / "hostile.mcap"
+    at = len(MAGIC) + 9 + struct.unpack_from("<Q", whole, len(MAGIC) + 1)[0]
+    path.write_bytes(whole[:at] + records + whole[at:])
+    tracemalloc.start()
+    try:
+        survivors(path)
+        assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).bytes(200_000)
+    entries = [e._replace(data=e.data + noise) for e in pairs(100)]
+    path = write_log(tmp_path / "log.mcap", entries, chunk_size=2**20)
+    tracemalloc.start()
+    try:
+        count = sum(1 for _ in LogReader(path, window=4).frames())
+        assert count == 200 and tracemalloc.get_traced_memory()[1] < 8 * 2**20 < path.stat().st_size
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", [COMPRESSED, IMAGE])
+def test_damaged_messages_are_pictures_or_broken_and_nothing_else(kind: str) -> None:
+    chance = random.Random(8)
+    whole = picture(LOWER, 10**18).data if kind == COMPRESSED else image(10**18, "mono8", np.zeros((4, 5), np.uint8))
+    for size in range(len(whole)):
+        with pytest.raises(BrokenFrame):
+            parse_image(kind, memoryview(whole[:size]))
+    for _ in range(2000):
+        data = bytearray(whole)
+        data[chance.randrange(min(80, len(data)))] = chance.randrange(256)
+        try:
+            assert parse_image(kind, memoryview(bytes(data))).stamp_ns >= 0
+        except BrokenFrame as error:
+            assert "\n" not in str(error)

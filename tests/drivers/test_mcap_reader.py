@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+
+from drivers.errors import DriverError
+from drivers.frame import Frame, gray
+from drivers.mcap_reader import LogReader
+from tests.drivers.mcap_logs import (
+    BARE,
+    COMPRESSED,
+    IMAGE,
+    LOWER,
+    START_NS,
+    STORE,
+    UPPER,
+    Entry,
+    compressed,
+    image,
+    jpeg,
+    pairs,
+    picture,
+    text,
+    write_log,
+)
+
+REAL_LOGS = Path(__file__).parents[3] / "shared" / "data"
+
+
+def read(path: Path, **options: Any) -> tuple[list[Frame], LogReader]:
+    reader = LogReader(path, **options)
+    frames = list(reader.frames())
+    reader.close()
+    return frames, reader
+
+
+def places(frames: list[Frame]) -> list[tuple[str, int, int]]:
+    return [(frame.camera, frame.seq, frame.stamp_ns) for frame in frames]
+
+
+def in_order(count: int) -> list[tuple[str, int, int]]:
+    stamps = [START_NS + index * 10**8 for index in range(count)]
+    return [place for n, s in enumerate(stamps) for place in (("lower", n, s), ("upper", n, s + 10**6))]
+
+
+def stamps_by_rosbags(path: Path, topic: str) -> list[int]:
+    with AnyReader([path], default_typestore=STORE) as reader:
+        found = [
+            STORE.deserialize_cdr(m[2], m[0].msgtype).header.stamp for m in reader.messages() if m[0].topic == topic
+        ]
+    return sorted(stamp.sec * 10**9 + stamp.nanosec for stamp in found)
+
+
+@pytest.mark.parametrize(("name", "count"), [("two_walls", 99), ("two_walls_crooked", 33)])
+def test_a_real_log_gives_every_frame_in_order(name: str, count: int) -> None:
+    path = REAL_LOGS / name / "log.mcap"
+    if not path.exists():
+        pytest.skip("the shared logs are not here")
+    frames, reader = read(path)
+    for camera in ("lower", "upper"):
+        mine = [(f.seq, f.stamp_ns) for f in frames if f.camera == camera]
+        assert mine == list(enumerate(stamps_by_rosbags(path, reader.topics[camera])))
+        assert len(mine) == count
+    assert [f.stamp_ns for f in frames] == sorted(f.stamp_ns for f in frames)
+    assert {gray(frame).shape for frame in frames[::50]} == {(768, 768)}
+    assert (reader.truncated, reader.warnings, reader.pair_estimate()) == (False, [], count)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+@pytest.mark.parametrize("layout", [{}, {"use_chunking": False}, BARE, BARE | {"use_chunking": False}])
+def test_every_layout_of_the_file_gives_the_same_frames(
+    tmp_path: Path, compression: CompressionType, layout: dict[str, Any]
+) -> None:
+    frames, reader = read(write_log(tmp_path / "log.mcap", pairs(20), compression=compression, **layout))
+    assert places(frames) == in_order(20)
+    assert [bytes(frame.data) for frame in frames] == [jpeg(f.stamp_ns // 10**8) for f in frames]
+    assert reader.counts == {"lower": 20, "upper": 20} | dict.fromkeys(set(reader.counts) - {"lower", "upper"}, 0)
+    assert (reader.truncated, reader.warnings) == (False, [])
+    assert reader.pair_estimate() == (None if "use_statistics" in layout else 20)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "to_gray"),
+    [
+        ("mono8", lambda p: p[..., 0]),
+        ("8UC1", lambda p: p[..., 0]),
+        ("bgr8", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_BGR2GRAY)),
+        ("8UC3", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_BGR2GRAY)),
+        ("rgb8", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_RGB2GRAY)),
+        ("bgra8", lambda p: cv2.cvtColor(p, cv2.COLOR_BGRA2GRAY)),
+        ("rgba8", lambda p: cv2.cvtColor(p, cv2.COLOR_RGBA2GRAY)),
+    ],
+)
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_raw_pictures(
+    tmp_path: Path, encoding: str, to_gray: Callable[[NDArray[Any]], NDArray[Any]], little_endian: bool
+) -> None:
+    pixels = np.random.default_rng(2).integers(0, 256, (9, 14, 4), np.uint8)
+    channels = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3}.get(encoding, 4)
+    data = image(START_NS, encoding, pixels[..., :channels], little_endian=little_endian)
+    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/cam/top", "/cam/bottom")]))
+    assert [frame.camera for frame in frames] == ["lower", "upper"]
+    for frame in frames:
+        np.testing.assert_array_equal(gray(frame), to_gray(pixels))
+
+
+@pytest.mark.parametrize(("order", "bigendian"), [("<u2", 0), (">u2", 1)])
+def test_sixteen_bits_in_both_byte_orders(tmp_path: Path, order: str, bigendian: int) -> None:
+    values = np.random.default_rng(2).integers(0, 2**16, (9, 14), np.uint16)
+    data = image(START_NS, "mono16", values.astype(order), bigendian)
+    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/a/lower", "/a/upper")]))
+    np.testing.assert_array_equal(gray(frames[0]), values >> 8)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "format_", "encoding"),
+    [
+        (".jpg", "bgr8; jpeg compressed bgr8", "jpeg"),
+        (".png", "mono8; png compressed ", "png"),
+        (".png", "jpeg", "png"),
+        (".jpg", "", "jpeg"),
+    ],
+)
+def test_the_bytes_tell_the_compression(tmp_path: Path, suffix: str, format_: str, encoding: str) -> None:
+    data = compressed(START_NS, cv2.imencode(suffix, np.full((8, 8), 90, np.uint8))[1].tobytes(), format_)
+    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, COMPRESSED, data, 0) for t in (LOWER, UPPER)]))
+    assert [frame.encoding for frame in frames] == [encoding] * 2
+    assert abs(int(gray(frames[0])[4, 4]) - 90) < 2
+
+
+@pytest.mark.parametrize("name", ["sensor_msgs::msg::dds_::CompressedImage_", "sensor_msgs/CompressedImage"])
+def test_other_spellings_of_the_type(tmp_path: Path, name: str) -> None:
+    frames, _ = read(write_log(tmp_path / "log.mcap", pairs(2), schema_names={COMPRESSED: name}))
+    assert places(frames) == in_order(2)
+
+
+def test_a_folder_stands_for_the_one_log_in_it(tmp_path: Path) -> None:
+    write_log(tmp_path / "bag_0.mcap", pairs(2))
+    assert places(read(tmp_path)[0]) == in_order(2)
+    write_log(tmp_path / "bag_1.mcap", pairs(2))
+    with pytest.raises(DriverError, match=r"bag_0\.mcap, bag_1\.mcap"):
+        LogReader(tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_frames_shuffled_within_the_window_come_out_sorted(tmp_path: Path, seed: int) -> None:
+    chance, entries = random.Random(seed), pairs(60)
+    moved = sorted(range(len(entries)), key=lambda index: index + chance.uniform(0, 16))
+    assert moved != sorted(moved)
+    frames, reader = read(write_log(tmp_path / "log.mcap", [entries[index] for index in moved]), window=16)
+    assert places(frames) == in_order(60)
+    assert not reader.warnings
+
+
+def test_a_frame_that_comes_after_its_window_is_dropped_and_counted(tmp_path: Path) -> None:
+    entries = pairs(20)
+    frames, reader = read(write_log(tmp_path / "log.mcap", entries[2:] + entries[:2]), window=4)
+    assert len(frames) == 38 and reader.counts["late"] == 2
+    assert [f.seq for f in frames if f.camera == "upper"] == list(range(19))
+    assert "dropped 2 frames" in reader.warnings[0]
+
+
+def test_a_second_frame_with_the_same_stamp_is_dropped_and_counted(tmp_path: Path) -> None:
+    entries = pairs(5)
+    copy = picture(LOWER, entries[4].log_time_ns, 200)
+    frames, reader = read(write_log(tmp_path / "log.mcap", [*entries[:5], copy, *entries[5:], entries[9]]))
+    assert places(frames) == in_order(5)
+    assert reader.counts["duplicate"] == 2 and bytes(frames[4].data) != jpeg(200)
+
+
+def test_both_cameras_may_have_the_same_stamp(tmp_path: Path) -> None:
+    entries = [picture(topic, START_NS + n) for n in range(3) for topic in (UPPER, LOWER)]
+    frames, _ = read(write_log(tmp_path / "log.mcap", entries))
+    assert [(f.camera, f.seq) for f in frames] == [(c, n) for n in range(3) for c in ("lower", "upper")]
+
+
+def test_an_unset_stamp_is_replaced_by_the_time_of_logging(tmp_path: Path) -> None:
+    entries = [Entry(e.topic, e.type, compressed(0, jpeg(1)), e.log_time_ns) for e in pairs(3)]
+    frames, reader = read(write_log(tmp_path / "log.mcap", entries))
+    assert places(frames) == in_order(3)
+    assert reader.counts["unstamped"] == 6 and len(reader.warnings) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"\0\1", b"\0\7\0\0" + bytes(40), b"\0\1\0\0" + b"\xff" * 40])
+def test_a_message_that_is_no_picture_is_skipped_and_counted(tmp_path: Path, damage: bytes) -> None:
+    entries = pairs(4)
+    entries.insert(3, Entry(LOWER, COMPRESSED, damage, START_NS))
+    frames, reader = read(write_log(tmp_path / "log.mcap", entries))
+    assert places(frames) == in_order(4)
+    assert reader.counts["broken"] == 1 and len(reader.warnings) == 1
+
+
+def test_other_topics_are_left_alone(tmp_path: Path) -> None:
+    noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS + n) for n in range(50)]
+    frames, reader = read(write_log(tmp_path / "log.mcap", [*noise, *pairs(5), *noise]))
+    assert places(frames) == in_order(5) and reader.counts["broken"] == 0
+
+
+def test_frames_can_be_read_again_and_stop_after_close(tmp_path: Path) -> None:
+    reader = LogReader(write_log(tmp_path / "log.mcap", pairs(50)), window=2)
+    assert places(list(reader.frames())) == places(list(reader.frames())) == in_order(50)
+    stream = reader.frames()
+    next(stream)
+    reader.close()
+    reader.close()
+    assert len(list(stream)) < 4
+
+
+def test_attachments_with_and_without_a_summary(tmp_path: Path) -> None:
+    files = [("rig.toml", b"version = 1"), ("big", bytes(17 * 2**20)), ("empty", b"")]
+    path = write_log(tmp_path / "log.mcap", pairs(2), files)
+    assert LogReader(path).attachments() == {"rig.toml": b"version = 1", "empty": b""}
+    path.write_bytes(path.read_bytes()[:-9])
+    assert LogReader(path).attachments() == {"rig.toml": b"version = 1", "empty": b""}
+
+
+def test_a_corrupt_attachment_is_not_given(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2), [("rig.toml", b"version = 1"), ("other", b"2")])
+    path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
+    assert LogReader(path).attachments() == {"other": b"2"}

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.frame import Camera
+from drivers.mcap_reader import LogReader
+from drivers.topic_choice import choose_topics
+from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
+
+CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        ("/lower/image_raw/compressed", "/upper/image_raw/compressed"),
+        ("/camera_bottom/image", "/camera_top/image"),
+        ("/cam/down/image", "/cam/up/image"),
+        ("/lower/upsampled", "/upper/down_sampled"),
+        ("/LOWER", "/Upper"),
+    ],
+)
+def test_names_that_tell_the_camera(tmp_path: Path, lower: str, upper: str) -> None:
+    reader = LogReader(write_log(tmp_path / "log.mcap", [CHATTER, *pairs(2, lower, upper)]))
+    assert reader.topics == {"lower": lower, "upper": upper}
+    assert [frame.camera for frame in reader.frames()] == ["lower", "upper"] * 2
+
+
+@pytest.mark.parametrize("layout", [{}, BARE, BARE | {"use_chunking": False}])
+def test_given_names_with_and_without_a_summary(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/b"), **layout)
+    with pytest.raises(DriverError, match=r"found /a, /b; give --lower and --upper"):
+        LogReader(path)
+    reader = LogReader(path, lower="/b", upper="/a")
+    assert reader.topics == {"lower": "/b", "upper": "/a"} and len(list(reader.frames())) == 4
+
+
+def test_one_given_name_leaves_the_other_to_its_own(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/upper/b"))
+    assert LogReader(path, lower="/a").topics == {"lower": "/a", "upper": "/upper/b"}
+
+
+IMAGES = {"/a/lower/image_raw": IMAGE, "/a/upper/image_raw": IMAGE}
+
+
+def test_compressed_pictures_are_preferred_and_depth_is_no_picture() -> None:
+    both = IMAGES | {name + "/compressed": COMPRESSED for name in IMAGES}
+    both |= {name + "/compressedDepth": COMPRESSED for name in IMAGES}
+    assert choose_topics("log", both, {"lower": None, "upper": None}) == {
+        "/a/lower/image_raw/compressed": "lower",
+        "/a/upper/image_raw/compressed": "upper",
+    }
+    raw = "/a/lower/image_raw"
+    assert choose_topics("log", both, {"lower": raw, "upper": None})[raw] == "lower"
+
+
+@pytest.mark.parametrize(
+    ("topics", "wanted", "message"),
+    [
+        ({}, {}, "no image topics in log: found no topics at all"),
+        ({"/imu": "sensor_msgs/msg/Imu", "/tf": ""}, {}, "no image topics in log: found /imu, /tf"),
+        (
+            {"/lower/a": IMAGE, "/imu": "x/msg/Y"},
+            {},
+            "no upper camera in log: found only /lower/a; give --upper",
+        ),
+        ({"/cam/image": IMAGE}, {}, "no lower camera in log: found only /cam/image"),
+        (
+            {"/a": IMAGE, "/b": IMAGE},
+            {},
+            "cameras in log apart: found /a, /b; give --lower and --upper",
+        ),
+        (IMAGES, {"lower": "/nowhere"}, "no topic '/nowhere' in log: found /a/lower/image_raw, /a/upper"),
+        (IMAGES | {"/imu": "sensor_msgs/msg/Imu"}, {"lower": "/imu"}, "'/imu' in log holds sensor_msgs/msg/Imu"),
+        (IMAGES, {"lower": "/a/upper/image_raw"}, "no upper camera in log"),
+        (IMAGES, dict.fromkeys(("lower", "upper"), "/a/upper/image_raw"), "cannot be both cameras"),
+        (IMAGES | {"/b/lower": IMAGE}, {}, "several lower cameras in log: found /a/lower/image_raw, /b/lower"),
+        ({"/lower\n\x1b[2J": IMAGE}, {}, r"/lower\\n\\x1b"),
+        ({f"/t{n:02}": "" for n in range(40)}, {}, "/t15 and 24 more"),
+    ],
+)
+def test_doubts_are_errors_that_list_what_there_is(
+    topics: dict[str, str], wanted: dict[Camera, str], message: str
+) -> None:
+    with pytest.raises(DriverError, match=message) as caught:
+        choose_topics("log", topics, {"lower": wanted.get("lower"), "upper": wanted.get("upper")})
+    assert str(caught.value).isprintable()
+
+
+def test_the_error_names_the_log(tmp_path: Path) -> None:
+    with pytest.raises(DriverError, match=r"no image topics in '.*log\.mcap': found /chatter"):
+        LogReader(write_log(tmp_path / "log.mcap", [CHATTER]))

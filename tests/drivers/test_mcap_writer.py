@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from drivers.errors import DriverError
+from drivers.mcap_reader import LogReader
+from drivers.mcap_writer import LogWriter, schema_text
+from tests.drivers.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, UPPER, Entry, pairs, text
+
+RIG = {"rig.toml": b"version = 1", "omnid.toml": b""}
+
+
+def written(path: Path, entries: list[Entry], **options: object) -> Path:
+    with LogWriter(path, RIG, **options) as log:  # type: ignore[arg-type]
+        for entry in entries:
+            log.write(entry.topic, entry.type, memoryview(entry.data), entry.log_time_ns)
+    return path
+
+
+@pytest.mark.parametrize("compression", ["lz4", "none"])
+@pytest.mark.parametrize("chunk_bytes", [1, 256 * 1024])
+def test_what_is_written_is_read_by_rosbags_and_by_us(
+    tmp_path: Path, compression: Literal["lz4", "none"], chunk_bytes: int
+) -> None:
+    entries = [*pairs(30), Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
+    path = written(tmp_path / "log.mcap", entries, chunk_bytes=chunk_bytes, compression=compression)
+    with AnyReader([path]) as bag:
+        found = [Entry(c.topic, c.msgtype, bytes(data), stamp) for c, stamp, data in bag.messages()]
+        chatter = [
+            STORE.deserialize_cdr(data, c.msgtype).data for c, _, data in bag.messages() if c.topic == "/chatter"
+        ]
+    assert sorted(found) == sorted(entries) and chatter == ["hello"]
+    reader = LogReader(path)
+    assert len(list(reader.frames())) == 60 and not reader.truncated and not reader.warnings
+    assert reader.attachments() == RIG and reader.pair_estimate() == 30
+
+
+def test_the_file_is_what_ros_writes(tmp_path: Path) -> None:
+    with written(tmp_path / "log.mcap", pairs(2)).open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert reader.get_header().profile == "ros2" and summary is not None
+        assert {(c.topic, c.message_encoding) for c in summary.channels.values()} == {(LOWER, "cdr"), (UPPER, "cdr")}
+        assert all(c.metadata == {"offered_qos_profiles": ""} for c in summary.channels.values())
+        (schema,) = summary.schemas.values()
+        definition = STORE.generate_msgdef(COMPRESSED, ros_version=2)[0]
+        assert (schema.name, schema.encoding, schema.data.decode()) == (COMPRESSED, "ros2msg", definition)
+
+
+DIES = """
+import os, sys
+from drivers.mcap_writer import LogWriter
+from tests.drivers.mcap_logs import pairs
+log = LogWriter(sys.argv[1], {"rig.toml": b"version = 1"}, int(sys.argv[2]))
+for entry in pairs(50):
+    log.write(entry.topic, entry.type, entry.data, entry.log_time_ns)
+os._exit(9)
+"""
+
+
+@pytest.mark.parametrize("chunk_bytes", [2000, 2**30])
+def test_a_crash_loses_no_more_than_the_last_chunk_or_second(tmp_path: Path, chunk_bytes: int) -> None:
+    path = tmp_path / "log.mcap"
+    command = [sys.executable, "-c", DIES, str(path), str(chunk_bytes)]
+    assert subprocess.run(command, cwd=Path(__file__).parents[2], check=False).returncode == 9
+    reader = LogReader(path)
+    count = len(list(reader.frames()))
+    assert (95 if chunk_bytes == 2000 else 80) <= count < 100
+    assert reader.truncated and reader.attachments() == {"rig.toml": b"version = 1"}
+
+
+def test_a_path_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "nowhere" / "log.mcap"):
+        with pytest.raises(DriverError, match="cannot create the log") as caught:
+            LogWriter(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_full_disk_is_told_at_once() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("there is no /dev/full here")
+    reason = os.strerror(errno.ENOSPC)
+    with pytest.raises(DriverError, match=reason):
+        LogWriter(full, RIG)
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """The kernel refuses files over 100 kB, as a full disk would."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("chunk_bytes", [2000, 2**30])
+def test_a_disk_that_fills_up_ends_the_log_which_stays_readable(
+    tmp_path: Path, small_files: None, chunk_bytes: int
+) -> None:
+    log = LogWriter(tmp_path / "log.mcap", RIG, chunk_bytes, compression="none")
+    entries = pairs(200)
+    with pytest.raises(DriverError, match=os.strerror(errno.EFBIG)):
+        for entry in entries:
+            log.write(*entry)
+        log.close()
+    with pytest.raises(DriverError, match="closed or failed"):
+        log.write(*entries[0])
+    log.close()
+    reader = LogReader(tmp_path / "log.mcap")
+    assert reader.attachments() == RIG and len(list(reader.frames())) > 100
+
+
+def test_wrong_use_is_told_and_leaves_the_log_whole(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        with pytest.raises(DriverError, match="unknown message type 'no/msg/Such'"):
+            log.write("/a", "no/msg/Such", b"", START_NS)
+        with pytest.raises(DriverError, match="-1 ns is not a time"):
+            log.write(LOWER, COMPRESSED, b"", -1)
+        for entry in pairs(2):
+            log.write(*entry)
+    log.close()
+    with pytest.raises(DriverError, match="closed"):
+        log.write(*pairs(1)[0])
+    assert len(list(LogReader(path).frames())) == 4
+
+
+def test_schema_text_holds_all_the_parts() -> None:
+    assert "MSG: geometry_msgs/Quaternion" in schema_text("nav_msgs/msg/Odometry")
