@@ -1,0 +1,512 @@
+"""The graph: nothing is lost that must not be, everything ends, and threads change no number."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
+from typing import NoReturn
+
+import pytest
+
+from omnid.errors import OmnidError
+from omnid.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
+
+LONG_S = 20.0  # a wait that only a broken graph exhausts
+both = pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    before = threading.enumerate()
+    yield
+    assert threading.enumerate() == before
+
+
+@dataclass
+class Collect:
+    """A sink that keeps what it gets, and is told the end."""
+
+    got: list[int] = field(default_factory=list)
+    finished: int = 0
+
+    def process(self, message: int) -> None:
+        self.got.append(message)
+
+    def finish(self) -> None:
+        self.finished += 1
+
+
+@dataclass
+class Apply:
+    """A stage without an end."""
+
+    function: Callable[[int], int | None]
+
+    def process(self, message: int) -> int | None:
+        return self.function(message)
+
+
+@dataclass
+class Sums:
+    """A stage with memory: gives the sum of two messages, and in the end what is left over and a marker."""
+
+    held: list[int] = field(default_factory=list)
+
+    def process(self, message: int) -> int | None:
+        self.held.append(message)
+        if len(self.held) < 2:
+            return None
+        total, self.held = sum(self.held), []
+        return total
+
+    def finish(self) -> Iterable[int]:
+        yield from self.held
+        yield -1
+
+
+def fail_at(bad: int) -> Callable[[int], int]:
+    def check(message: int) -> int:
+        if message == bad:
+            raise ValueError(f"cannot take {message}")
+        return message
+
+    return check
+
+
+def stopped_at(graph: Graph, last: int, act: Callable[[], None]) -> Callable[[int], int]:
+    """Lets messages pass and acts at one of them."""
+
+    def check(message: int) -> int:
+        if message == last:
+            act()
+        return message
+
+    return check
+
+
+def summed(threaded: bool) -> tuple[list[int], list[int], list[int]]:
+    graph, raw, sums, late = Graph(threaded=threaded), Collect(), Collect(), Collect()
+    numbers = graph.source("numbers", lambda: range(101))
+    graph.sink("raw", raw, numbers)
+    pairs = graph.stage("pairs", Sums(), numbers)
+    graph.sink("sums", sums, pairs)
+    graph.sink("late", late, graph.stage("quads", Sums(), pairs))
+    graph.run()
+    assert [sink.finished for sink in (raw, sums, late)] == [1, 1, 1]
+    return raw.got, sums.got, late.got
+
+
+def test_threads_change_no_number_and_no_order() -> None:
+    raw, sums, late = summed(threaded=True)
+    assert (raw, sums, late) == summed(threaded=False)
+    assert raw == list(range(101))
+    assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # what finish gives flows down
+    assert late == [sums[k] + sums[k + 1] for k in range(0, 52, 2)] + [-1]
+
+
+def test_a_slow_reader_loses_nothing_and_its_inbox_stays_bounded() -> None:
+    graph, slow = Graph(policy=LOSSLESS, depth=3), Collect()
+    produced: list[int] = []
+    ahead: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(300):
+            produced.append(number)
+            yield number
+
+    def crawl(message: int) -> int:
+        threading.Event().wait(1e-4)
+        ahead.append(len(produced) - message)
+        return message
+
+    graph.sink("slow", slow, graph.stage("crawl", Apply(crawl), graph.source("numbers", numbers)))
+    graph.run()
+    assert slow.got == list(range(300))
+    assert max(ahead) <= 3 + 2  # the inbox, one message in the writer's hand and the one at work
+    assert [row.drops for row in graph.telemetry.summary()] == [0, 0, 0]
+
+
+def test_newest_forgets_the_oldest_and_counts_it() -> None:
+    graph, slow, fast, all_sent = Graph(policy=NEWEST, depth=2), Collect(), Collect(), threading.Event()
+
+    def numbers() -> Iterator[int]:
+        yield from range(50)
+        all_sent.set()
+
+    def hold(message: int) -> int:
+        assert all_sent.wait(LONG_S)
+        return message
+
+    stream = graph.source("numbers", numbers)
+    graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), policy=LOSSLESS)
+    graph.sink("fast", fast, stream, policy=LOSSLESS)
+    graph.run()
+    assert fast.got == list(range(50))  # a sink may overrule the run
+    assert slow.got[-2:] == [48, 49]
+    assert len(slow.got) in (2, 3)  # and perhaps the one that was at work first
+    counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
+    assert counted["hold"] == (len(slow.got), 50 - len(slow.got))
+    assert counted["numbers"] == counted["fast"] == (50, 0)
+
+
+@both
+def test_several_sources_merge_into_one_inbox(threaded: bool) -> None:
+    graph, sink = Graph(threaded=threaded), Collect()
+    streams = [graph.source("even", lambda: range(0, 100, 2)), graph.source("odd", lambda: range(1, 60, 2))]
+    graph.sink("sink", sink, *streams)
+    graph.run()
+    assert sorted(sink.got) == sorted([*range(0, 100, 2), *range(1, 60, 2)])
+    assert [number for number in sink.got if number % 2] == list(range(1, 60, 2))
+    if not threaded:
+        assert sink.got[:60] == list(range(60))  # inline, sources take turns
+
+
+@both
+def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
+    graph, before, beside, after, closed = Graph(threaded=threaded), Collect(), Collect(), Collect(), threading.Event()
+
+    def endless() -> Iterator[int]:
+        try:
+            yield from count()
+        finally:
+            closed.set()
+
+    numbers = graph.source("numbers", endless)
+    graph.sink("before", before, numbers)
+    fragile = graph.stage("fragile", Apply(fail_at(10)), numbers)
+    graph.sink("beside", beside, graph.stage("sums", Sums(), numbers))
+    graph.sink("after", after, fragile)
+    with pytest.raises(ValueError, match="cannot take 10") as caught:
+        graph.run()
+    assert caught.value.__notes__ == ["in 'fragile'"]
+    assert after.got == list(range(10))
+    assert [sink.finished for sink in (before, beside, after)] == [1, 1, 1]  # the end flows down all the same
+    assert before.got == list(range(len(before.got)))
+    assert closed.is_set()
+
+
+@both
+@pytest.mark.parametrize("place", ["open", "next", "close", "finish", "sink"])
+def test_an_error_anywhere_is_raised_and_named(threaded: bool, place: str) -> None:
+    def broken() -> NoReturn:
+        raise OSError(place)
+
+    class Messages:
+        def __iter__(self) -> Iterator[int]:
+            return self
+
+        def __next__(self) -> int:
+            if place in ("next", "sink"):
+                return 1 if place == "sink" else broken()
+            raise StopIteration
+
+        def close(self) -> None:
+            if place == "close":
+                broken()
+
+    class Last(Collect):
+        def process(self, message: int) -> None:
+            broken()
+
+        def finish(self) -> None:
+            broken()
+
+    graph = Graph(threaded=threaded)
+    stream = graph.source("source", broken if place == "open" else Messages)
+    graph.sink("sink", Last() if place in ("finish", "sink") else Collect(), stream)
+    with pytest.raises(OSError, match=place) as caught:
+        graph.run()
+    assert caught.value.__notes__ == ["in 'sink'" if place in ("finish", "sink") else "in 'source'"]
+
+
+def test_later_errors_are_told_with_the_first() -> None:
+    class Second(Collect):
+        def finish(self) -> None:
+            raise OSError("the disk is full")
+
+    graph = Graph()
+    graph.sink("second", Second(), graph.stage("first", Apply(fail_at(3)), graph.source("numbers", lambda: range(9))))
+    with pytest.raises(ValueError, match="cannot take 3") as caught:
+        graph.run()
+    assert caught.value.__notes__ == ["in 'first'", "and then: OSError('the disk is full')"]
+
+
+@both
+def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
+    graph, sink, stopped = Graph(threaded=threaded), Collect(), threading.Event()
+    seen = threading.Event()
+
+    def stop() -> None:
+        assert seen.wait(LONG_S)
+        graph.stop()
+        stopped.set()
+
+    def act() -> None:
+        seen.set()
+        assert stopped.wait(LONG_S)
+
+    numbers = graph.source("numbers", count)
+    graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
+    stopper = threading.Thread(target=stop)
+    stopper.start()
+    graph.run()
+    stopper.join()
+    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all that the source gave has come down
+    assert len(sink.got) >= 6
+    assert sink.finished == 1
+
+
+@both
+@pytest.mark.parametrize("handled", [True, False], ids=["SIGTERM handler", "Ctrl-C"])
+def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool, handled: bool) -> None:
+    graph, sink = Graph(threaded=threaded), Collect()
+    number = signal.SIGTERM if handled else signal.SIGINT
+    old = signal.signal(signal.SIGTERM, lambda *_: graph.stop())
+    try:
+        act = partial(os.kill, os.getpid(), number)
+        numbers = graph.source("numbers", count)
+        graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
+        graph.run()
+    finally:
+        signal.signal(signal.SIGTERM, old)
+    assert sink.got == list(range(graph.telemetry.stages[0].processed))
+    assert len(sink.got) >= 6
+    assert sink.finished == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_stop_forgets_what_waits_and_wakes_a_blocked_writer() -> None:
+    graph, sink, third, ended = Graph(depth=1), Collect(), threading.Event(), threading.Event()
+
+    def numbers() -> Iterator[int]:
+        try:
+            yield from (0, 1)
+            third.set()  # one message at work, one in the inbox: the next one has to wait
+            yield from count(2)
+        finally:
+            ended.set()
+
+    def hold(message: int) -> int:
+        assert third.wait(LONG_S)
+        graph.stop()
+        graph.stop()
+        assert ended.wait(LONG_S)  # the writer was woken while its reader is still at work
+        return message
+
+    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("numbers", numbers)))
+    with pytest.raises(KeyboardInterrupt, match="stopped twice"):
+        graph.run()
+    numbers_stats, hold_stats, _ = graph.telemetry.stages
+    assert (hold_stats.processed, hold_stats.dropped) == (1, numbers_stats.processed - 1)
+    assert sink.finished == 0
+
+
+def test_a_second_ctrl_c_breaks_into_an_inline_stage() -> None:
+    graph, sink = Graph(threaded=False), Collect()
+
+    def stuck() -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+        assert not threading.Event().wait(LONG_S)
+
+    numbers = graph.source("numbers", count)
+    graph.sink("sink", sink, graph.stage("stuck", Apply(stopped_at(graph, 2, stuck)), numbers))
+    with pytest.raises(KeyboardInterrupt):
+        graph.run()
+    assert sink.got == [0, 1]
+    assert sink.finished == 0
+
+
+def test_an_exception_from_a_foreign_signal_handler_joins_everything() -> None:
+    graph, sink = Graph(), Collect()
+
+    def too_long(*_: object) -> None:
+        raise TimeoutError("alarm")
+
+    old = signal.signal(signal.SIGALRM, too_long)
+    try:
+        act = partial(os.kill, os.getpid(), signal.SIGALRM)
+        numbers = graph.source("numbers", count)
+        graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
+        with pytest.raises(TimeoutError, match="alarm"):
+            graph.run()
+    finally:
+        signal.signal(signal.SIGALRM, old)
+
+
+def test_a_source_that_blocks_is_woken_to_end() -> None:
+    graph, sink, closed = Graph(), Collect(), threading.Event()
+
+    def camera() -> Iterator[int]:
+        yield 1
+        graph.stop()
+        assert closed.wait(LONG_S)
+
+    graph.sink("sink", sink, graph.source("camera", camera, wake=closed.set))
+    graph.run()
+    assert (sink.got, sink.finished) == ([1], 1)
+
+
+@both
+def test_a_stop_before_the_run_ends_it_at_once(threaded: bool) -> None:
+    graph, sink = Graph(threaded=threaded), Collect()
+    graph.sink("sink", sink, graph.source("numbers", count))
+    graph.stop()
+    graph.run()
+    assert (sink.got, sink.finished) == ([], 1)
+
+
+@dataclass
+class Beat:
+    """A ticker's action that tells when it has been called often enough, and fails at one call if asked to."""
+
+    enough: int
+    bad: int = -1
+    calls: int = 0
+    closed: int = 0
+    reached: threading.Event = field(default_factory=threading.Event)
+
+    def __call__(self) -> None:
+        self.calls += 1
+        if self.calls == self.bad:
+            raise OSError("no answer from the motor")
+        if self.calls >= self.enough:
+            self.reached.set()
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@both
+def test_a_ticker_does_not_wait_for_a_stage(threaded: bool) -> None:
+    graph, sink, beat = Graph(threaded=threaded), Collect(), Beat(enough=20)
+
+    def hold(message: int) -> int:
+        assert beat.reached.wait(LONG_S)  # the stage ends only after 20 more ticks
+        return message
+
+    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
+    ticker = graph.ticker("motor", 1e-3, beat)
+    graph.run()
+    assert sink.got == [7]
+    assert beat.closed == 1
+    assert ticker.stats.processed == beat.calls >= 20
+    assert ticker.stats in graph.telemetry.stages
+
+
+@both
+def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
+    graph, sink, beat = Graph(threaded=threaded), Collect(), Beat(enough=99, bad=3)
+    graph.sink("sink", sink, graph.source("numbers", lambda: (number % 7 for number in count())), policy=NEWEST)
+    graph.ticker("motor", 1e-3, beat)
+    with pytest.raises(OSError, match="no answer") as caught:
+        graph.run()
+    assert caught.value.__notes__ == ["in 'motor'"]
+    assert (beat.calls, beat.closed, sink.finished) == (3, 1, 1)
+
+
+def test_a_stop_ends_the_ticker_before_the_rest_has_drained() -> None:
+    graph, sink, beat = Graph(), Collect(), Beat(enough=1)
+    halted = threading.Event()
+    beat.close = halted.set  # type: ignore[method-assign]
+
+    def drain_slowly(message: int) -> int:
+        graph.stop()
+        assert halted.wait(LONG_S)  # the wheels stand still while this message is still at work
+        return message
+
+    graph.sink("sink", sink, graph.stage("slow", Apply(drain_slowly), graph.source("one", lambda: [1])))
+    graph.ticker("motor", 1e-3, beat)
+    graph.ticker("hourly", 3600.0, Beat(enough=1))
+    graph.run()
+    assert sink.got == [1]
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "skipped"), [(-50, 0), (0, 0), (99, 0), (100, 1), (199, 1), (1000, 10), (1050, 10)]
+)
+def test_a_stall_skips_deadlines_and_keeps_the_phase(late_ns: int, skipped: int) -> None:
+    assert skipped_deadlines(5_000, 5_000 + late_ns, 100) == skipped
+
+
+def test_a_stalled_ticker_counts_what_it_missed_and_does_not_burst() -> None:
+    stalled = threading.Event()
+
+    def action() -> None:
+        if not stalled.is_set():
+            threading.Event().wait(0.05)
+            stalled.set()
+        elif ticker.stats.processed + ticker.stats.dropped >= 30:
+            ticker.halt()
+
+    ticker = Ticker("motor", 2e-3, action)
+    ticker.run(lambda: False)
+    assert ticker.stats.dropped >= 23  # 24 deadlines lie in the stall, the newest is served
+    assert ticker.stats.processed <= 8
+
+
+@both
+def test_two_hundred_runs_leave_no_thread(threaded: bool) -> None:
+    before = threading.enumerate()
+    for _ in range(200):
+        graph, sink = Graph(threaded=threaded), Collect()
+        graph.sink("sink", sink, graph.stage("sums", Sums(), graph.source("numbers", lambda: range(5))))
+        graph.ticker("beat", 1e-3, Beat(enough=1))
+        graph.run()
+        assert sink.got == [1, 5, 4, -1]
+        assert threading.enumerate() == before
+
+
+@both
+def test_threads_are_named_after_their_boxes(threaded: bool) -> None:
+    names: list[str] = []
+    graph = Graph(threaded=threaded)
+    where = Apply(lambda _: names.append(threading.current_thread().name))
+    graph.stage("where", where, graph.source("one", lambda: [1]))
+    graph.run()
+    assert names == ["where" if threaded else threading.current_thread().name]
+
+
+@both
+def test_a_slot_keeps_the_newest_as_a_sink(threaded: bool) -> None:
+    slot: Slot[int] = Slot()
+    assert slot.get() is None
+    graph = Graph(threaded=threaded)
+    graph.sink("newest", slot, graph.source("numbers", lambda: range(10)))
+    graph.run()
+    assert slot.get() == 9
+    slot.put(3)
+    assert slot.get() == 3
+
+
+def test_a_run_may_live_outside_the_main_thread() -> None:
+    graph, sink = Graph(), Collect()
+    graph.sink("sink", sink, graph.source("numbers", lambda: range(3)))
+    thread = threading.Thread(target=graph.run)
+    thread.start()
+    thread.join()
+    assert sink.got == [0, 1, 2]
+
+
+def test_wrong_wiring_is_refused_in_one_line() -> None:
+    graph = Graph()
+    numbers = graph.source("numbers", lambda: range(3))
+    with pytest.raises(OmnidError, match="'numbers': the name is taken"):
+        graph.sink("numbers", Collect(), numbers)
+    with pytest.raises(OmnidError, match="expected inputs"):
+        graph.sink("nothing", Collect())
+    with pytest.raises(OmnidError, match="depth above 0"):
+        graph.sink("narrow", Collect(), numbers, depth=0)
+    for period_s in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(OmnidError, match="period above 0"):
+            graph.ticker("beat", period_s, print)
+    graph.run()
+    with pytest.raises(OmnidError, match="runs once"):
+        graph.run()
+    with pytest.raises(OmnidError, match="runs once"):
+        graph.source("late", lambda: range(3))
