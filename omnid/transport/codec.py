@@ -183,7 +183,7 @@ def odometry_from_cdr(payload: bytes) -> OdometryRecord:
     """What an Odometry message says; any bytes may come: OmnidError unless they are one with a finite, rigid pose."""
     try:
         message = _typestore().deserialize_cdr(bytes(payload), ODOMETRY_SCHEMA)
-    except (SerdeError, IndexError, OverflowError) as error:
+    except SerdeError as error:
         raise OmnidError(f"{len(payload)} bytes are no {ODOMETRY_SCHEMA} in CDR ({error}); check the sender") from error
     assert isinstance(message, ros.nav_msgs__msg__Odometry)
     twist = message.twist.twist

@@ -85,6 +85,15 @@ def test_decoder_refuses(payload: bytes) -> None:
         codec.odometry_from_cdr(payload)
 
 
+@pytest.mark.parametrize(("offset", "value"), [(4, struct.pack("<i", -1)), (8, struct.pack("<I", 10**9)),
+                                               (68, bytes(32)), (92, struct.pack("<d", 3.0))])  # fmt: skip
+def test_decoder_refuses_odd_times_and_rotations(offset: int, value: bytes) -> None:
+    payload = bytearray(odometry())
+    payload[offset : offset + len(value)] = value
+    with pytest.raises(OmnidError, match=r"stamp|quaternion"):
+        codec.odometry_from_cdr(bytes(payload))
+
+
 def test_decoder_refuses_a_pose_that_is_not_finite() -> None:
     T = T_ODOM_BASE.copy()
     T[0, 3] = np.nan
