@@ -93,7 +93,7 @@ def back(seed: int, size: int, pairs: int) -> Run:
 
 
 def plain(seed: int, size: int, pairs: int) -> Run:
-    """two_walls without texture but two pictures: what must be called degraded or lost, never guessed."""
+    """Bare walls and floor, a few pictures and boxes, a tiled ceiling: a pose must be called degraded, not guessed."""
     scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, pictures=2)
     return Run(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.05), scene)
 
