@@ -40,7 +40,7 @@ class _Inbox:
     def put(self, message: object) -> None:
         with self._changed:
             if self._policy is LOSSLESS:
-                self._changed.wait_for(lambda: self._closed or len(self._messages) < self._capacity)
+                self._changed.wait_for(lambda: len(self._messages) < self._capacity)  # closing makes room as well
             if self._closed:  # the reader is gone: nobody waits for it
                 self._stats.dropped += 1
                 return

@@ -133,6 +133,7 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path)
         ("offset_m = [1, 2, 'x']", "offset_m: expected a list of 3 numbers, found [1, 2, 'x']"),
         ("offset_m = [1, 2, 1e999]", "offset_m: expected a list of 3 numbers, found [1, 2, inf]"),
         ("topics = 'a'", "topics: expected a list of strings, found 'a'"),
+        ("motor.serial.bauds = [9600, true]", "expected a list of integers of at least 1, found [9600, True]"),
         ("motor.serial.bauds = [0]", "expected a list of integers of at least 1, found [0]"),
         (f"stereo.ratio = 0x{'f' * 5000}", "expected a number from 0.0 to 1.0, found a huge int"),
         (f"stereo.window_px = {'9' * 5000}", "expected TOML, found: "),
