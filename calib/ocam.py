@@ -20,7 +20,7 @@ VIEWS: tuple[View, View] = ("mirror", "direct")
 
 # Radii of the table that starts the inversion; each solve stays between two of its neighbours.
 TABLE_SIZE = 1025
-# Newton steps on one table interval: 3 reach the last bit, the others bisect where the slope vanishes.
+# Newton steps on one table interval: 3 reach the last bit, the others serve the model's end, where the slope vanishes.
 SOLVE_STEPS = 8
 
 
@@ -105,7 +105,7 @@ class OcamCamera:
         return -1.0 if self.view == "mirror" else 1.0
 
     def _radius(self, r: Array, z: Array) -> Array:
-        """The rho (N,) that solves f(rho) * r = z * rho, by Newton steps kept inside one interval of the table."""
+        """The rho (N,) that solves f(rho) * r = z * rho, by Newton steps inside one interval of the table."""
         norm = np.hypot(r, z)
         unit = np.where((norm > 0) & np.isfinite(norm), norm, np.nan)
         r, z, angle = r / unit, z / unit, np.arctan2(z, r)
@@ -115,8 +115,8 @@ class OcamCamera:
         for _ in range(SOLVE_STEPS):
             value = self.height(rho) * r - z * rho
             low, high = np.where(value < 0, rho, low), np.where(value < 0, high, rho)
-            step = self._newton(rho, value, (r, z))
-            rho = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+            step = np.clip(self._newton(rho, value, (r, z)), low, high)
+            rho = np.where(np.isnan(step), (low + high) / 2, step)
         return np.where(np.isfinite(unit) & (angle <= self._angles[-1]), rho, np.nan)
 
     def _newton(self, rho: Array, value: Array, slope: tuple[Array, Array]) -> Array:

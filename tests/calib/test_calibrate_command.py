@@ -1,0 +1,78 @@
+"""`omnid calibrate`: files in, files out, one line printed, errors before work."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.errors import CalibError
+from calib.kalibr import export_kalibr
+from calib.ocam_file import export_ocam
+from calib.rig import Rig
+from calib.rig_file import read_rig, write_rig
+from omnid.commands import calibrate
+from omnid.errors import OmnidError
+
+
+def omnid(*words: object) -> int:
+    parser = argparse.ArgumentParser("omnid")
+    calibrate.add_parser(parser.add_subparsers(required=True))
+    args = parser.parse_args(["calibrate", *map(str, words)])
+    status: int = args.run(args)
+    return status
+
+
+def test_kalibr_in_and_out(omni_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "k.yaml").write_text(export_kalibr(omni_rig))
+    assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert f"baseline {omni_rig.baseline_m * 1e3:.1f} mm" in line and "upper turned by 14.4" in line
+    assert "lower omni 768x770 (/front/lower/image_raw), upper omni 780x768" in line
+    assert omnid("export", tmp_path / "rig.toml", "--format", "kalibr", "-o", tmp_path / "again.yaml") == 0
+    assert omnid("import", tmp_path / "again.yaml", "-o", tmp_path / "again.toml") == 0
+    assert (tmp_path / "again.toml").read_text() == (tmp_path / "rig.toml").read_text()
+    assert omnid("import", tmp_path / "k.yaml", "--lower", "cam1", "-o", tmp_path / "swapped.toml") == 0
+    assert read_rig(tmp_path / "swapped.toml").lower.camera == omni_rig.upper.camera
+
+
+def test_ocam_in_and_out(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_rig(tmp_path / "rig.toml", ocam_rig)
+    assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "o") == 0
+    assert "left out, as the format has no place for it: T_base_rig" in capsys.readouterr().out
+    files = ["--lower", tmp_path / "o.lower.txt", "--upper", tmp_path / "o.upper.txt"]
+    assert omnid("import", *files, "--transform", tmp_path / "o.transform.toml", "-o", tmp_path / "again.toml") == 0
+    again = read_rig(tmp_path / "again.toml")
+    assert (again.lower.camera, again.upper.camera) == (ocam_rig.lower.camera, ocam_rig.upper.camera)
+    np.testing.assert_allclose(again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
+                               ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig), atol=1e-11)
+    assert omnid("import", *files, "--baseline", 0.2, "--view", "direct", "-o", tmp_path / "up.toml") == 0
+    assert "lower ocam direct 1024x768, upper ocam direct 1000x780, baseline 200.0 mm, upper turned by 0.00 deg" in \
+        capsys.readouterr().out
+    (tmp_path / "folder").mkdir()
+    assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
+    assert (tmp_path / "folder" / "calib_results.upper.txt").read_text() == export_ocam(ocam_rig.upper.camera)
+
+
+def test_what_cannot_be_done_is_said_before_anything_is_written(omni_rig: Rig, ocam_rig: Rig, tmp_path: Path) -> None:
+    write_rig(tmp_path / "omni.toml", omni_rig)
+    write_rig(tmp_path / "ocam.toml", ocam_rig)
+    (tmp_path / "k.yaml").write_text(export_kalibr(omni_rig))
+    before = sorted(tmp_path.iterdir())
+    cases = [
+        (("import", tmp_path / "none.yaml", "-o", tmp_path / "no" / "rig.toml"), "there is no folder"),
+        (("import", tmp_path / "k.yaml", "-o", tmp_path), "expected a file to write, found a folder"),
+        (("import", tmp_path / "none.yaml", "-o", tmp_path / "rig.toml"), "cannot be read"),
+        (("import", tmp_path / "k.yaml", "--baseline", 0.2, "-o", tmp_path / "rig.toml"), "go with OCamCalib files"),
+        (("import", "-o", tmp_path / "rig.toml"), "expected a Kalibr camchain.yaml, or two OCamCalib files"),
+        (("import", "--lower", "a", "--upper", "b", "-o", tmp_path / "rig.toml"), "give --transform FILE or --baseline"),
+        (("export", tmp_path / "omni.toml", "--format", "ocam", "-o", tmp_path / "o"), "use --format kalibr"),
+        (("export", tmp_path / "ocam.toml", "--format", "kalibr", "-o", tmp_path / "k"), "use --format ocam"),
+    ]
+    for words, says in cases:
+        with pytest.raises((CalibError, OmnidError), match=says):
+            omnid(*words)
+        assert sorted(tmp_path.iterdir()) == before

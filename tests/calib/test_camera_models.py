@@ -1,0 +1,138 @@
+"""Both camera models on their own: round trips, plain numbers by hand, and NaN where there is nothing to see."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.camera import Array, Mask, OmniCamera, inscribed_mask
+from calib.errors import CalibError
+from calib.ocam import OcamCamera
+from calib.unified import UnifiedCamera
+
+BENT = (-0.02, 0.004, 1e-3, -5e-4)
+CAMERAS: dict[str, OmniCamera] = {
+    **{f"omni xi {xi}": UnifiedCamera(xi, (-207.0, 213.0), (380.0, 390.0), (768, 770)) for xi in (0.0, 0.6, 1.0)},
+    "omni xi 1.7": UnifiedCamera(1.7, (-507.0, 513.0), (380.0, 390.0), (768, 770)),
+    "omni bent": UnifiedCamera(0.95, (-207.0, 213.0), (380.0, 390.0), (768, 770), BENT),
+    "ocam mirror": OcamCamera((-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768)),
+    "ocam direct": OcamCamera((-300.0, 0, 1.4e-3, -1.6e-6, 4e-9), (470.0, 650.0), (1.001, 1e-3, 2e-3), (1280, 960),
+                              "direct"),
+    "ocam turning": OcamCamera((-100.0, 0, 1e-3, 0, -1e-8), (300.0, 310.0), (1.0, 0.0, 0.0), (600, 600)),
+}
+
+
+@pytest.fixture(params=CAMERAS)
+def camera(request: pytest.FixtureRequest) -> OmniCamera:
+    return CAMERAS[request.param]
+
+
+def pixels_of(camera: OmniCamera) -> Array:
+    u, v = np.meshgrid(np.linspace(0, camera.size[0] - 1, 61), np.linspace(0, camera.size[1] - 1, 53))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def test_pixels_come_back_from_their_rays_at_any_distance(camera: OmniCamera) -> None:
+    pixels = pixels_of(camera)
+    rays = camera.lift(pixels)
+    seen = np.isfinite(rays).all(axis=1)
+    assert seen.mean() > 0.4
+    np.testing.assert_allclose(np.linalg.norm(rays[seen], axis=1), 1, atol=1e-12)
+    distance = np.random.default_rng(0).uniform(0.01, 100, (len(pixels), 1))
+    np.testing.assert_allclose(camera.project(rays * distance)[seen], pixels[seen], atol=1e-7)
+
+
+def test_rays_come_back_from_their_pixels(camera: OmniCamera) -> None:
+    rays = np.random.default_rng(1).normal(size=(2000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pixels = camera.project(rays)
+    width, height = camera.size
+    seen = (pixels >= 0).all(axis=1) & (pixels <= (width, height)).all(axis=1)
+    assert seen.sum() > 150
+    np.testing.assert_allclose(camera.lift(pixels)[seen], rays[seen], atol=1e-8)
+
+
+def test_the_axis_is_seen_at_the_centre_and_nonsense_nowhere(camera: OmniCamera) -> None:
+    axis = camera.lift(np.array([camera.center]))
+    assert abs(axis[0, 2]) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(camera.project(3 * axis), [camera.center], atol=1e-6)
+    nothing = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
+    assert np.isnan(camera.project(nothing)).any(axis=1).all()
+    assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
+
+
+def test_omni_by_hand() -> None:
+    camera = UnifiedCamera(0.5, (-200.0, 300.0), (100.0, 50.0), (640, 480), (0.1, 0.2, 0.01, 0.02))
+    mx, my = (2 / 3) / (1 / 3 + 0.5), (-2 / 3) / (1 / 3 + 0.5)  # of the unit ray (2, -2, 1) / 3
+    r2 = mx * mx + my * my
+    radial = 1 + 0.1 * r2 + 0.2 * r2 * r2
+    x = mx * radial + 2 * 0.01 * mx * my + 0.02 * (r2 + 2 * mx * mx)
+    y = my * radial + 0.01 * (r2 + 2 * my * my) + 2 * 0.02 * mx * my
+    np.testing.assert_allclose(camera.project(np.array([[4.0, -4.0, 2.0]])), [[100 - 200 * x, 50 + 300 * y]], atol=1e-9)
+
+
+def test_omni_without_xi_is_a_pinhole_and_a_half_sphere() -> None:
+    camera = UnifiedCamera(0.0, (100.0, 110.0), (50.0, 60.0), (640, 480))
+    np.testing.assert_allclose(camera.project(np.array([[1.0, 2.0, 4.0]])), [[75.0, 115.0]])
+    assert np.isnan(camera.project(np.array([[1.0, 2.0, -0.1]]))).all()
+
+
+@pytest.mark.parametrize(("view", "sign"), [("mirror", 1.0), ("direct", -1.0)])
+def test_ocam_by_hand(view: str, sign: float) -> None:
+    camera = OcamCamera((-100.0, 0.0, 0.002), (240.0, 320.0), (1.01, 0.02, -0.03), (640, 480),
+                        "mirror" if view == "mirror" else "direct")
+    x, y = 60.0, -80.0  # rho = 100, f = -100 + 20 = -80
+    row, column = 1.01 * x + 0.02 * y + 240, -0.03 * x + y + 320
+    ray = np.array([[x, y, sign * 80.0]])
+    np.testing.assert_allclose(camera.lift(np.array([[column, row]])), ray / np.linalg.norm(ray), atol=1e-12)
+    np.testing.assert_allclose(camera.project(ray), [[column, row]], atol=1e-9)
+    assert camera.center == (320.0, 240.0)
+
+
+def test_ocam_ends_where_two_radii_would_share_a_ray() -> None:
+    camera = OcamCamera((-100.0, 0.0, 1e-3, 0.0, -1e-8), (300.0, 300.0), (1.0, 0.0, 0.0), (600, 600))
+    low, high = 0.0, 600.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 100 + 1e-3 * middle**2 - 3e-8 * middle**4 > 0 else (low, middle)
+    assert camera.radius_limit_px == pytest.approx(low, abs=1e-6)
+    rays = camera.lift(np.array([[300 + low - 1e-3, 300.0], [300 + low + 1e-3, 300.0]]))
+    assert np.isfinite(rays[0]).all() and np.isnan(rays[1]).any()
+    beyond = rays[:1] + [[0, 0, -1e-3]]
+    assert np.isnan(camera.project(beyond)).all()
+
+
+def test_ocam_agrees_with_the_toolbox_on_its_own_corners(shared_data: Path) -> None:
+    """The reprojection error of a board that the toolbox itself has placed is the one it reports."""
+    found = json.loads((shared_data / "vmr_board" / "reference.json").read_text())["ocam_subpix"]
+    camera = OcamCamera(tuple(found["ss"]), (found["xc_row_1based"] - 1, found["yc_col_1based"] - 1),
+                        (found["c"], found["d"], found["e"]), (found["width"], found["height"]), "direct")
+    board = np.column_stack([found["Xt_mm"], found["Yt_mm"], np.ones(len(found["Xt_mm"]))])
+    for image in found["images"]:
+        pixels = camera.project(board @ np.array(image["RRfin_r1_r2_t"]).T)
+        corners = np.column_stack([image["col_1based"], image["row_1based"]]) - 1
+        error = np.linalg.norm(pixels - corners, axis=1).mean()
+        assert error == pytest.approx(image["recomputed_mean_err_px"], abs=0.02)
+
+
+@pytest.mark.parametrize("change", [
+    {"polynomial": ()}, {"polynomial": (1.0, 0.0)}, {"polynomial": (math.nan,)}, {"affine": (0.0, 0.0, 1.0)},
+    {"size": (0, 4)}, {"view": "window"}])
+def test_ocam_refuses_what_is_no_camera(change: dict[str, object]) -> None:
+    values = {"polynomial": (-100.0,), "center_row_column": (1.0, 1.0), "affine": (1.0, 0.0, 0.0), "size": (4, 4)}
+    with pytest.raises(CalibError):
+        OcamCamera(**{**values, **change})  # type: ignore[arg-type]
+
+
+def test_a_mask_is_a_ring_without_what_its_picture_blanks_out() -> None:
+    picture = np.full((40, 60), 255, np.uint8)
+    picture[:, 40] = 0
+    mask = Mask((30.0, 20.0), 3.0, 15.0, picture)
+    pixels = np.array([[30, 20], [34, 20], [30, 34], [30, 36], [40, 20], [np.nan, 1]], float)
+    assert mask.contains(pixels).tolist() == [False, True, True, False, False, False]
+    assert mask.contains(pixels, 2.0).tolist() == [False] * 6
+    assert inscribed_mask(CAMERAS["omni xi 1.0"]).outer_px == pytest.approx(379.0)

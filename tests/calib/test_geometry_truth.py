@@ -1,0 +1,198 @@
+"""The physical truth of axes: mirrors reflected by the law of reflection, rigs of all kinds, panoramas seen from inside."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.camera import Array, Mask
+from calib.ocam import OcamCamera
+from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
+from calib.rig import MountedCamera, Rig
+from calib.rig_frame import rig_between
+from calib.transform_file import straight_up
+from calib.unified import UnifiedCamera
+
+FOCAL_PX = 200.0
+CENTER = (384.0, 380.0)
+# A camera under a mirror, or a lens, that looks up in a world with x forward, y left, z up: forward is up in its
+# picture. From below, left is then on the right, whether in a mirror or directly.
+SEEN_FROM_BELOW = {"forward": (0, -1), "left": (1, 0), "right": (-1, 0), "backward": (0, 1)}
+DIRECTIONS = {"forward": (1.0, 0, 0), "left": (0, 1.0, 0), "right": (0, -1.0, 0), "backward": (-1.0, 0, 0)}
+
+
+def reflected(points: Array) -> Array:
+    """Pixels of world points in an orthographic camera that looks up at a convex paraboloid with focus at the origin.
+
+    The paraboloid r^2 = 1 + 2 z hangs with its vertex down: |p| = 1 + z. A ray towards the focus leaves it straight
+    down, which is proved here by the law of reflection. The picture's u runs left, its v backward: u x v is up.
+    """
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    on_mirror = rays / (1 - rays[:, 2:])
+    np.testing.assert_allclose((on_mirror[:, :2] ** 2).sum(axis=1), 1 + 2 * on_mirror[:, 2], atol=1e-9)
+    normals = np.column_stack([on_mirror[:, :2], -np.ones(len(rays))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    leaving = -rays + 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
+    np.testing.assert_allclose(leaving, np.broadcast_to([0, 0, -1.0], rays.shape), atol=1e-9)
+    return np.column_stack([CENTER[0] + FOCAL_PX * on_mirror[:, 1], CENTER[1] - FOCAL_PX * on_mirror[:, 0]])
+
+
+def parabolic_omni() -> MountedCamera:
+    """The mirror as Kalibr would have it: fu < 0, camera x right, y backward, z down."""
+    T_cam_rig = se3.transform([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], [0, 0, 0])
+    return MountedCamera(UnifiedCamera(1.0, (-FOCAL_PX, FOCAL_PX), CENTER, (768, 768)), T_cam_rig)
+
+
+def parabolic_ocam() -> MountedCamera:
+    """The mirror as the toolbox would have it: camera x backward (rows), y left (columns), z down."""
+    polynomial = (-FOCAL_PX / 2, 0.0, 1 / (2 * FOCAL_PX))
+    T_cam_rig = se3.transform([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], [0, 0, 0])
+    return MountedCamera(OcamCamera(polynomial, CENTER[::-1], (1.0, 0.0, 0.0), (768, 768)), T_cam_rig)
+
+
+@pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
+def test_both_models_see_in_a_mirror_what_the_law_of_reflection_says(mounted: MountedCamera, around: Array) -> None:
+    assert se3.is_rigid(mounted.T_cam_rig)
+    pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, around))
+    np.testing.assert_allclose(pixels, reflected(around), atol=1e-7)
+
+
+def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -> None:
+    """An equidistant-like lens: the angle from straight up grows with the radius; the sides are those of a mirror."""
+    camera = OcamCamera((-FOCAL_PX, 0.0, 1 / FOCAL_PX), CENTER[::-1], (1.0, 0.0, 0.0), (768, 768), "direct")
+    T_cam_rig = se3.transform([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], [0, 0, 0])
+    pixels = camera.project(se3.apply(T_cam_rig, around))
+    r, slope = np.hypot(around[:, 0], around[:, 1]), around[:, 2] / np.hypot(around[:, 0], around[:, 1])
+    rho = FOCAL_PX * (-slope + np.sqrt(slope**2 + 4)) / 2  # f(rho)/rho = -slope
+    expected = np.column_stack([CENTER[0] + rho * around[:, 1] / r, CENTER[1] - rho * around[:, 0] / r])
+    np.testing.assert_allclose(pixels, expected, atol=1e-7)
+    np.testing.assert_allclose(camera.project(se3.apply(T_cam_rig, [[0, 0, 3.0]])), [CENTER])
+
+
+@pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
+@pytest.mark.parametrize("side", DIRECTIONS)
+def test_left_of_the_robot_is_on_the_right_of_a_picture_taken_from_below(mounted: MountedCamera, side: str) -> None:
+    (pixel,) = mounted.camera.project(se3.apply(mounted.T_cam_rig, [DIRECTIONS[side]]))
+    np.testing.assert_allclose((pixel - CENTER) / FOCAL_PX, SEEN_FROM_BELOW[side], atol=1e-9)
+
+
+def test_higher_things_are_further_out_in_a_mirror() -> None:
+    mounted = parabolic_omni()
+    pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, [[1, 0, -1.0], [1, 0, 0], [1, 0, 0.7]]))
+    assert (np.diff(np.linalg.norm(pixels - CENTER, axis=1)) > 50).all()
+
+
+def rectified(rig: Rig, points: Array, cylinder: Cylinder) -> tuple[Array, Array]:
+    """Panorama pixels of points (rig frame), through each camera's picture: project, lift, turn to the cylinder."""
+    found = []
+    for mounted in (rig.lower, rig.upper):
+        rays = mounted.camera.lift(mounted.camera.project(se3.apply(mounted.T_cam_rig, points)))
+        R_rect_cam = rig.T_rect_rig[:3, :3] @ mounted.T_cam_rig[:3, :3].T
+        found.append(cylinder.pixels(rays @ R_rect_cam.T))
+    return found[0], found[1]
+
+
+def test_upper_and_lower_share_columns_and_disparity_is_focal_times_baseline_by_distance(rig: Rig, around: Array) -> None:
+    cylinder = Cylinder(1200, 400, 200.0)
+    lower, upper = rectified(rig, around, cylinder)
+    assert np.isfinite(lower).all() and np.isfinite(upper).all()
+    np.testing.assert_allclose(cylinder.wrap(upper[:, 0] - lower[:, 0]), 0, atol=1e-9)
+    axis = (rig.upper.viewpoint - rig.lower.viewpoint) / rig.baseline_m
+    distance = np.linalg.norm(np.cross(around - rig.lower.viewpoint, axis), axis=1)
+    disparity = upper[:, 1] - lower[:, 1]
+    assert (disparity > 0).all()
+    np.testing.assert_allclose(disparity, 1200 / (2 * np.pi) * rig.baseline_m / distance, atol=1e-8)
+
+
+def test_the_viewpoint_is_where_the_camera_is(rig: Rig) -> None:
+    for mounted in (rig.lower, rig.upper):
+        np.testing.assert_allclose(mounted.T_cam_rig @ np.r_[mounted.viewpoint, 1], [0, 0, 0, 1], atol=1e-14)
+    np.testing.assert_allclose(rig.T_rect_rig @ np.r_[rig.upper.viewpoint, 1], [0, 0, rig.baseline_m, 1], atol=1e-12)
+    assert rig.T_rect_rig[0, 0] > 0.9
+    assert se3.is_rigid(rig.T_rect_rig)
+
+
+def test_the_panorama_is_seen_from_inside_left_on_the_left_and_up_is_up() -> None:
+    cylinder = Cylinder(1000, 400, 150.0)
+    pixels = cylinder.pixels(np.array([[1.0, 0, 0], [1, 0.1, 0], [1, -0.1, 0], [1, 0, 0.1], [-1, 1e-9, 0], [-1, -1e-9, 0]]))
+    np.testing.assert_allclose(pixels[0], [499.5, 150.0])
+    assert pixels[1, 0] < pixels[0, 0] < pixels[2, 0]
+    assert pixels[3, 1] < pixels[0, 1]
+    np.testing.assert_allclose(pixels[4:, 0], [-0.5, 999.5], atol=1e-5)
+    grid = np.column_stack([np.linspace(0, 999, 50), np.linspace(0, 399, 50)])
+    np.testing.assert_allclose(cylinder.pixels(cylinder.rays(grid)), grid, atol=1e-9)
+
+
+def test_a_turn_to_the_left_moves_the_picture_right(rig: Rig, around: Array) -> None:
+    cylinder, turn = Cylinder(1200, 400, 200.0), 0.2
+    T_before_after = se3.transform(se3.rotation_exp(turn * se3.inverse(rig.T_rect_rig)[:3, 2]), np.zeros(3))
+    away = around * 1e6
+    before, after = rectified(rig, away, cylinder)[0], rectified(rig, se3.apply(se3.inverse(T_before_after), away), cylinder)[0]
+    np.testing.assert_allclose(cylinder.wrap(after[:, 0] - before[:, 0]), turn * cylinder.focal_px, atol=1e-3)
+
+
+def test_remap_tables_lead_from_the_panorama_to_the_very_pixel(rig: Rig) -> None:
+    cylinder = fit_cylinder(rig, 800)
+    for mounted in (rig.lower, rig.upper):
+        maps = remap_tables(rig, mounted, cylinder, pad_px=16)
+        assert maps[0].shape == (cylinder.height, 832)
+        np.testing.assert_array_equal(maps[0][:, :32], maps[0][:, 800:])
+        column, row, distance = 250, cylinder.height // 2, 2.5
+        azimuth = np.pi - (column + 0.5) / cylinder.focal_px
+        z = distance * (cylinder.row0 - row) / cylinder.focal_px
+        viewpoint = se3.apply(rig.T_rect_rig, [mounted.viewpoint])
+        point = viewpoint + [[distance * np.cos(azimuth), distance * np.sin(azimuth), z]]
+        pixel = mounted.camera.project(se3.apply(mounted.T_cam_rig @ se3.inverse(rig.T_rect_rig), point))
+        np.testing.assert_allclose([maps[0][row, column + 16], maps[1][row, column + 16]], pixel[0], atol=1e-3)
+
+
+def test_a_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
+    cylinder = fit_cylinder(omni_rig, 800)
+    maps = remap_tables(omni_rig, omni_rig.lower, cylinder)
+    masked = MountedCamera(omni_rig.lower.camera, omni_rig.lower.T_cam_rig, Mask(omni_rig.lower.camera.center, 120.0, 300.0))
+    seen = visible(masked, maps, 2.0)
+    radius = np.hypot(maps[0] - masked.camera.center[0], maps[1] - masked.camera.center[1])
+    np.testing.assert_array_equal(seen, (maps[0] >= 0) & (radius >= 122) & (radius <= 298))
+
+
+def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_picture_runs() -> None:
+    lower, upper = parabolic_omni().camera, parabolic_ocam().camera
+    for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
+        rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
+        np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], atol=1e-15)
+        # The picture's u axis runs to the robot's left here, and the rig's x is that axis.
+        np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], atol=1e-12)
+
+
+def test_columns_of_a_real_pair_agree(shared_data: object) -> None:
+    """What the two cameras of a crooked rig saw lies in the same columns, and lower in the upper panorama."""
+    from pathlib import Path
+
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_typestore
+
+    from calib.kalibr import import_kalibr
+
+    folder = Path(str(shared_data)) / "two_walls_crooked"
+    rig = import_kalibr(folder / "camchain.yaml")
+    store, images = get_typestore(Stores.ROS2_HUMBLE), {}
+    with (folder / "log.mcap").open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(topics=list(rig.topics)):
+            data = store.deserialize_cdr(message.data, "sensor_msgs/msg/CompressedImage").data
+            images.setdefault(channel.topic, cv2.imdecode(np.asarray(data), cv2.IMREAD_GRAYSCALE))
+            if len(images) == 2:
+                break
+    cylinder = fit_cylinder(rig)
+    lower, upper = (cv2.remap(images[topic], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
+                    for topic, mounted in zip(rig.topics, (rig.lower, rig.upper), strict=True))
+    corners = cv2.goodFeaturesToTrack(lower, 400, 0.02, 8)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(lower, upper, corners, None, winSize=(21, 21), maxLevel=4)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(upper, lower, moved, None, winSize=(21, 21), maxLevel=4)
+    good = (status & status_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
+    offset = (moved - corners).reshape(-1, 2)[good]
+    assert good.sum() > 150
+    assert abs(np.median(offset[:, 0])) < 0.1
+    assert np.median(np.abs(offset[:, 0])) < 0.2
+    assert np.mean(offset[:, 1] > 0) > 0.95

@@ -1,0 +1,175 @@
+"""Kalibr's camchain.yaml: in, out, which camera is lower, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.camera import Array
+from calib.errors import CalibError
+from calib.kalibr import export_kalibr, import_kalibr, parse_kalibr
+from calib.rig import Rig
+from calib.unified import UnifiedCamera
+
+CAMERA = """
+  camera_model: omni
+  intrinsics: [1.0, -207.0, 208.0, 383.5, 384.5]
+  distortion_model: radtan
+  distortion_coeffs: [0.01, -0.02, 0.003, 0.004]
+  resolution: [768, 770]
+"""
+# The lower camera looks up and is turned about every axis: as a transform, nobody's inverse.
+T_LOWER_IMU = se3.exp([0.01, 0.02, 0.03, 0.1, -0.2, 0.7]) @ np.diag([1, -1, -1, 1.0])
+T_UPPER_LOWER = se3.exp([0.02, -0.01, 0.2, 0.02, 0.05, 0.3])
+
+
+def chain(T_imu: tuple[Array | None, Array | None], T_1_0: Array | None, topics: tuple[str, str] = ("", "")) -> str:
+    text = ""
+    for index, (T, topic) in enumerate(zip(T_imu, topics, strict=True)):
+        text += f"cam{index}:{CAMERA}" + (f"  rostopic: {topic}\n" if topic else "")
+        text += f"  T_cam_imu: {T.tolist()}\n" if T is not None else ""
+        text += f"  T_cn_cnm1: {T_1_0.tolist()}\n" if T_1_0 is not None and index == 1 else ""
+    return text
+
+
+BOTH = (T_LOWER_IMU, T_UPPER_LOWER @ T_LOWER_IMU)
+NAMED = ("/lower/image_raw", "/upper/image_raw")
+
+
+def test_every_number_lands_where_kalibr_means_it() -> None:
+    rig = parse_kalibr(chain(BOTH, T_UPPER_LOWER, NAMED))
+    assert rig.lower.camera == UnifiedCamera(1.0, (-207.0, 208.0), (383.5, 384.5), (768, 770), (0.01, -0.02, 0.003, 0.004))
+    np.testing.assert_array_equal(rig.lower.T_cam_rig, BOTH[0])
+    np.testing.assert_array_equal(rig.upper.T_cam_rig, BOTH[1])
+    assert rig.topics == NAMED
+
+
+def test_a_rig_goes_out_and_comes_back_bit_for_bit(omni_rig: Rig) -> None:
+    found = parse_kalibr(export_kalibr(omni_rig))
+    for a, b in ((found.lower, omni_rig.lower), (found.upper, omni_rig.upper)):
+        assert a.camera == b.camera
+        np.testing.assert_array_equal(a.T_cam_rig, b.T_cam_rig)
+    assert found.topics == omni_rig.topics
+    assert "e-05" not in export_kalibr(omni_rig).replace(".0e-05", "")
+
+
+def test_an_ocam_rig_is_not_exported(ocam_rig: Rig) -> None:
+    with pytest.raises(CalibError, match="found an ocam camera; use --format ocam"):
+        export_kalibr(ocam_rig)
+
+
+def test_without_an_imu_the_chain_places_the_cameras() -> None:
+    rig = parse_kalibr(chain((None, None), T_UPPER_LOWER, NAMED))
+    T_found = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    np.testing.assert_allclose(T_found, T_UPPER_LOWER, atol=1e-14)
+    np.testing.assert_allclose(rig.lower.viewpoint, 0, atol=1e-15)
+    np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, rig.baseline_m], atol=1e-14)
+    x_lower = rig.lower.T_cam_rig[:3, 0]
+    z_lower = se3.inverse(T_UPPER_LOWER)[:3, 3] / rig.baseline_m
+    u_lower = np.array([-1.0, 0, 0])  # fu < 0: the picture's u runs against the camera's x
+    np.testing.assert_allclose(x_lower, (u_lower - z_lower * (z_lower @ u_lower)) / np.sqrt(1 - (z_lower @ u_lower)**2),
+                               atol=1e-3)
+    np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 2], z_lower, atol=1e-14)
+
+
+def test_one_imu_transform_and_the_chain_are_enough() -> None:
+    for T_imu in ((BOTH[0], None), (None, BOTH[1])):
+        rig = parse_kalibr(chain(T_imu, T_UPPER_LOWER, NAMED))
+        np.testing.assert_allclose(rig.lower.T_cam_rig, BOTH[0], atol=1e-14)
+        np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-14)
+
+
+@pytest.mark.parametrize(("topics", "lower_is_cam0"), [
+    (("/lower/image", "/upper/image"), True), (("/upper/image", "/lower/image"), False),
+    (("/cam_top/image", ""), False), (("", "/rig/Top"), True), (("/bottom", "/x"), True),
+    (("/desktop/a", "/desktop/b"), True), (("/follower/a", "/laptop/b"), True)])
+def test_which_is_lower_by_topic_else_by_height(topics: tuple[str, str], lower_is_cam0: bool) -> None:
+    rig = parse_kalibr(chain(BOTH, None, topics))
+    np.testing.assert_array_equal(rig.lower.T_cam_rig, BOTH[not lower_is_cam0])
+
+
+def test_which_is_lower_when_told() -> None:
+    assert parse_kalibr(chain(BOTH, None), lower="cam1").upper.T_cam_rig.tolist() == BOTH[0].tolist()
+    assert parse_kalibr(chain(BOTH, None, NAMED), upper="cam0").lower.T_cam_rig.tolist() == BOTH[1].tolist()
+    swapped = parse_kalibr(chain(BOTH[::-1], None))
+    np.testing.assert_array_equal(swapped.lower.T_cam_rig, BOTH[0])
+
+
+def test_two_of_three_cameras_can_be_named() -> None:
+    text = chain(BOTH, T_UPPER_LOWER, NAMED) + f"cam2:{CAMERA}  T_cn_cnm1: {T_UPPER_LOWER.tolist()}\n"
+    with pytest.raises(CalibError, match="expected two cameras, found cam0, cam1, cam2"):
+        parse_kalibr(text, lower="cam0")
+    rig = parse_kalibr(text, lower="cam0", upper="cam2")
+    np.testing.assert_allclose(rig.upper.T_cam_rig, T_UPPER_LOWER @ BOTH[1], atol=1e-14)
+    unused = text.replace("camera_model: omni", "camera_model: ds", 1)
+    assert parse_kalibr(unused, lower="cam1", upper="cam2").topics == (NAMED[1], "")
+
+
+@pytest.mark.parametrize(("old", "new", "says"), [
+    ("camera_model: omni", "camera_model: pinhole", "cam0.camera_model: expected omni.*found 'pinhole'"),
+    ("camera_model: omni", "camera_model: eucm", "found 'eucm'"),
+    ("camera_model: omni", "camera_model: ds", "found 'ds'"),
+    ("distortion_model: radtan", "distortion_model: equidistant", "distortion_model: expected radtan or none"),
+    ("[0.01, -0.02, 0.003, 0.004]", "[]", "cam0.distortion_coeffs: expected 4 finite numbers"),
+    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[-207.0, 208.0, 383.5, 384.5]", "cam0.intrinsics: expected 5"),
+    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[1.0, 0.0, 208.0, 383.5, 384.5]", "cam0: omni camera: needs"),
+    ("[768, 770]", "768", "cam0.resolution"),
+    ("cam1:", "cam0:", "not a YAML file"),
+    ("cam1:", "camera1:", "expected two cameras"),
+    ("T_cam_imu: [[", "T_cam_imu: [[9", "cam0.T_cam_imu: expected a rotation"),
+    ("rostopic: /lower", "rostopic: [/lower]\n  x: /lower", "cam0.rostopic: expected a string"),
+    ("cam0:", "- cam0:", "not a YAML file"),
+    ("cam0:", "cam0: &a [*a]\ncam2:", "cam0: expected a table"),
+])
+def test_what_is_wrong_is_named(old: str, new: str, says: str) -> None:
+    text = chain(BOTH, T_UPPER_LOWER, NAMED)
+    assert old in text
+    with pytest.raises(CalibError, match=says) as caught:
+        parse_kalibr(text.replace(old, new, 1), "c.yaml")
+    assert str(caught.value).startswith("c.yaml: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [se3.inverse(T_UPPER_LOWER), T_UPPER_LOWER @ se3.exp([0.0015, 0, 0, 0, 0, 0]),
+                                   T_UPPER_LOWER @ se3.exp([0, 0, 0, 0, 0.002, 0])])
+def test_transforms_that_contradict_each_other_are_refused(wrong: Array) -> None:
+    with pytest.raises(CalibError, match=r"cam1: T_cam_imu and T_cn_cnm1 contradict each other by"):
+        parse_kalibr(chain(BOTH, wrong, NAMED))
+    parse_kalibr(chain(BOTH, T_UPPER_LOWER @ se3.exp([0.0005, 0, 0, 0, 0.001, 0]), NAMED))
+
+
+@pytest.mark.parametrize(("text", "arguments", "says"), [
+    (chain((None, None), None, NAMED), {}, "no transform ties cam0 to cam1"),
+    (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
+    (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
+    (chain((BOTH[0], BOTH[0]), None, NAMED), {}, "viewpoints must lie apart"),
+    (chain(BOTH, None), {"lower": "cam7"}, "there is no camera cam7, found cam0, cam1"),
+    (chain(BOTH, None), {"lower": "cam1", "upper": "cam1"}, "must be two cameras"),
+    (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),
+    ("", {}, "expected a YAML mapping"), ("[" * 3000, {}, "not a YAML file"), ("!!python/none x", {}, "YAML"),
+])
+def test_what_cannot_be_told_is_asked_for(text: str, arguments: dict[str, str], says: str) -> None:
+    with pytest.raises(CalibError, match=says):
+        parse_kalibr(text, **arguments)
+
+
+def test_any_damage_is_a_calib_error_or_a_rig() -> None:
+    text, random = chain(BOTH, None, NAMED).encode(), np.random.default_rng(0)
+    for _ in range(60):
+        damaged = bytearray(text)
+        for at in random.integers(0, len(text), 3):
+            damaged[at] = random.integers(0, 256)
+        try:
+            parse_kalibr(bytes(damaged[:random.integers(1, len(text) + 400)]))
+        except CalibError as error:
+            assert "\n" not in str(error)
+
+
+def test_the_crooked_file_is_read_as_its_makers_mean_it(shared_data: Path) -> None:
+    rig = import_kalibr(shared_data / "two_walls_crooked" / "camchain.yaml")
+    assert rig.baseline_m == pytest.approx(0.16, abs=1e-3)
+    assert rig.upper.viewpoint[2] - rig.lower.viewpoint[2] > 0.15
+    again = parse_kalibr(export_kalibr(rig))
+    np.testing.assert_array_equal(again.upper.T_cam_rig, rig.upper.T_cam_rig)

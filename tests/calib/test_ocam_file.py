@@ -1,0 +1,150 @@
+"""calib_results.txt in and out, and the transform that has to come with two of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.errors import CalibError
+from calib.ocam import OcamCamera
+from calib.ocam_file import export_ocam, import_ocam, inverse_polynomial, parse_ocam
+from calib.rig import Rig
+from calib.transform_file import read_transform, straight_up, transform_toml
+
+# The layout of the toolbox's own export, with own numbers.
+TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world
+
+5 -2.315000e+02 0.000000e+00 1.540000e-03 -5.960000e-07 1.590000e-09 \n
+#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). These are used by world2cam
+
+3 386.100000 298.200000 72.900000 \n
+#center: "row" and "column", starting from 0 (C convention)
+
+240.378942 318.540278
+
+#affine parameters "c", "d", "e"
+
+1.000529 0.000053 0.000122
+
+#image size: "height" and "width"
+
+480 640
+
+"""
+T_LOWER_UPPER = se3.exp([0.02, -0.01, -0.2, 0.02, 0.05, 0.3])
+
+
+def test_every_number_lands_where_the_toolbox_means_it() -> None:
+    for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n")):
+        assert parse_ocam(text, "direct") == OcamCamera(
+            (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9), (240.378942, 318.540278), (1.000529, 0.000053, 0.000122),
+            (640, 480), "direct")
+
+
+def test_cameras_go_out_and_come_back_bit_for_bit(ocam_rig: Rig) -> None:
+    for mounted in (ocam_rig.lower, ocam_rig.upper):
+        assert parse_ocam(export_ocam(mounted.camera)) == mounted.camera
+
+
+def test_the_exported_inverse_polynomial_serves_programs_that_use_it(ocam_rig: Rig) -> None:
+    """The way the toolbox's C code projects: theta = atan(z / r), rho by the inverse polynomial, then the affine."""
+    camera = ocam_rig.lower.camera
+    assert isinstance(camera, OcamCamera)
+    pixels = np.random.default_rng(0).uniform((0, 0), camera.size, (500, 2))
+    ray = camera.lift(pixels) * (1, 1, -1)
+    theta = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))
+    rho = sum(a * theta**power for power, a in enumerate(inverse_polynomial(camera)))
+    x, y = (ray[:, :2] / np.hypot(ray[:, 0], ray[:, 1])[:, None] * np.asarray(rho)[:, None]).T
+    c, d, e = camera.affine
+    row, column = camera.center_row_column
+    np.testing.assert_allclose(np.column_stack([x * e + y + column, x * c + y * d + row]), pixels, atol=0.02)
+
+
+def test_an_omni_camera_is_not_exported(omni_rig: Rig) -> None:
+    with pytest.raises(CalibError, match="found an omni camera; use --format kalibr"):
+        export_ocam(omni_rig.lower.camera)
+
+
+@pytest.mark.parametrize(("old", "new", "says"), [
+    ("5 -2.315000e+02", "6 -2.315000e+02", "line 3: expected 7 finite numbers"),
+    ("5 -2.315000e+02", "x -2.315000e+02", "line 3: expected a count"),
+    ("5 -2.315000e+02", "65 -2.315000e+02", "line 3: expected a count of 1 to 64"),
+    ("5 -2.315000e+02", "5 nan", "line 3: expected 6 finite numbers"),
+    ("5 -2.315000e+02", "5 231", "c.txt: ocam camera: needs a0 < 0"),
+    ("3 386.100000", "3", "line 7: expected 4 finite numbers"),
+    ("240.378942 318.540278", "240.378942", "line 11: expected 2 finite numbers"),
+    ("1.000529 0.000053", "1.000529 one", r"line 15: expected 3 finite numbers \(affine c d e\)"),
+    ("480 640", "480.5 640", "line 19: expected the image's height"),
+    ("480 640", "0 640", "line 19"),
+    ("480 640", "", "expected 5 lines of numbers.*found 4"),
+    ("480 640", "480 640\n1", "found 6"),
+])
+def test_what_is_wrong_is_named_with_its_line(old: str, new: str, says: str) -> None:
+    assert old in TEXT
+    with pytest.raises(CalibError, match=says) as caught:
+        parse_ocam(TEXT.replace(old, new, 1), name="c.txt")
+    assert str(caught.value).startswith("c.txt") and "\n" not in str(caught.value)
+
+
+def test_any_damage_is_a_calib_error_or_a_camera() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        damaged = bytearray(TEXT.encode())
+        for at in random.integers(0, len(damaged), 4):
+            damaged[at] = random.integers(0, 256)
+        try:
+            parse_ocam(bytes(damaged))
+        except CalibError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("view", ["mirror", "direct"])
+def test_two_files_and_a_transform_are_a_rig(tmp_path: Path, view: str) -> None:
+    (tmp_path / "lower.txt").write_text(TEXT)
+    (tmp_path / "upper.txt").write_text(TEXT.replace("480 640", "481 641"))
+    rig = import_ocam(tmp_path / "lower.txt", tmp_path / "upper.txt", T_LOWER_UPPER,
+                      "mirror" if view == "mirror" else "direct")
+    assert (rig.lower.camera.size, rig.upper.camera.size) == ((640, 480), (641, 481))
+    np.testing.assert_allclose(rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig), T_LOWER_UPPER, atol=1e-14)
+    np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, np.linalg.norm(T_LOWER_UPPER[:3, 3])], atol=1e-14)
+    # The picture's u is the camera's y in this model, and the rig's x.
+    assert rig.lower.T_cam_rig[1, 0] > 0.99
+
+
+@pytest.mark.parametrize("view", ["mirror", "direct"])
+def test_a_baseline_is_straight_up_from_cameras_that_look_up(tmp_path: Path, view: str) -> None:
+    (tmp_path / "c.txt").write_text(TEXT)
+    rig = import_ocam(tmp_path / "c.txt", tmp_path / "c.txt", straight_up(0.2), "mirror" if view == "mirror" else "direct")
+    axis = rig.lower.camera.lift(np.array([rig.lower.camera.center]))[0] @ rig.lower.T_cam_rig[:3, :3]
+    # In a mirror the middle of the picture shows the camera below, through a lens the ceiling.
+    np.testing.assert_allclose(axis, [0, 0, -1 if view == "mirror" else 1], atol=1e-12)
+    for baseline in (0.0, -0.2, float("nan")):
+        with pytest.raises(CalibError, match="--baseline"):
+            straight_up(baseline)
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("t.toml", transform_toml(T_LOWER_UPPER)),
+    ("t.toml", transform_toml(se3.inverse(T_LOWER_UPPER)).replace("T_lower_upper", "T_upper_lower")),
+    ("t.yaml", f"T_lower_upper: {T_LOWER_UPPER.tolist()}"),
+    ("t.txt", "# rows\n" + "\n".join(" ".join(map(repr, map(float, row))) for row in T_LOWER_UPPER)),
+    ("t.csv", ",".join(map(repr, map(float, T_LOWER_UPPER.ravel())))),
+])
+def test_a_transform_is_read_from_any_of_its_formats(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_transform(tmp_path / name), T_LOWER_UPPER, atol=1e-15)
+
+
+@pytest.mark.parametrize(("name", "text", "says"), [
+    ("t.toml", "T_x = 3", "T_x: unknown key"), ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
+    ("t.toml", "[", "not a TOML file"), ("t.yml", "T_lower_upper: 3", "4 rows of 4 numbers"), ("t.yml", "[", "YAML"),
+    ("t.txt", "1 0 0 0", "4 rows"), ("t.txt", "one", "expected 16 numbers"), ("t.txt", "1 " * 16, "expected a rotation"),
+    ("t.txt", "nan " * 16, "finite"),
+])
+def test_what_is_no_transform_is_refused(tmp_path: Path, name: str, text: str, says: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibError, match=says):
+        read_transform(tmp_path / name)

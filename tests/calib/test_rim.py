@@ -1,0 +1,98 @@
+"""The mirror's rim: drawn ones to a fraction of a pixel, real ones, and None for pictures that have none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.camera import Mask
+from calib.rim import find_rim
+
+Image = NDArray[np.uint8]
+CENTER, RADIUS = (391.3, 377.6), 340.7
+V, U = np.mgrid[:768, :768].astype(float)
+R = np.hypot(U - CENTER[0], V - CENTER[1])
+
+
+def world(seed: int = 0) -> NDArray[np.float64]:
+    """A picture with light and dark patches."""
+    coarse = np.random.default_rng(seed).uniform(40, 230, (24, 24))
+    return np.asarray(cv2.resize(coarse, (768, 768), interpolation=cv2.INTER_LINEAR))
+
+
+def drawn(inner: float = 0.0, outer: float = RADIUS, blur: float = 0.8, noise: float = 2.0) -> Image:
+    fine = np.where((outer > R) & (inner <= R), world(), 9.0)
+    soft = cv2.GaussianBlur(fine, (0, 0), blur) + np.random.default_rng(1).normal(0, noise, fine.shape)
+    return np.clip(soft, 0, 255).astype(np.uint8)
+
+
+def assert_ring(mask: Mask | None, inner: float = 0.0, outer: float = RADIUS) -> None:
+    assert mask is not None
+    assert mask.center == pytest.approx(CENTER, abs=0.25)
+    assert mask.outer_px == pytest.approx(outer - 1.5, abs=0.6)
+    assert mask.inner_px == pytest.approx(inner + 1.5 if inner else 0.0, abs=3.0 if inner else 0.0)
+
+
+@pytest.mark.parametrize("guess", [CENTER, (384.0, 384.0), (410.0, 350.0)])
+def test_a_drawn_rim_is_found_from_any_fair_guess(guess: tuple[float, float]) -> None:
+    assert_ring(find_rim(drawn(), guess))
+
+
+def test_a_hub_is_found_and_a_glint_on_it_does_no_harm() -> None:
+    picture = drawn(inner=60.0)
+    assert_ring(find_rim(picture, (384.0, 384.0)), inner=60.0)
+    cv2.circle(picture, (391, 378), 20, 130, -1)
+    assert_ring(find_rim(picture, (384.0, 384.0)), inner=60.0)
+
+
+def test_a_rim_that_the_picture_cuts_off_above_and_below_is_found() -> None:
+    mask = find_rim(drawn(outer=365.0)[90:-80], (384.0, 300.0))
+    assert mask is not None
+    assert (*mask.center, mask.outer_px) == pytest.approx((CENTER[0], CENTER[1] - 90, 363.5), abs=0.6)
+
+
+def test_a_dark_object_over_a_third_of_the_rim_does_no_harm() -> None:
+    picture = drawn()
+    picture[np.abs(np.arctan2(V - CENTER[1], U - CENTER[0])) < np.pi / 3.2] = 9
+    assert_ring(find_rim(picture, (384.0, 384.0)))
+
+
+def squares() -> NDArray[np.float64]:
+    return np.asarray((U // 40 + V // 40) % 2 * 255)
+
+
+NOTHING = {
+    "black": 0 * U, "white": 0 * U + 255, "noise": np.random.default_rng(0).uniform(0, 255, U.shape),
+    "dark noise": np.random.default_rng(0).normal(8, 4, U.shape), "full frame": world(), "squares": squares(),
+    "soft vignette": 220 * np.exp(-(R / 300)**2), "lens vignette": 230 * np.cos(np.clip(R / 540, 0, 1.5))**4,
+    "square": np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5), "half": np.where(U < 384, 150, 5),
+    "ellipse": np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5), "tiny": np.zeros((20, 20)),
+    "thin": np.zeros((1, 900)), "most of the rim dark": np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
+    "moon": np.where(np.hypot(U - 150, V - 150) < 100, 200, 5),
+    "blobs": cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, U.shape), (0, 0), 25) * 30 - 3700,
+}
+
+
+@pytest.mark.parametrize("name", NOTHING)
+def test_none_rather_than_nonsense(name: str) -> None:
+    picture = np.clip(NOTHING[name], 0, 255).astype(np.uint8)
+    assert find_rim(picture, (picture.shape[1] / 2, picture.shape[0] / 2)) is None
+
+
+def test_the_inside_of_a_mirror_alone_has_no_rim() -> None:
+    assert find_rim(drawn()[160:-160, 160:-160], (224.0, 224.0)) is None
+
+
+def test_real_mirrors(shared_data: Path) -> None:
+    """Ten pictures of one mirror whose rim the picture cuts off above and below, with the lens in its middle."""
+    found = [find_rim(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (512.0, 384.0))
+             for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
+    masks = [mask for mask in found if mask is not None]
+    assert len(masks) >= 8
+    rings = np.array([(*mask.center, mask.inner_px, mask.outer_px) for mask in masks])
+    assert (np.ptp(rings, axis=0) < (1.0, 1.0, 3.0, 0.6)).all()
+    np.testing.assert_allclose(rings.mean(axis=0), (516.7, 384.1, 79.0, 451.7), atol=1.0)
