@@ -20,7 +20,7 @@ from drivers.errors import BrokenFrame, DriverError
 from drivers.mcap_reader import LogReader
 from drivers.mcap_records import MAGIC
 from drivers.ros_image import parse_image
-from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, image, pairs, picture, write_log
+from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, Entry, image, pairs, picture, write_log
 
 LAYOUTS: list[dict[str, Any]] = [
     {"compression": CompressionType.LZ4, "chunk_size": 700},
@@ -122,6 +122,18 @@ def test_a_corrupt_first_chunk_loses_no_channels(tmp_path: Path) -> None:
     assert found is not None and 55 <= len(found[0]) < 60
 
 
+def test_a_corrupt_length_within_a_log_is_told(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(30), chunk_size=700)
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        place = make_reader(file).get_summary().chunk_indexes[9]  # type: ignore[union-attr]
+    data[place.chunk_start_offset + 6] ^= 0x55
+    path.write_bytes(data)
+    found = survivors(path)
+    assert found is not None and 8 <= len(found[0]) <= 20
+    assert found[1].truncated and f"after byte {place.chunk_start_offset} of {len(data)}" in found[1].warnings[0]
+
+
 def test_a_corrupt_summary_is_not_believed(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(3))
     data = bytearray(path.read_bytes())
@@ -170,12 +182,15 @@ def chunk(compression: str, size: int, packed: bytes, crc: int = 0) -> bytes:
 BOMB = bytes(400 * 2**20)
 HOSTILE = {
     "a record longer than the file": struct.pack("<BQ", 6, 2**62),
+    "a record 200 MB longer than the file": struct.pack("<BQ", 6, 200 * 2**20),
     "a schema longer than the file": struct.pack("<BQHI", 3, 6, 1, 2**32 - 1),
     "a chunk's inner length": struct.pack("<BQQQQIIQ", 6, 40, 0, 0, 10, 0, 0, 2**63 + 5),
     "an lz4 size": chunk("lz4", 2**40, lz4.frame.compress(b"x" * 99)),
     "a zstd size": chunk("zstd", 2**40, zstandard.compress(b"x" * 99)),
     "an lz4 bomb": chunk("lz4", 1000, lz4.frame.compress(BOMB)),
     "a zstd bomb": chunk("zstd", 1000, zstandard.compress(BOMB)),
+    "an lz4 bomb that says so": chunk("lz4", len(BOMB), lz4.frame.compress(BOMB)),
+    "a zstd bomb that says so": chunk("zstd", len(BOMB), zstandard.compress(BOMB)),
     "a message in a chunk": chunk("", 31, struct.pack("<BQHIQQ", 5, 2**61, 1, 0, 0, 0)),
     "an unknown compression": chunk("rar", 5, b"12345"),
 }
@@ -190,7 +205,8 @@ def test_hostile_lengths_take_no_memory(tmp_path: Path, records: bytes) -> None:
     path.write_bytes(whole[:at] + records + whole[at:])
     tracemalloc.start()
     try:
-        survivors(path)
+        found = survivors(path)
+        assert found is None or found[1].truncated or found[1].counts["broken_records"] == 1
         assert tracemalloc.get_traced_memory()[1] < 8 * 2**20
     finally:
         tracemalloc.stop()
@@ -204,6 +220,17 @@ def test_the_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     try:
         count = sum(1 for _ in LogReader(path, window=4).frames())
         assert count == 200 and tracemalloc.get_traced_memory()[1] < 8 * 2**20 < path.stat().st_size
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_kept_frame_keeps_no_chunk(tmp_path: Path) -> None:
+    ballast = Entry("/ballast", "std_msgs/msg/String", bytes(2 * 2**20), 0)
+    path = write_log(tmp_path / "log.mcap", [e for pair in pairs(10) for e in (ballast, pair)], chunk_size=2**21)
+    tracemalloc.start()
+    try:
+        frames = list(LogReader(path).frames())
+        assert len(frames) == 20 and tracemalloc.get_traced_memory()[0] < 2**20
     finally:
         tracemalloc.stop()
 

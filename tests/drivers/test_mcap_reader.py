@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.mcap_reader import LogReader
+from drivers.ros_image import RosImage
+from drivers.stamp_order import StampOrder
 from tests.drivers.mcap_logs import (
     BARE,
     COMPRESSED,
@@ -159,6 +162,13 @@ def test_frames_shuffled_within_the_window_come_out_sorted(tmp_path: Path, seed:
     frames, reader = read(write_log(tmp_path / "log.mcap", [entries[index] for index in moved]), window=16)
     assert places(frames) == in_order(60)
     assert not reader.warnings
+
+
+def test_waiting_frames_are_bounded_in_bytes_too() -> None:
+    data = memoryview(bytes(64 * 2**20))
+    order = StampOrder(32, Counter())
+    given = [len(list(order.push("lower", RosImage(stamp, "mono8", data)))) for stamp in range(1, 8)]
+    assert given == [0, 0, 0, 0, 1, 1, 1]
 
 
 def test_a_frame_that_comes_after_its_window_is_dropped_and_counted(tmp_path: Path) -> None:
