@@ -94,7 +94,7 @@ def test_doubts_are_errors_that_list_what_there_is(
 def test_a_topic_that_is_not_cdr_is_no_image_topic(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2), use_chunking=False, enable_crcs=False)
     path.write_bytes(path.read_bytes().replace(b"\3\0\0\0cdr", b"\3\0\0\0xyz"))
-    with pytest.raises(DriverError, match="no image topics in .*: found /lower/image_raw/compressed, /upper"):
+    with pytest.raises(DriverError, match=r"no image topics in .*: found /lower/image_raw/compressed, /upper"):
         LogReader(path)
 
 
