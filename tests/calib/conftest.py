@@ -32,7 +32,8 @@ def omni_cameras() -> tuple[UnifiedCamera, UnifiedCamera]:
 
 
 def ocam_cameras() -> tuple[OcamCamera, OcamCamera]:
-    return (OcamCamera((-131.64, 0.0, 1.88e-3, 9.4e-8, -6.1e-10), (382.4, 514.6), (0.99923, 2.2e-4, -2.1e-4), (1024, 768)),
+    curved = (-131.64, 0.0, 1.88e-3, 9.4e-8, -6.1e-10)
+    return (OcamCamera(curved, (382.4, 514.6), (0.99923, 2.2e-4, -2.1e-4), (1024, 768)),
             OcamCamera((-110.0, 0.0, 2.1e-3), (390.0, 500.0), (1.001, -1e-3, 2e-3), (1000, 780)))
 
 
@@ -56,8 +57,8 @@ def around() -> Array:
     """Points (N, 3) [m] all around a rig's frame, 1 to 5 m away, from 35 degrees below to 30 above the horizon."""
     random = np.random.default_rng(1)
     azimuth, elevation = random.uniform(-np.pi, np.pi, 300), np.deg2rad(random.uniform(-35, 30, 300))
-    rays = np.column_stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    return np.asarray(rays * random.uniform(1, 5, (300, 1)))
+    level = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    return np.asarray(level * random.uniform(1, 5, (300, 1)))
 
 
 @pytest.fixture

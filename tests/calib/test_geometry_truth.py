@@ -1,13 +1,20 @@
-"""The physical truth of axes: mirrors reflected by the law of reflection, rigs of all kinds, panoramas seen from inside."""
+"""The physical truth of axes: mirrors by the law of reflection, rigs of all kinds, panoramas seen from inside."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from calib.camera import Array, Mask
+from calib.kalibr import import_kalibr
 from calib.ocam import OcamCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
@@ -31,11 +38,11 @@ def reflected(points: Array) -> Array:
     """
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     on_mirror = rays / (1 - rays[:, 2:])
-    np.testing.assert_allclose((on_mirror[:, :2] ** 2).sum(axis=1), 1 + 2 * on_mirror[:, 2], atol=1e-9)
+    np.testing.assert_allclose((on_mirror[:, :2] ** 2).sum(axis=1), 1 + 2 * on_mirror[:, 2], rtol=0, atol=1e-9)
     normals = np.column_stack([on_mirror[:, :2], -np.ones(len(rays))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     leaving = -rays + 2 * (rays * normals).sum(axis=1, keepdims=True) * normals
-    np.testing.assert_allclose(leaving, np.broadcast_to([0, 0, -1.0], rays.shape), atol=1e-9)
+    np.testing.assert_allclose(leaving, np.broadcast_to([0, 0, -1.0], rays.shape), rtol=0, atol=1e-9)
     return np.column_stack([CENTER[0] + FOCAL_PX * on_mirror[:, 1], CENTER[1] - FOCAL_PX * on_mirror[:, 0]])
 
 
@@ -56,7 +63,7 @@ def parabolic_ocam() -> MountedCamera:
 def test_both_models_see_in_a_mirror_what_the_law_of_reflection_says(mounted: MountedCamera, around: Array) -> None:
     assert se3.is_rigid(mounted.T_cam_rig)
     pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, around))
-    np.testing.assert_allclose(pixels, reflected(around), atol=1e-7)
+    np.testing.assert_allclose(pixels, reflected(around), rtol=0, atol=1e-7)
 
 
 def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -> None:
@@ -67,20 +74,21 @@ def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -
     r, slope = np.hypot(around[:, 0], around[:, 1]), around[:, 2] / np.hypot(around[:, 0], around[:, 1])
     rho = FOCAL_PX * (-slope + np.sqrt(slope**2 + 4)) / 2  # f(rho)/rho = -slope
     expected = np.column_stack([CENTER[0] + rho * around[:, 1] / r, CENTER[1] - rho * around[:, 0] / r])
-    np.testing.assert_allclose(pixels, expected, atol=1e-7)
-    np.testing.assert_allclose(camera.project(se3.apply(T_cam_rig, [[0, 0, 3.0]])), [CENTER])
+    np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(camera.project(se3.apply(T_cam_rig, np.array([[0, 0, 3.0]]))), [CENTER])
 
 
 @pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
 @pytest.mark.parametrize("side", DIRECTIONS)
 def test_left_of_the_robot_is_on_the_right_of_a_picture_taken_from_below(mounted: MountedCamera, side: str) -> None:
-    (pixel,) = mounted.camera.project(se3.apply(mounted.T_cam_rig, [DIRECTIONS[side]]))
-    np.testing.assert_allclose((pixel - CENTER) / FOCAL_PX, SEEN_FROM_BELOW[side], atol=1e-9)
+    (pixel,) = mounted.camera.project(se3.apply(mounted.T_cam_rig, np.array([DIRECTIONS[side]])))
+    np.testing.assert_allclose((pixel - CENTER) / FOCAL_PX, SEEN_FROM_BELOW[side], rtol=0, atol=1e-9)
 
 
 def test_higher_things_are_further_out_in_a_mirror() -> None:
     mounted = parabolic_omni()
-    pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, [[1, 0, -1.0], [1, 0, 0], [1, 0, 0.7]]))
+    steps = np.array([[1, 0, -1.0], [1, 0, 0], [1, 0, 0.7]])
+    pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, steps))
     assert (np.diff(np.linalg.norm(pixels - CENTER, axis=1)) > 50).all()
 
 
@@ -94,43 +102,46 @@ def rectified(rig: Rig, points: Array, cylinder: Cylinder) -> tuple[Array, Array
     return found[0], found[1]
 
 
-def test_upper_and_lower_share_columns_and_disparity_is_focal_times_baseline_by_distance(rig: Rig, around: Array) -> None:
+def test_columns_are_shared_and_disparity_is_focal_times_baseline_by_distance(rig: Rig, around: Array) -> None:
     cylinder = Cylinder(1200, 400, 200.0)
     lower, upper = rectified(rig, around, cylinder)
     assert np.isfinite(lower).all() and np.isfinite(upper).all()
-    np.testing.assert_allclose(cylinder.wrap(upper[:, 0] - lower[:, 0]), 0, atol=1e-9)
+    np.testing.assert_allclose(cylinder.wrap(upper[:, 0] - lower[:, 0]), 0, rtol=0, atol=1e-9)
     axis = (rig.upper.viewpoint - rig.lower.viewpoint) / rig.baseline_m
     distance = np.linalg.norm(np.cross(around - rig.lower.viewpoint, axis), axis=1)
     disparity = upper[:, 1] - lower[:, 1]
     assert (disparity > 0).all()
-    np.testing.assert_allclose(disparity, 1200 / (2 * np.pi) * rig.baseline_m / distance, atol=1e-8)
+    np.testing.assert_allclose(disparity, 1200 / (2 * np.pi) * rig.baseline_m / distance, rtol=0, atol=1e-8)
 
 
 def test_the_viewpoint_is_where_the_camera_is(rig: Rig) -> None:
     for mounted in (rig.lower, rig.upper):
-        np.testing.assert_allclose(mounted.T_cam_rig @ np.r_[mounted.viewpoint, 1], [0, 0, 0, 1], atol=1e-14)
-    np.testing.assert_allclose(rig.T_rect_rig @ np.r_[rig.upper.viewpoint, 1], [0, 0, rig.baseline_m, 1], atol=1e-12)
+        np.testing.assert_allclose(mounted.T_cam_rig @ np.r_[mounted.viewpoint, 1], [0, 0, 0, 1], rtol=0, atol=1e-14)
+    upper_rect = rig.T_rect_rig @ np.r_[rig.upper.viewpoint, 1]
+    np.testing.assert_allclose(upper_rect, [0, 0, rig.baseline_m, 1], rtol=0, atol=1e-12)
     assert rig.T_rect_rig[0, 0] > 0.9
     assert se3.is_rigid(rig.T_rect_rig)
 
 
 def test_the_panorama_is_seen_from_inside_left_on_the_left_and_up_is_up() -> None:
     cylinder = Cylinder(1000, 400, 150.0)
-    pixels = cylinder.pixels(np.array([[1.0, 0, 0], [1, 0.1, 0], [1, -0.1, 0], [1, 0, 0.1], [-1, 1e-9, 0], [-1, -1e-9, 0]]))
+    ahead, behind = [[1.0, 0, 0], [1, 0.1, 0], [1, -0.1, 0], [1, 0, 0.1]], [[-1, 1e-9, 0], [-1, -1e-9, 0]]
+    pixels = cylinder.pixels(np.array(ahead + behind))
     np.testing.assert_allclose(pixels[0], [499.5, 150.0])
     assert pixels[1, 0] < pixels[0, 0] < pixels[2, 0]
     assert pixels[3, 1] < pixels[0, 1]
-    np.testing.assert_allclose(pixels[4:, 0], [-0.5, 999.5], atol=1e-5)
+    np.testing.assert_allclose(pixels[4:, 0], [-0.5, 999.5], rtol=0, atol=1e-5)
     grid = np.column_stack([np.linspace(0, 999, 50), np.linspace(0, 399, 50)])
-    np.testing.assert_allclose(cylinder.pixels(cylinder.rays(grid)), grid, atol=1e-9)
+    np.testing.assert_allclose(cylinder.pixels(cylinder.rays(grid)), grid, rtol=0, atol=1e-9)
 
 
 def test_a_turn_to_the_left_moves_the_picture_right(rig: Rig, around: Array) -> None:
     cylinder, turn = Cylinder(1200, 400, 200.0), 0.2
     T_before_after = se3.transform(se3.rotation_exp(turn * se3.inverse(rig.T_rect_rig)[:3, 2]), np.zeros(3))
     away = around * 1e6
-    before, after = rectified(rig, away, cylinder)[0], rectified(rig, se3.apply(se3.inverse(T_before_after), away), cylinder)[0]
-    np.testing.assert_allclose(cylinder.wrap(after[:, 0] - before[:, 0]), turn * cylinder.focal_px, atol=1e-3)
+    before, _ = rectified(rig, away, cylinder)
+    after, _ = rectified(rig, se3.apply(se3.inverse(T_before_after), away), cylinder)
+    np.testing.assert_allclose(cylinder.wrap(after[:, 0] - before[:, 0]), turn * cylinder.focal_px, rtol=0, atol=1e-3)
 
 
 def test_remap_tables_lead_from_the_panorama_to_the_very_pixel(rig: Rig) -> None:
@@ -143,15 +154,15 @@ def test_remap_tables_lead_from_the_panorama_to_the_very_pixel(rig: Rig) -> None
         azimuth = np.pi - (column + 0.5) / cylinder.focal_px
         z = distance * (cylinder.row0 - row) / cylinder.focal_px
         viewpoint = se3.apply(rig.T_rect_rig, [mounted.viewpoint])
-        point = viewpoint + [[distance * np.cos(azimuth), distance * np.sin(azimuth), z]]
+        point = viewpoint + np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), z])
         pixel = mounted.camera.project(se3.apply(mounted.T_cam_rig @ se3.inverse(rig.T_rect_rig), point))
-        np.testing.assert_allclose([maps[0][row, column + 16], maps[1][row, column + 16]], pixel[0], atol=1e-3)
+        np.testing.assert_allclose([maps[0][row, column + 16], maps[1][row, column + 16]], pixel[0], rtol=0, atol=1e-3)
 
 
 def test_a_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
     cylinder = fit_cylinder(omni_rig, 800)
     maps = remap_tables(omni_rig, omni_rig.lower, cylinder)
-    masked = MountedCamera(omni_rig.lower.camera, omni_rig.lower.T_cam_rig, Mask(omni_rig.lower.camera.center, 120.0, 300.0))
+    masked = replace(omni_rig.lower, mask=Mask(omni_rig.lower.camera.center, 120.0, 300.0))
     seen = visible(masked, maps, 2.0)
     radius = np.hypot(maps[0] - masked.camera.center[0], maps[1] - masked.camera.center[1])
     np.testing.assert_array_equal(seen, (maps[0] >= 0) & (radius >= 122) & (radius <= 298))
@@ -161,38 +172,44 @@ def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_picture_runs()
     lower, upper = parabolic_omni().camera, parabolic_ocam().camera
     for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
         rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
-        np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], atol=1e-15)
+        np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], rtol=0, atol=1e-15)
         # The picture's u axis runs to the robot's left here, and the rig's x is that axis.
-        np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], atol=1e-12)
+        np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], rtol=0, atol=1e-12)
 
 
-def test_columns_of_a_real_pair_agree(shared_data: object) -> None:
-    """What the two cameras of a crooked rig saw lies in the same columns, and lower in the upper panorama."""
-    from pathlib import Path
-
-    from mcap.reader import make_reader
-    from rosbags.typesys import Stores, get_typestore
-
-    from calib.kalibr import import_kalibr
-
-    folder = Path(str(shared_data)) / "two_walls_crooked"
-    rig = import_kalibr(folder / "camchain.yaml")
-    store, images = get_typestore(Stores.ROS2_HUMBLE), {}
-    with (folder / "log.mcap").open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages(topics=list(rig.topics)):
-            data = store.deserialize_cdr(message.data, "sensor_msgs/msg/CompressedImage").data
-            images.setdefault(channel.topic, cv2.imdecode(np.asarray(data), cv2.IMREAD_GRAYSCALE))
-            if len(images) == 2:
+def first_pictures(log: Path, topics: tuple[str, str]) -> list[Any]:
+    """The first picture of each topic of a log."""
+    images: dict[str, Any] = dict.fromkeys(topics)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with log.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(topics=list(topics)):
+            decoded: Any = store.deserialize_cdr(message.data, "sensor_msgs/msg/CompressedImage")
+            images[channel.topic] = images[channel.topic] or decoded
+            if all(images.values()):
                 break
+    return [cv2.imdecode(np.asarray(images[topic].data), cv2.IMREAD_GRAYSCALE) for topic in topics]
+
+
+def tracked(first: Any, second: Any) -> Array:
+    """Offsets (N, 2) of features that go from one picture to the other and come back."""
+    corners: Any = cv2.goodFeaturesToTrack(first, 400, 0.02, 8)
+    track: Any = cv2.calcOpticalFlowPyrLK
+    moved, there, _ = track(first, second, corners, None, winSize=(21, 21), maxLevel=4)
+    back, again, _ = track(second, first, moved, None, winSize=(21, 21), maxLevel=4)
+    good = (there & again).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
+    return np.asarray((moved - corners).reshape(-1, 2)[good])
+
+
+def test_columns_of_a_real_pair_agree(shared_data: Path) -> None:
+    """What the two cameras of a crooked rig saw lies in the same columns, and lower in the upper panorama."""
+    folder = shared_data / "two_walls_crooked"
+    rig = import_kalibr(folder / "camchain.yaml")
     cylinder = fit_cylinder(rig)
-    lower, upper = (cv2.remap(images[topic], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-                    for topic, mounted in zip(rig.topics, (rig.lower, rig.upper), strict=True))
-    corners = cv2.goodFeaturesToTrack(lower, 400, 0.02, 8)
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(lower, upper, corners, None, winSize=(21, 21), maxLevel=4)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(upper, lower, moved, None, winSize=(21, 21), maxLevel=4)
-    good = (status & status_back).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
-    offset = (moved - corners).reshape(-1, 2)[good]
-    assert good.sum() > 150
+    lower, upper = (cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
+                    for image, mounted in zip(first_pictures(folder / "log.mcap", rig.topics), (rig.lower, rig.upper),
+                                              strict=True))
+    offset = tracked(lower, upper)
+    assert len(offset) > 150
     assert abs(np.median(offset[:, 0])) < 0.1
     assert np.median(np.abs(offset[:, 0])) < 0.2
     assert np.mean(offset[:, 1] > 0) > 0.95

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from calib.rig import Rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 
 # The layout of the toolbox's own export, with own numbers.
-TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world
+TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). Used by cam2world
 
 5 -2.315000e+02 0.000000e+00 1.540000e-03 -5.960000e-07 1.590000e-09 \n
 #polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). These are used by world2cam
@@ -56,11 +57,12 @@ def test_the_exported_inverse_polynomial_serves_programs_that_use_it(ocam_rig: R
     pixels = np.random.default_rng(0).uniform((0, 0), camera.size, (500, 2))
     ray = camera.lift(pixels) * (1, 1, -1)
     theta = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))
-    rho = sum(a * theta**power for power, a in enumerate(inverse_polynomial(camera)))
-    x, y = (ray[:, :2] / np.hypot(ray[:, 0], ray[:, 1])[:, None] * np.asarray(rho)[:, None]).T
+    rho = np.polyval(inverse_polynomial(camera)[::-1], theta)
+    x, y = (ray[:, :2] / np.hypot(ray[:, 0], ray[:, 1])[:, None] * rho[:, None]).T
     c, d, e = camera.affine
     row, column = camera.center_row_column
-    np.testing.assert_allclose(np.column_stack([x * e + y + column, x * c + y * d + row]), pixels, atol=0.02)
+    found: Any = np.column_stack([x * e + y + column, x * c + y * d + row])
+    np.testing.assert_allclose(found, pixels, atol=0.02)
 
 
 def test_an_omni_camera_is_not_exported(omni_rig: Rig) -> None:
@@ -109,7 +111,7 @@ def test_two_files_and_a_transform_are_a_rig(tmp_path: Path, view: str) -> None:
                       "mirror" if view == "mirror" else "direct")
     assert (rig.lower.camera.size, rig.upper.camera.size) == ((640, 480), (641, 481))
     np.testing.assert_allclose(rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig), T_LOWER_UPPER, atol=1e-14)
-    np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, np.linalg.norm(T_LOWER_UPPER[:3, 3])], atol=1e-14)
+    np.testing.assert_allclose(rig.upper.viewpoint, (0, 0, float(np.linalg.norm(T_LOWER_UPPER[:3, 3]))), atol=1e-14)
     # The picture's u is the camera's y in this model, and the rig's x.
     assert rig.lower.T_cam_rig[1, 0] > 0.99
 
@@ -117,10 +119,11 @@ def test_two_files_and_a_transform_are_a_rig(tmp_path: Path, view: str) -> None:
 @pytest.mark.parametrize("view", ["mirror", "direct"])
 def test_a_baseline_is_straight_up_from_cameras_that_look_up(tmp_path: Path, view: str) -> None:
     (tmp_path / "c.txt").write_text(TEXT)
-    rig = import_ocam(tmp_path / "c.txt", tmp_path / "c.txt", straight_up(0.2), "mirror" if view == "mirror" else "direct")
+    path = tmp_path / "c.txt"
+    rig = import_ocam(path, path, straight_up(0.2), "mirror" if view == "mirror" else "direct")
     axis = rig.lower.camera.lift(np.array([rig.lower.camera.center]))[0] @ rig.lower.T_cam_rig[:3, :3]
     # In a mirror the middle of the picture shows the camera below, through a lens the ceiling.
-    np.testing.assert_allclose(axis, [0, 0, -1 if view == "mirror" else 1], atol=1e-12)
+    np.testing.assert_allclose(axis, np.array([0, 0, -1 if view == "mirror" else 1]), atol=1e-12)
     for baseline in (0.0, -0.2, float("nan")):
         with pytest.raises(CalibError, match="--baseline"):
             straight_up(baseline)
@@ -141,8 +144,8 @@ def test_a_transform_is_read_from_any_of_its_formats(tmp_path: Path, name: str, 
 @pytest.mark.parametrize(("name", "text", "says"), [
     ("t.toml", "T_x = 3", "T_x: unknown key"), ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
     ("t.toml", "[", "not a TOML file"), ("t.yml", "T_lower_upper: 3", "4 rows of 4 numbers"), ("t.yml", "[", "YAML"),
-    ("t.txt", "1 0 0 0", "4 rows"), ("t.txt", "one", "expected 16 numbers"), ("t.txt", "1 " * 16, "expected a rotation"),
-    ("t.txt", "nan " * 16, "finite"),
+    ("t.txt", "1 0 0 0", "4 rows"), ("t.txt", "one", "expected 16 numbers"),
+    ("t.txt", "1 " * 16, "expected a rotation"), ("t.txt", "nan " * 16, "finite"),
 ])
 def test_what_is_no_transform_is_refused(tmp_path: Path, name: str, text: str, says: str) -> None:
     (tmp_path / name).write_text(text)

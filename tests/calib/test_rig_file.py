@@ -91,7 +91,7 @@ def test_a_rotation_typed_with_few_digits_is_made_one(omni_rig: Rig) -> None:
     ("size = [768, 770]", "size = [768]", "lower.size"),
     ("size = [768, 770]", "size = [768, 770]\nT_rig_upper = 4", "lower.T_rig_upper: unknown key"),
     ("T_rig_lower = [", "T_rig_lower = 3\n[lower.x]\ny = [", "lower.x: unknown key"),
-    ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 1.0],\n]\n\n[lower]", "T_base_rig: expected 4 rows of 4 numbers"),
+    ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 1.0],\n]\n\n[lower]", "T_base_rig: expected 4 rows of 4"),
     ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 0.5, 1.0],\n]\n\n[lower]", "T_base_rig: expected a rotation"),
     ("[upper]", "[higher]", "higher: unknown key"),
     ("[lower]", "[lower", "not a TOML file"),
@@ -145,6 +145,6 @@ def test_any_damage_is_a_calib_error_or_a_rig(ocam_rig: Rig) -> None:
             parse_rig(bytes(damaged[:random.integers(1, len(text) + 400)]))
         except CalibError as error:
             assert "\n" not in str(error)
-    for text in ("[" * 5000, "a = " + "[" * 5000, "x = " + "9" * 5000):
+    for deep in ("[" * 5000, "a = " + "[" * 5000, "x = " + "9" * 5000):
         with pytest.raises(CalibError):
-            parse_rig(text)
+            parse_rig(deep)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,7 +72,8 @@ NOTHING = {
     "soft vignette": 220 * np.exp(-(R / 300)**2), "lens vignette": 230 * np.cos(np.clip(R / 540, 0, 1.5))**4,
     "square": np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5), "half": np.where(U < 384, 150, 5),
     "ellipse": np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5), "tiny": np.zeros((20, 20)),
-    "thin": np.zeros((1, 900)), "most of the rim dark": np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
+    "thin": np.zeros((1, 900)), "dusk": np.where(R < RADIUS, 26, 6),
+    "most of the rim dark": np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
     "moon": np.where(np.hypot(U - 150, V - 150) < 100, 200, 5),
     "blobs": cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, U.shape), (0, 0), 25) * 30 - 3700,
 }
@@ -89,8 +91,9 @@ def test_the_inside_of_a_mirror_alone_has_no_rim() -> None:
 
 def test_real_mirrors(shared_data: Path) -> None:
     """Ten pictures of one mirror whose rim the picture cuts off above and below, with the lens in its middle."""
-    found = [find_rim(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (512.0, 384.0))
-             for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
+    pictures: list[Any] = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+                           for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
+    found = [find_rim(picture, (512.0, 384.0)) for picture in pictures]
     masks = [mask for mask in found if mask is not None]
     assert len(masks) >= 8
     rings = np.array([(*mask.center, mask.inner_px, mask.outer_px) for mask in masks])
