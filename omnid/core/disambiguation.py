@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Array = NDArray[np.float32]
 
+REMAP_ROWS = 32_000  # cv2.remap takes no more rows than a short counts
+
 
 def nearest_anchor(shape: tuple[int, int], anchors: NDArray[np.intp], points: NDArray[np.intp]) -> NDArray[np.intp]:
     """For each point (flat index) the position in `anchors` of the nearest anchor (flat indices; at least one)."""
@@ -41,5 +43,6 @@ def line_difference(lower: Image, upper: Image, ends: tuple[Array, Array, Array,
 
 def _sample(image: Image, positions: Array) -> Image:
     """Grey levels (N, S) uint8 at positions (N, S, 2)."""
-    return np.asarray(cv2.remap(image, np.ascontiguousarray(positions, np.float32), None, cv2.INTER_LINEAR,
-                                borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    chunks = [cv2.remap(image, np.ascontiguousarray(positions[k : k + REMAP_ROWS]), None, cv2.INTER_LINEAR,
+                        borderMode=cv2.BORDER_REPLICATE) for k in range(0, len(positions), REMAP_ROWS)]
+    return np.asarray(np.concatenate(chunks), np.uint8)

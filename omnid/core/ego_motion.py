@@ -34,7 +34,7 @@ class Limits:
     """What is enough: features wanted, and the support below which a pose is doubted or refused."""
 
     features: int = 500
-    refresh: float = 0.7  # share of the features below which a keyframe is added
+    refresh: float = 0.7  # share of the most landmarks since the last keyframe, below which one is added
     keyframes: int = 5
     min_inliers: int = 20
     min_share: float = 0.4
@@ -75,6 +75,7 @@ class EgoMotion:
         self._previous: Wrapped | None = None
         self._refused = self._strange = self._resets = 0
         self._blind_s = 0.0
+        self._most_agreeing = 0  # landmarks, since the last keyframe: what this place can give
 
     def process(self, sight: Sight, dt_s: float) -> Ego:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
@@ -160,7 +161,8 @@ class EgoMotion:
     def _refresh_map(self, sight: Sight, usable: Flags, fit: Fit) -> None:
         """Forgets landmarks that stay away, and adds a keyframe where too few are left."""
         self._map.keep(fit.landmarks)
-        if fit.agreeing < self._limits.refresh * self._limits.features:
+        self._most_agreeing = max(self._most_agreeing, fit.agreeing)
+        if fit.agreeing < self._limits.refresh * self._most_agreeing:
             self._add_keyframe(sight, usable, fit.pixels)
 
     def _add_keyframe(self, sight: Sight, usable: Flags, known: Array) -> None:
@@ -173,6 +175,7 @@ class EgoMotion:
         keyframe = Keyframe(sight.seq, sight.lower, self._T, self._covariance)
         self._map.add(keyframe, np.column_stack([points, rows])[located])
         self._relocaliser.remember(sight, self._T)
+        self._most_agreeing = 0
 
     def _inherited(self, fit: Fit) -> Array:
         """Covariance (6, 6) that comes with the keyframes in which the agreeing landmarks are anchored."""

@@ -41,6 +41,13 @@ class SadVolume:
             np.take(plane.reshape(-1), pixels, out=row, mode="clip")
         return costs
 
+    def around(self, pixels: Indices, disparity: Indices, reach: int) -> Costs:
+        """Costs (2 reach + 1, N) of pixels (flat indices) at disparity - reach .. disparity + reach; NEVER outside."""
+        wanted = disparity[None] + np.arange(-reach, reach + 1)[:, None]
+        inside = (wanted >= 0) & (wanted < len(self.planes))
+        size = self.planes[0].size
+        return np.where(inside, self.planes.reshape(-1)[np.where(inside, wanted, 0) * size + pixels], NEVER)
+
     def seen_from_upper(self, pixels: Indices, disparity: NDArray[np.intp]) -> NDArray[np.intp]:
         """The disparity (N,) that the upper panorama's pixel would choose, for lower pixels and their disparities."""
         width = self.planes.shape[2]
