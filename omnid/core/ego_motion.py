@@ -16,6 +16,7 @@ from omnid.core.klt import Klt, Wrapped
 from omnid.core.local_map import Keyframe, LocalMap
 from omnid.core.motion import StereoModel
 from omnid.core.motion_filter import MotionFilter
+from omnid.core.patches import disparity_slopes
 from omnid.core.pose_search import PoseSearch
 from omnid.core.relocalisation import Relocaliser
 from omnid.core.sight import Sight
@@ -173,7 +174,8 @@ class EgoMotion:
         rows = rows_in_upper((sight.lower, sight.upper), points, guess, self._stereo_klt)
         located = np.isfinite(rows)
         keyframe = Keyframe(sight.seq, sight.lower, self._T, self._covariance)
-        self._map.add(keyframe, np.column_stack([points, rows])[located])
+        slopes = disparity_slopes(sight.disparity, points[located], (rows - points[:, 1])[located])
+        self._map.add(keyframe, np.column_stack([points, rows])[located], slopes)
         self._relocaliser.remember(sight, self._T)
         self._most_agreeing = 0
 

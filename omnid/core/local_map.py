@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.klt import Klt, Wrapped, track
 from omnid.core.motion import StereoModel
+from omnid.core.patches import CELL_PX, affine_warps, align, warped_templates
 from omnid.core.triangulation import point_covariance, triangulate, view
 
 Array = NDArray[np.float64]
@@ -52,23 +53,26 @@ class LocalMap:
         self.keyframes: dict[int, Keyframe] = {}
         self.points = np.zeros((0, 3))  # (N, 3) m in odom
         self.covariance = np.zeros((0, 3, 3))  # (N, 3, 3) m^2 in odom
-        self.pixels = np.zeros((0, 2))  # (N, 2) px in the keyframe's panorama
+        self.views = np.zeros((0, 3))  # (N, 3) px: column, lower row, upper row in the keyframe
+        self.slopes = np.zeros((0, 2))  # (N, 2) px/px of the disparity about the view
         self.anchor = np.zeros(0, np.intp)  # (N,) seq of the keyframe
         self._misses = np.zeros(0, np.intp)
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def add(self, keyframe: Keyframe, views: Array) -> None:
-        """Takes a keyframe and the landmarks that it adds, as views (N, 3) = (column, lower row, upper row) [px]."""
+    def add(self, keyframe: Keyframe, views: Array, slopes: Array) -> None:
+        """Takes a keyframe and its new landmarks: views (N, 3) [px] and the slopes (N, 2) of the disparity there."""
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
-        views, points = views[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
+        finite = np.isfinite(points).all(axis=1)
+        views, slopes, points = views[finite], slopes[finite], points[finite]
         covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px)
         R = keyframe.T_odom_rect[:3, :3]
         self.keyframes[keyframe.seq] = keyframe
         self.points = np.concatenate([self.points, se3.apply(keyframe.T_odom_rect, points)])
         self.covariance = np.concatenate([self.covariance, R @ covariance @ R.T])
-        self.pixels = np.concatenate([self.pixels, views[:, :2]])
+        self.views = np.concatenate([self.views, views])
+        self.slopes = np.concatenate([self.slopes, slopes])
         self.anchor = np.concatenate([self.anchor, np.full(len(points), keyframe.seq)])
         self._misses = np.concatenate([self._misses, np.zeros(len(points), np.intp)])
         self._forget_oldest()
@@ -87,9 +91,23 @@ class LocalMap:
         for seq, keyframe in self.keyframes.items():
             at = np.flatnonzero(self.anchor[visible] == seq)
             of = visible[at]
-            pixels[at], found[at] = track(keyframe.lower, lower, self.pixels[of], predicted[of, :2], self._klt)
+            pixels[at], found[at] = track(keyframe.lower, lower, self.views[of, :2], predicted[of, :2], self._klt)
         index = visible[found]
         return Tracks(index, pixels[found], predicted[index], len(visible))
+
+    def align(self, lower: Wrapped, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
+        """Pixels (M, 2) of landmarks (indices) in a panorama whose pose is known well, by warped patches, and which fit."""
+        T_rect_odom = se3.inverse(T_odom_rect)
+        predicted = view(se3.apply(T_rect_odom, self.points[index]), self._model.cylinder, self._model.baseline_m)[:, :2]
+        templates = np.zeros((len(index), CELL_PX, CELL_PX), np.uint8)
+        for seq, keyframe in self.keyframes.items():
+            at = np.flatnonzero(self.anchor[index] == seq)
+            of = index[at]
+            if not len(of):
+                continue
+            warps = affine_warps(self.views[of], self.slopes[of], T_rect_odom @ keyframe.T_odom_rect, self._model)
+            templates[at] = warped_templates(keyframe.lower, self.views[of, :2], warps, predicted[at])
+        return align(templates, lower, predicted)
 
     def anchor_shares(self, index: Indices) -> dict[int, float]:
         """For each keyframe the share of the landmarks (indices) that it anchors."""
@@ -108,7 +126,8 @@ class LocalMap:
         self._select(np.isin(self.anchor, list(self.keyframes)))
 
     def _select(self, kept: Flags) -> None:
-        self.points, self.covariance, self.pixels = self.points[kept], self.covariance[kept], self.pixels[kept]
+        self.points, self.covariance = self.points[kept], self.covariance[kept]
+        self.views, self.slopes = self.views[kept], self.slopes[kept]
         self.anchor, self._misses = self.anchor[kept], self._misses[kept]
         anchors = set(self.anchor.tolist())
         self.keyframes = {seq: k for seq, k in self.keyframes.items() if seq in anchors}

@@ -40,7 +40,8 @@ class PoseSearch:
         T_guess_odom = se3.inverse(guess)
         in_guess = se3.apply(T_guess_odom, self._map.points[tracks.index])
         T_curr_guess, agree = ransac(in_guess, views, self._model, np.random.default_rng(sight.seq))
-        return self._refine(tracks, views, agree, T_curr_guess @ T_guess_odom)
+        T_curr_odom, agree = self._refine(tracks, views, agree, T_curr_guess @ T_guess_odom)
+        return self._polish(sight, tracks, views, agree, T_curr_odom)
 
     def best_turn(self, sight: Sight, previous: Wrapped, T_odom_previous: Array, usable: Flags) -> Array:
         """The pose guess with the most forward-backward tracks among turns of the previous pose.
@@ -58,16 +59,34 @@ class PoseSearch:
         found = rows_in_upper((sight.lower, sight.upper), tracks.pixels, rows, self._stereo_klt)
         return np.column_stack([tracks.pixels, found])
 
-    def _refine(self, tracks: Tracks, views: Array, agree: Flags, T_curr_odom: Array) -> Fit | None:
-        """Gauss-Newton on the consensus, and again without those that then fit badly."""
+    def _polish(self, sight: Sight, tracks: Tracks, views: Array, agree: Flags, T_curr_odom: Array) -> Fit | None:
+        """The pose from the same landmarks once their patches, warped as the coarse pose predicts, are aligned."""
+        if agree.sum() < LEAST: return None
+        index=tracks.index[agree]
+        pixels, fitted = self._map.align(sight.lower, se3.inverse(T_curr_odom), index)
+        v=views[agree].copy()
+        # the upper row goes along: the disparity was measured between two panoramas of one instant
+        v[:,2] += pixels[:,1]-v[:,1]
+        v[:,:2] = pixels
+        index, v = index[fitted], v[fitted]
+        for _ in range(2):
+            if len(index) < LEAST: return None
+            estimate = gauss_newton(self._map.points[index], self._map.covariance[index], v, T_curr_odom, self._model)
+            T_curr_odom = estimate.T
+            good = estimate.squared < OUTLIER
+            index, v, squared = index[good], v[good], estimate.squared[good]
+        scale = max(1.0, float(squared.mean()) / 3)
+        self.debug=squared.mean()/3
+        return Fit(se3.inverse(T_curr_odom), scale * estimate.covariance, tracks.visible, len(tracks.index),
+                   len(index), index, v[:, :2])
+
+    def _refine(self, tracks: Tracks, views: Array, agree: Flags, T_curr_odom: Array):
         for _ in range(2):
             if agree.sum() < LEAST:
-                return None
+                return T_curr_odom, agree
             index = tracks.index[agree]
             estimate = gauss_newton(self._map.points[index], self._map.covariance[index], views[agree], T_curr_odom,
                                     self._model)
             T_curr_odom = estimate.T
             agree[agree] = estimate.squared < OUTLIER
-        scale = max(1.0, float(estimate.squared.mean()) / 3)
-        return Fit(se3.inverse(T_curr_odom), scale * estimate.covariance, tracks.visible, len(tracks.index),
-                   int(agree.sum()), tracks.index[agree], views[agree, :2])
+        return T_curr_odom, agree

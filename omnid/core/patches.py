@@ -1,0 +1,122 @@
+"""The last hundredths of a pixel: landmarks' patches, bent as the new viewpoint sees them, aligned once more.
+
+Plain Lucas-Kanade shifts a window but does not bend it, and errs by tenths of a pixel as soon as the camera has moved
+some decimetres. Here each keyframe patch is warped by the affine map that pose, depth and local slope predict; all
+patches lie side by side in one picture, so that a single call aligns them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.klt import Wrapped
+from omnid.core.motion import StereoModel
+from omnid.core.triangulation import triangulate, view
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+CELL_PX = 24  # holds the window, the largest shift and the gradient's border
+WINDOW_PX = 15
+MOST_PX = 2.0  # a patch that has to move farther was predicted wrongly
+CELLS_A_ROW = 32
+HALF_PX = 4.0  # half the base over which the warp is taken
+
+
+def disparity_slopes(disparity: NDArray[np.float32], points: Array, centre: Array, reach_px: int = 8) -> Array:
+    """Slopes (N, 2) of the disparity [px/px] along column and row about points (N, 2) with disparity centre (N,).
+
+    A plane through the centre, by least squares with a pull to zero (an upright surface facing the camera); neighbours
+    that lie more than two pixels off belong to something else.
+    """
+    height, width = disparity.shape
+    offsets = np.arange(-reach_px, reach_px + 1)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
+    columns = (np.rint(points[:, :1]).astype(int) + dx) % width
+    rows = np.clip(np.rint(points[:, 1:]).astype(int) + dy, 0, height - 1)
+    change = disparity[rows, columns] - centre[:, None]
+    near = np.abs(change) < 2.0
+    change = np.where(near, change, 0.0)
+    xx, yy, xy = near @ (dx * dx) + 50.0, near @ (dy * dy) + 50.0, near @ (dx * dy)
+    x, y = change @ dx, change @ dy
+    return np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None]
+
+
+def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
+    """Matrices (N, 2, 2): by how much a pixel moves in the current panorama per pixel in the keyframe's.
+
+    views (N, 3) and slopes (N, 2) in the keyframe. A warp that would more than halve or double is taken as none.
+    """
+    ends = []
+    for column, row in ((HALF_PX, 0.0), (-HALF_PX, 0.0), (0.0, HALF_PX), (0.0, -HALF_PX)):
+        moved = views + np.array([column, row, row])
+        moved[:, 2] += slopes @ (column, row)
+        points = triangulate(moved, model.cylinder, model.baseline_m)
+        ends.append(view(se3.apply(T_curr_ref, points), model.cylinder, model.baseline_m)[:, :2])
+    across, down = ends[0] - ends[1], ends[2] - ends[3]
+    for difference in (across, down):
+        difference[:, 0] = model.cylinder.wrap(difference[:, 0])
+    warps = np.stack([across, down], axis=2) / (2 * HALF_PX)
+    area = np.abs(np.linalg.det(warps))
+    sane = (np.abs(warps) < 2).all(axis=(1, 2)) & (area > 0.25)  # false for NaN as well
+    return np.where(sane[:, None, None], warps, np.eye(2))
+
+
+def align(templates: Floats, current: Wrapped, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where patches (N, CELL, CELL), centred on predicted (N, 2), really are, and which of them moved little enough."""
+    cells = _cut(current, np.rint(predicted))
+    centres = _centres(len(predicted))
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        _atlas(templates), _atlas(cells), centres, centres.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=0,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.003), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4)
+    shift = (there - centres)[:, 0].astype(float)
+    close = (found.ravel() > 0) & (np.abs(shift).max(axis=1, initial=0.0) < MOST_PX)
+    return predicted + shift, close
+
+
+def warped_templates(keyframe: Wrapped, pixels: Array, warps: Array, predicted: Array) -> NDArray[np.uint8]:
+    """Patches (N, CELL, CELL) uint8 of a keyframe about pixels (N, 2), as seen about predicted (N, 2) after warps."""
+    offsets = _cell_offsets() + (np.rint(predicted) - predicted)[:, None]
+    positions = pixels[:, None] + offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2)
+    return _sample(keyframe, positions)
+
+
+def _cut(image: Wrapped, centres: Array) -> NDArray[np.uint8]:
+    """Patches (N, CELL, CELL) about whole pixels (N, 2)."""
+    return _sample(image, centres[:, None] + _cell_offsets())
+
+
+def _cell_offsets() -> Array:
+    """Positions (CELL * CELL, 2) of a cell's pixels relative to its centre."""
+    side = np.arange(CELL_PX) - CELL_PX // 2
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(float)
+
+
+def _sample(image: Wrapped, positions: Array) -> NDArray[np.uint8]:
+    """Patches (N, CELL, CELL) at positions (N, CELL * CELL, 2) of the panorama, across the seam if need be."""
+    centre = positions.mean(axis=1, keepdims=True)[:, :, 0]
+    columns = positions[..., 0] - np.floor(centre / image.width) * image.width + image.pad_px
+    maps = np.stack([columns, positions[..., 1]], axis=-1).astype(np.float32)
+    patches = cv2.remap(image.image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
+
+
+def _atlas(patches: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Patches laid out in rows of CELLS_A_ROW, one picture."""
+    rows = -(-len(patches) // CELLS_A_ROW)
+    filled = np.zeros((rows * CELLS_A_ROW, CELL_PX, CELL_PX), np.uint8)
+    filled[: len(patches)] = patches
+    grid = filled.reshape(rows, CELLS_A_ROW, CELL_PX, CELL_PX)
+    return np.ascontiguousarray(grid.transpose(0, 2, 1, 3)).reshape(rows * CELL_PX, CELLS_A_ROW * CELL_PX)
+
+
+def _centres(count: int) -> Floats:
+    """Centres (N, 1, 2) of the cells in the atlas."""
+    number = np.arange(count)
+    corner = np.column_stack([number % CELLS_A_ROW, number // CELLS_A_ROW]) * CELL_PX
+    return np.ascontiguousarray((corner + CELL_PX // 2)[:, None], np.float32)
