@@ -1,7 +1,7 @@
 """The ego-motion of Dang et al. 2012, section IV, as it stands: frame to frame, 3-D to 3-D.
 
-Kept to be measured against: eq. (9) comes out short, because depth noise stands on both of its sides, and what one pair
-of frames gets wrong stays wrong.
+Kept to be measured against: eq. (9) believes far points as much as near ones, their depth noise stands on both of its
+sides, and what one pair of frames gets wrong stays wrong.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from omnid.core.paper_registration import Registration, consensus, register
 from omnid.core.sight import Sight
 from omnid.core.triangulation import triangulate
 from omnid.core.yaw import steps
+from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -29,6 +30,9 @@ ENOUGH = 0.5  # share of the features that must be found for a turn to be the ri
 EPSILON_PX = 3  # eq. (8): how far a located point may be from a feature that it locates
 THRESHOLD_M = 0.05  # section IV.B: how far a point of the consensus may be from where the motion puts it
 LEAST = 6  # points of the consensus, below which the motion is refused
+# For the motion filter: the turns of section IV.F change the yaw rate by radians per second within a tenth of one, and
+# a filter that calls this impossible would bend the turn and swing after it.
+JERK_PSD = (10.0, 4000.0)
 BLIND_SPEED = 0.5  # what may have happened where it is [m/s and rad/s], one deviation
 
 
@@ -40,9 +44,9 @@ class PaperMotion:
 
     def __init__(self, model: StereoModel, klt: Klt, tracker: str = "improved") -> None:
         if tracker not in TRACKERS:
-            raise ValueError(f"tracker: expected one of {', '.join(TRACKERS)}, found {tracker!r}")
+            raise OmnidError(f"tracker: expected one of {', '.join(TRACKERS)}, found {tracker!r}")
         self._model, self._klt, self._tracker = model, klt, tracker
-        self._filter = MotionFilter()
+        self._filter = MotionFilter(JERK_PSD)
         self._T, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: Sight | None = None
 
@@ -80,10 +84,10 @@ class PaperMotion:
         return triangulate(views, self._model.cylinder, self._model.baseline_m)
 
     def _move(self, found: Registration, dt_s: float) -> None:
-        """Filters the motion (section IV.D) and composes its inverse: the points' motion, seen from the robot, eq. (12).
+        """Filters the motion (section IV.D) and composes the inverse of what the points did: eq. (12).
 
-        The measured covariance is that of the fit: millimetres against a robot that may change its velocity by far
-        more, so that the filter takes over even a turn that no constant acceleration explains.
+        The filter hears the fit's own covariance. It takes the twist where eq. (11) has Euler angles: the same for
+        small motions, and for large ones the only thing that is proportional to time.
         """
         T_prev_curr = se3.inverse(found.M)
         if dt_s > 0:
@@ -119,7 +123,7 @@ def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt) -> tu
     best, most = (features, np.zeros(len(features), bool)), -1
     for turn in steps():
         shift = turn * previous.lower.width / (2 * np.pi)
-        there, found = track(previous.lower, sight.lower, features, features + (shift, 0.0), klt)
+        there, found = track(previous.lower, sight.lower, features, features + np.array([shift, 0.0]), klt)
         if found.sum() > most:
             best, most = (there, found), int(found.sum())
         if most >= ENOUGH * len(features):

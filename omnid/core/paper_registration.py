@@ -1,4 +1,4 @@
-"""The motion between two clouds of the same points, 3-D to 3-D: RANSAC, then Gauss-Newton (Dang et al. 2012, IV.B, C)."""
+"""The motion between two clouds of the same points, 3-D to 3-D: RANSAC and Gauss-Newton of Dang et al. 2012, IV.B, C."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _linearised(a: Array, b: Array, parameters: Array) -> tuple[Array, Array]:
 
 
 def _covariance(moved: Array, b: Array) -> Array:
-    """Covariance (6, 6) of a small motion [t; r] on the left of M, from the errors that are left: H^-1 (J'ee'J) H^-1."""
+    """Covariance (6, 6) of a small motion [t; r] on the left of M, from the errors that are left."""
     J = np.concatenate([np.broadcast_to(np.eye(3), (len(b), 3, 3)), -se3.hat(moved)], axis=2)
     slopes = (np.swapaxes(J, 1, 2) @ (b - moved)[:, :, None])[:, :, 0]
     H = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
