@@ -1,0 +1,61 @@
+"""The command line: finds the command, runs it, and turns what the user can put right into one line and exit code 2."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NoReturn
+
+from omnid import __version__
+
+COMMANDS = ("replay", "demo", "eval", "calibrate", "config")
+MODULES = {"eval": "evaluate"}  # eval is a name that Python has taken
+WRONG = 2
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program."""
+        self.exit(WRONG, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The exit code: 0 all is well, 1 found wanting, 2 the input is wrong, 130 stopped by Ctrl-C."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    args = _parser(words).parse_args(words)
+    return _guarded(args)
+
+
+def _parser(words: Sequence[str]) -> Parser:
+    """Only the command that is asked for is loaded: some take a second to be."""
+    parser = Parser(prog="omnid", description="Odometry, map and guidance from two stacked omnidirectional cameras.")
+    parser.add_argument("--version", action="version", version=f"omnid {__version__}")
+    subparsers = parser.add_subparsers(required=True, metavar="command", parser_class=Parser)
+    asked = next((word for word in words if not word.startswith("-")), "")
+    for name in (asked,) if asked in COMMANDS else COMMANDS if "--version" not in words else ():
+        import_module(f"omnid.commands.{MODULES.get(name, name)}").add_parser(subparsers)
+    return parser
+
+
+def _guarded(args: argparse.Namespace) -> int:
+    from calib.errors import CalibError
+    from drivers.errors import DriverError
+    from omnid.errors import OmnidError
+
+    try:
+        code = int(args.run(args))
+        sys.stdout.flush()
+        return code
+    except (OmnidError, DriverError, CalibError) as error:
+        print(f"omnid: {' '.join(str(error).split())}", file=sys.stderr)
+        return WRONG
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141

@@ -1,0 +1,24 @@
+"""`omnid eval`: how far an estimated trajectory is from the truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `eval` to the command line."""
+    parser = subparsers.add_parser("eval", help="compare a trajectory with the truth, both in the TUM format")
+    parser.add_argument("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig")
+    parser.add_argument("truth", type=Path, metavar="TRUTH", help="likewise, of the same rig frame in any world")
+    parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS", help="largest difference of stamps")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prints the errors."""
+    from omnid.core.evaluation import evaluate, format_metrics
+    from omnid.core.trajectory import read_tum
+
+    print(format_metrics(evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3)))
+    return 0

@@ -1,0 +1,62 @@
+"""`omnid replay`: a recorded log becomes a trajectory, a map and motor commands."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from omnid.commands.config import add_settings
+
+RIG_ATTACHMENT = "rig.toml"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `replay` to the command line."""
+    parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
+    parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap file, or the folder of ros2 bag record -s mcap")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
+    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's pictures; default: by name")
+    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's pictures; default: by name")
+    _add_outputs(parser)
+    _add_manner(parser)
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("what comes out")
+    group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
+    group.add_argument("--map", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
+    group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
+    group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
+    group.add_argument("--publish", action="store_true", help="speak on the bus as `<robot>/odom` and so on; off by "
+                       "default, because on a robot that voice belongs to its daemon")
+    group.add_argument("--motor", metavar="PORT", help="send commands to the controller on a serial port (the wheels "
+                       "will turn!), or to a 'simulated' one")
+
+
+def _add_manner(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how")
+    group.add_argument("--method", choices=("default", "paper"), help="the paper's own algorithm, to compare")
+    group.add_argument("--tracker", choices=("improved", "klt"), help="feature tracker of the paper's method")
+    group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same numbers")
+    group.add_argument("--realtime", action="store_true", help="at the pace of the log; what comes too late is dropped")
+    group.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replays the log."""
+    from omnid.config import Config
+    from omnid.replay import Options, Replay
+    from omnid.settings import load
+
+    options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
+                      inline=args.inline, realtime=args.realtime, quiet=args.quiet)
+    config = load(Config, args.config, [*args.overrides, *_shortcuts(args)])
+    return Replay(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
+
+
+def _shortcuts(args: argparse.Namespace) -> list[str]:
+    """The options that are settings as well."""
+    named = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
+    return [f"{key}={value}" for key, value in named.items() if value is not None]

@@ -1,0 +1,183 @@
+"""Every knob on one page. `omnid config` prints it as TOML; what `omnid replay --config FILE` reads is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, fields
+from typing import Any
+
+from omnid.core.ego_motion import Limits
+from omnid.core.heading import HeadingLimits
+from omnid.core.klt import Klt
+from omnid.core.stereo_matching import METHODS, Matching
+from omnid.settings import Knob, knob
+from omnid.transport.bus import BusConfig
+
+@dataclass(frozen=True, slots=True)
+class LogConfig:
+    """How a log is read."""
+
+    reorder_frames: int = knob(32, "pictures that may wait for one that was written late", low=1, high=1000)
+
+
+@dataclass(frozen=True, slots=True)
+class PairConfig:
+    """What counts as one instant."""
+
+    tolerance_ms: float = knob(10.0, "largest difference of the stamps of a pair, ms", low=0, high=1000)
+
+
+@dataclass(frozen=True, slots=True)
+class PanoramaConfig:
+    """What is shown on the cylinder."""
+
+    width_px: int = knob(0, "columns of a full turn, px; 0: the pictures' own resolution", low=0, high=8192)
+    elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
+    pad_px: int = knob(48, "columns repeated on either side, so that windows run across the seam", low=16, high=256)
+    rim_margin_px: float = knob(4.0, "what is left out along rim and hub in the pictures, px", low=0, high=100)
+    margin_px: int = knob(7, "what is left out along the border of what both cameras show, px", low=0, high=100)
+
+
+@dataclass(frozen=True, slots=True)
+class StereoConfig:
+    """Depth by matching along the columns."""
+
+    noise_px: float = knob(0.5, "deviation of a disparity, px: how far the map trusts a point", low=0.01, high=10)
+    matching: Matching = field(default_factory=Matching)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """The motion of the rig."""
+
+    method: str = knob("default", "how the motion is found", choices=("default", "paper"))
+    tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
+    noise_px: float = knob(0.2, "deviation of a tracked corner, px", low=0.01, high=10)
+    klt: Klt = field(default_factory=Klt)
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    """The map of the whole run."""
+
+    voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
+    log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
+    max_sigma_m: float = knob(0.15, "points less certain than this stay out of the map, m", low=0.001, high=100)
+    min_frames: int = knob(2, "frames that must have seen a voxel before it is written", low=1, high=1000)
+    path_poses: int = knob(100_000, "poses kept for the plan view; beyond, every second is forgotten", low=100,
+                           high=10_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class GuidanceConfig:
+    """What the base is to do, and what it may be asked for."""
+
+    velocity_mps: float = knob(0.0, "forward speed, m/s", low=-10, high=10)
+    heading_deg: float = knob(0.0, "heading in odom, counter-clockwise, deg", low=-360, high=360)
+    limits: HeadingLimits = field(default_factory=HeadingLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class MotorConfig:
+    """The controller of the wheels."""
+
+    port: str = knob("", "serial port of the controller, or simulated; empty: none")
+    baud: int = knob(115_200, "bits per second", low=300, high=4_000_000)
+    rate_hz: float = knob(20.0, "commands per second", low=1, high=200)
+    stale_s: float = knob(0.5, "the wheels are stopped when the newest command is older, s", low=0.05, high=10)
+    watchdog_ms: int = knob(500, "the controller stops the wheels by itself after so long without a command, ms",
+                            low=50, high=10_000)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordConfig:
+    """What `--record` writes."""
+
+    cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
+                             high=10_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class GraphConfig:
+    """How the stages are run."""
+
+    depth: int = knob(2, "messages that may wait in front of a stage", low=1, high=100)
+    opencv_threads: int = knob(1, "threads OpenCV may use within a stage", low=1, high=64)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All of it."""
+
+    log: LogConfig = field(default_factory=LogConfig)
+    pair: PairConfig = field(default_factory=PairConfig)
+    panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    motor: MotorConfig = field(default_factory=MotorConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+
+
+def _knob(doc: str, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Knob:
+    return Knob(doc, low, high, choices, finite=True)
+
+
+MATCHING: Mapping[str, Knob] = {
+    "method": _knob("how one of several candidates is chosen", choices=METHODS),
+    "window_px": _knob("side of the matching window, px; odd", 3, 15),
+    "disparities": _knob("largest disparity, px", 8, 512),
+    "max_difference": _knob("mean difference of grey levels in the window that is still a match", 0, 255),
+    "rival": _knob("a candidate's SAD is at most this times the best one's, plus a grey level", 1, 10),
+    "edge_threshold": _knob("Sobel response that makes an edge, 8 per grey level and pixel", 0, 1020),
+    "max_points": _knob("edge pixels matched in a pair", 100, 1_000_000),
+    "sigma_px": _knob("deviation of the Gaussian before the edges, px", 0, 10),
+    "max_candidates": _knob("candidates compared for one pixel", 1, 64),
+}
+KLT: Mapping[str, Knob] = {
+    "window_px": _knob("side of the tracking window, px", 5, 61),
+    "levels": _knob("pyramid levels above the picture", 0, 6),
+    "max_error_px": _knob("largest error of the way back, px", 0.01, 10),
+    "iterations": _knob("steps on each level", 1, 200),
+}
+LIMITS: Mapping[str, Knob] = {
+    "features": _knob("landmarks wanted in a keyframe", 20, 10_000),
+    "refresh": _knob("a keyframe is added when this share of the last one's landmarks is left", 0, 1),
+    "keyframes": _knob("keyframes in the local map", 1, 50),
+    "min_inliers": _knob("landmarks that must agree with a pose", 4, 10_000),
+    "min_share": _knob("share of the found landmarks that must agree", 0, 1),
+    "sure_inliers": _knob("below so many the pose is degraded", 4, 10_000),
+    "sure_share": _knob("below this share other turns are tried", 0, 1),
+    "max_speed_mps": _knob("faster the robot cannot be, m/s", 0.1, 100),
+    "lost_after": _knob("refused poses running that make the state lost", 1, 1000),
+    "restart_after": _knob("sights with enough corners that fit nowhere, before the map starts anew", 1, 10_000),
+    "max_gap_s": _knob("a pose after a longer silence is degraded, s", 0.01, 60),
+}
+HEADING: Mapping[str, Knob] = {
+    "velocity_mps": _knob("highest speed, m/s", 0.001, 10),
+    "acceleration_mps2": _knob("highest acceleration, m/s^2", 0.001, 100),
+    "yaw_rate_radps": _knob("highest yaw rate, rad/s", 0.001, 20),
+    "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
+    "gain_hz": _knob("yaw rate per heading error, 1/s", 0.001, 50),
+}
+BUS: Mapping[str, Knob] = {
+    "robot": _knob("first part of every key, and of the topics of --record"),
+    "listen": _knob("zenoh endpoints to listen on"),
+    "connect": _knob("zenoh endpoints to connect to"),
+}
+
+
+def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
+    """Gives the fields of a dataclass of the numerics, which knows nothing of settings, their words and ranges."""
+    every: tuple[Field[Any], ...] = fields(kind)
+    for entry in every:
+        described = knobs.get(entry.name) or _knob(entry.name.replace("_", " "))
+        entry.metadata = {"knob": described}  # type: ignore[assignment]  # any mapping will do
+
+
+for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING), (BusConfig, BUS)):
+    _describe(_kind, _knobs)

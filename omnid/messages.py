@@ -1,0 +1,74 @@
+"""What flows between the stages. p_a = T_a_b @ p_b; SI units; NaN for unknown; nobody writes into a message."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.klt import Wrapped
+from omnid.core.voxel_map import MapPoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePair:
+    """Pictures of both cameras at one instant; the stamp is the lower camera's."""
+
+    seq: int
+    stamp_ns: int
+    lower: NDArray[np.uint8]  # (H, W)
+    upper: NDArray[np.uint8]  # (H, W)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panoramas:
+    """Both pictures on the cylinder about the line through the viewpoints: epipolar lines are columns."""
+
+    seq: int
+    stamp_ns: int
+    lower: Wrapped
+    upper: Wrapped
+    visible: NDArray[np.bool_]  # (H, W) both cameras show the world here, and in a tracking window around
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depth:
+    """Disparities of the lower panorama, and the points they stand for."""
+
+    seq: int
+    stamp_ns: int
+    panoramas: Panoramas
+    disparity: NDArray[np.float32]  # (H, W) px > 0, NaN unknown
+    pixels: Array  # (N, 2) column, row of the located pixels
+    points: Array  # (N, 3) m, in the rig frame
+    variance_m2: Array  # (N,) along the ray, where it is largest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """The rig's pose, its uncertainty and motion, and the depth it came from."""
+
+    seq: int
+    stamp_ns: int
+    T_odom_rig: Array  # (4, 4)
+    covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
+    velocity: Array  # (6,) m/s, rad/s in the rig frame
+    velocity_covariance: Array  # (6, 6)
+    state: str  # tracking | degraded | lost
+    reset_counter: int  # how often odom had to start anew with an unknown gap
+    inliers: int  # landmarks that agree with the pose
+    tracks: int  # landmarks that were found
+    depth: Depth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapUpdate:
+    """The map as it stands, and the way there."""
+
+    seq: int
+    stamp_ns: int
+    points: MapPoints  # in odom
+    path_xy: Array  # (N, 2) m in odom, thinned where the run is long

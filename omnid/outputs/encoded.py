@@ -1,0 +1,89 @@
+"""What leaves the daemon, as topic, schema and CDR bytes: the same for the log and the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.motor import VelocityCommand
+from omnid.core.voxel_map import MapPoints
+from omnid.messages import MapUpdate, Odometry
+from omnid.stages.odometry import of_base
+from omnid.transport import codec
+
+Outgoing: TypeAlias = Odometry | VelocityCommand | MapUpdate
+
+
+class Encoded(NamedTuple):
+    """A message ready to go."""
+
+    topic: str
+    schema: str
+    payload: bytes
+
+
+class Encoder:
+    """Turns messages into those of ROS 2; poses are odom -> base_link."""
+
+    def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int) -> None:
+        self._T_base_rig, self._cloud_points = T_base_rig, cloud_points
+
+    def __call__(self, message: Outgoing) -> Iterator[Encoded]:
+        """All that is said about a message."""
+        match message:
+            case Odometry():
+                yield from self._poses(message)
+            case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
+                payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
+                yield Encoded("cmd", codec.TWIST_SCHEMA, payload)
+            case MapUpdate():
+                points = _surest(message.points, self._cloud_points)
+                payload = codec.point_cloud_cdr(message.stamp_ns, "odom", *points)
+                yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
+
+    def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
+        stamp_ns = odometry.stamp_ns
+        T_odom_base, *uncertain_motion = of_base(odometry, self._T_base_rig)
+        yield Encoded("odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T_odom_base, *uncertain_motion))
+        yield Encoded("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
+        edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
+                 codec.FrameTransform("base_link", "rig", self._T_base_rig)]
+        yield Encoded("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+
+
+class StateReports:
+    """A diagnostic message whenever the state of the odometry changes."""
+
+    def __init__(self) -> None:
+        self._last: tuple[str, int] | None = None
+
+    def __call__(self, odometry: Odometry) -> Iterator[Encoded]:
+        """What there is to report about a pose."""
+        now = (odometry.state, odometry.reset_counter)
+        if now != self._last:
+            self._last = now
+            level = ("tracking", "degraded", "lost").index(odometry.state)
+            values = {"state": odometry.state, "resets": str(odometry.reset_counter),
+                      "landmarks": f"{odometry.inliers} of {odometry.tracks}"}
+            payload = codec.diagnostics_cdr(odometry.stamp_ns, "omnid: odometry", level, odometry.state, values)
+            yield Encoded("status", codec.DIAGNOSTICS_SCHEMA, payload)
+
+
+def summary_report(stamp_ns: int, values: dict[str, str]) -> Encoded:
+    """The counters of a run as one diagnostic message."""
+    payload = codec.diagnostics_cdr(stamp_ns, "omnid: summary", 0, "the run has ended", values)
+    return Encoded("status", codec.DIAGNOSTICS_SCHEMA, payload)
+
+
+def _surest(points: MapPoints, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Positions and confidence of the most confident points, in their own order."""
+    if len(points.xyz) <= most:
+        return points.xyz, points.confidence
+    kept = np.sort(np.argsort(-points.confidence, kind="stable")[:most])
+    return points.xyz[kept], points.confidence[kept]
+
+
+Report: TypeAlias = Callable[[], dict[str, str]]

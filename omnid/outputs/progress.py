@@ -1,0 +1,66 @@
+"""How far a run is, on a terminal or in a journal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+from omnid.outputs.tally import Tally
+
+TERMINAL_PERIOD_S = 0.2
+JOURNAL_PERIOD_S = 5.0
+BAR = 24
+
+
+class Progress:
+    """Draws a bar, or writes a line where stderr is no terminal; called at a fixed rate."""
+
+    def __init__(self, tally: Tally, expected: int | None, stream: TextIO | None = None) -> None:
+        self._tally, self._expected = tally, expected
+        self._stream = stream or sys.stderr
+        self._terminal = self._stream.isatty()
+        self._start_s = time.monotonic()
+        self._drawn = 0
+
+    @property
+    def period_s(self) -> float:
+        """How often it is worth looking."""
+        return TERMINAL_PERIOD_S if self._terminal else JOURNAL_PERIOD_S
+
+    def __call__(self) -> None:
+        """Shows the state now."""
+        if self._tally.poses:
+            self._show(self._line())
+
+    def close(self) -> None:
+        """Leaves the terminal as it was."""
+        if self._terminal and self._drawn:
+            self._write("\r" + " " * self._drawn + "\r")
+
+    def _line(self) -> str:
+        done, newest = self._tally.poses, self._tally.newest
+        rate = done / max(1e-3, time.monotonic() - self._start_s)
+        state = newest.state if newest is not None else "starting"
+        return f"{self._share(done)} {rate:5.1f} pairs/s  {self._tally.length_m:8.2f} m  {state}"
+
+    def _share(self, done: int) -> str:
+        if not self._expected:
+            return f"{done} pairs"
+        filled = min(BAR, BAR * done // self._expected)
+        bar = f"[{'#' * filled}{'.' * (BAR - filled)}] " if self._terminal else ""
+        return f"{bar}{done}/{self._expected}"
+
+    def _show(self, line: str) -> None:
+        if self._terminal:
+            self._write("\r" + line.ljust(self._drawn))
+            self._drawn = len(line)
+        else:
+            self._write(f"omnid: {line}\n")
+
+    def _write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:  # nobody reads it any more: no reason to end the run
+            self._stream = open("/dev/null", "w", encoding="ascii")  # noqa: SIM115 - lives as long as the run

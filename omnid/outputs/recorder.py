@@ -1,0 +1,37 @@
+"""A log of what the daemon made of its input, for ROS 2, Foxglove, Rerun and evo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from drivers.mcap_writer import LogWriter
+from omnid.messages import Odometry
+from omnid.outputs.encoded import Encoded, Encoder, Outgoing, Report, StateReports, summary_report
+
+
+class Recorder:
+    """Writes every message under `/<robot>/`, and the report of the run at the end; `attachments` come first."""
+
+    def __init__(self, path: Path, attachments: Mapping[str, bytes], robot: str, encode: Encoder) -> None:
+        self._writer = LogWriter(path, attachments)
+        self._robot, self._encode, self._states = robot, encode, StateReports()
+        self._newest_ns = 0
+        self.report: Report = dict
+
+    def process(self, message: Outgoing) -> None:
+        """Adds what there is to say about a message."""
+        self._newest_ns = max(self._newest_ns, message.stamp_ns)
+        self._write(self._encode(message), message.stamp_ns)
+        if isinstance(message, Odometry):
+            self._write(self._states(message), message.stamp_ns)
+
+    def finish(self) -> None:
+        """Makes the file whole."""
+        self._write([summary_report(self._newest_ns, self.report())], self._newest_ns)
+        self._writer.close()
+
+    def _write(self, messages: Iterable[Encoded], stamp_ns: int) -> None:
+        for topic, schema, payload in messages:
+            name = topic if topic.startswith("/") else f"/{self._robot}/{topic}"
+            self._writer.write(name, schema, payload, stamp_ns)

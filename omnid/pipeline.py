@@ -1,0 +1,75 @@
+"""The wiring: light comes in at the top and leaves as a pose and a motor command at the bottom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from drivers.frame import Frame
+from drivers.motor import VelocityCommand
+from omnid.config import Config
+from omnid.flow import nothing
+from omnid.graph import NEWEST, Graph, Sink, Stream
+from omnid.messages import MapUpdate, Odometry
+from omnid.outputs.bus import BusSink
+from omnid.outputs.encoded import Outgoing
+from omnid.outputs.motor import MotorTick
+from omnid.outputs.recorder import Recorder
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry
+from omnid.stages.guidance import Guidance
+from omnid.stages.mapping import Mapping
+from omnid.stages.odometry import OdometryStage
+from omnid.stages.pair import PairSync
+from omnid.stages.stereo import Stereo
+
+
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Where the flow goes; what nobody wants is not computed."""
+
+    poses: dict[str, Sink[Odometry]] = field(default_factory=dict)
+    maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
+    recorder: Recorder | None = None
+    bus: BusSink | None = None
+    motor: MotorTick | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Where the flow comes from: opened in the source's own thread, woken when the run is to end."""
+
+    open: Callable[[], Iterable[Frame]]
+    wake: Callable[[], None] = nothing
+
+
+def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends: Ends) -> PairSync:
+    """Joins the stages; gives the first of them for its counters."""
+    pair = PairSync(geometry.rig, config.pair)
+    frames = graph.source("read", source.open, wake=source.wake)
+    pairs = graph.stage("pair", pair, frames)
+    panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
+    depths = graph.stage("stereo", Stereo(geometry, config.stereo), panoramas)
+    odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
+    commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
+    spoken: list[Stream[Outgoing]] = [odometry, commands]
+    if ends.maps or ends.recorder or ends.bus:
+        maps = graph.stage("mapping", Mapping(config.mapping), odometry)
+        spoken.append(maps)
+        for name, file in ends.maps.items():
+            graph.sink(name, file, maps)
+    for name, sink in ends.poses.items():
+        graph.sink(name, sink, odometry)
+    if ends.recorder:
+        graph.sink("record", ends.recorder, *spoken)
+    if ends.bus:
+        graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
+    if ends.motor:
+        _drive(graph, ends.motor, commands, 1.0 / config.motor.rate_hz)
+    return pair
+
+
+def _drive(graph: Graph, motor: MotorTick, commands: Stream[VelocityCommand], period_s: float) -> None:
+    """The motor's deadline waits for nobody: it reads the newest command from a slot."""
+    graph.sink("commands", motor, commands)
+    graph.ticker("motor", period_s, motor)

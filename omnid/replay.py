@@ -1,0 +1,165 @@
+"""A run over a recorded log, from the opening of its files to the summary."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import cv2
+
+from calib.rig import Rig
+from calib.rig_file import parse_rig, read_rig, rig_toml
+from drivers.mcap_reader import LogReader
+from drivers.simulated_motor import SimulatedMotor
+from omnid.config import Config
+from omnid.errors import OmnidError
+from omnid.graph import LOSSLESS, NEWEST, Graph
+from omnid.outputs.bus import BusSink
+from omnid.outputs.encoded import Encoder
+from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs
+from omnid.outputs.motor import open_motor
+from omnid.outputs.progress import Progress
+from omnid.outputs.recorder import Recorder
+from omnid.outputs.summary import counters, summary
+from omnid.outputs.tally import Tally
+from omnid.pipeline import Ends, Frames, wire
+from omnid.realtime import Pace
+from omnid.settings import dump
+from omnid.stages.geometry import Geometry, geometry, with_rims
+from omnid.stages.pair import PairSync
+from omnid.transport.bus import Bus
+
+READER_DROPS = ("late", "duplicate", "broken", "broken_records")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What is wanted of a run."""
+
+    tum: Path | None = None
+    map: Path | None = None
+    plan: Path | None = None
+    record: Path | None = None
+    publish: bool = False
+    inline: bool = False
+    realtime: bool = False
+    quiet: bool = False
+
+    @property
+    def files(self) -> list[tuple[str, Path]]:
+        """The files that will be written, by option."""
+        named = (("--tum", self.tum), ("--map", self.map), ("--plan", self.plan), ("--record", self.record))
+        return [(name, path) for name, path in named if path is not None]
+
+
+class Replay:
+    """One run over one log."""
+
+    def __init__(self, log: Path, config: Config, options: Options) -> None:
+        self._log, self._config, self._options = log, config, options
+        self._graph = Graph(policy=NEWEST if options.realtime else LOSSLESS, threaded=not options.inline,
+                            depth=config.graph.depth)
+        self._tally = Tally()
+        self._twin: SimulatedMotor | None = None
+        self._signal = 0
+
+    def run(self, rig: Path | None, topics: tuple[str | None, str | None]) -> int:
+        """The exit code; prints warnings and the summary."""
+        check_outputs(self._options.files, self._log)
+        cv2.setNumThreads(self._config.graph.opencv_threads)
+        with ExitStack() as closing:
+            reader = LogReader(self._log, *topics, window=self._config.log.reorder_frames)
+            closing.callback(reader.close)
+            place = self._geometry(reader, rig)
+            ends = self._ends(place, closing)
+            pair = wire(self._graph, self._frames(reader), place, self._config, ends)
+            if ends.recorder:
+                ends.recorder.report = lambda: counters(self._tally, self._dropped(reader, pair))
+            self._show_progress(reader)
+            with self._stopped_by_signals():
+                self._graph.run()
+            self._conclude(reader, pair)
+        return 128 + self._signal if self._signal else 0
+
+    def _geometry(self, reader: LogReader, path: Path | None) -> Geometry:
+        rig = read_rig(path) if path else self._attached_rig(reader)
+        return geometry(with_rims(rig, reader.frames()), self._config.panorama)
+
+    def _attached_rig(self, reader: LogReader) -> Rig:
+        attached = reader.attachments().get("rig.toml")
+        if attached is None:
+            raise OmnidError(
+                f"{self._log}: no rig.toml is attached to the log: give one with --rig, made by `omnid calibrate "
+                "import camchain.yaml -o rig.toml`"
+            )
+        return parse_rig(attached, None, f"{self._log}: attached rig.toml")
+
+    def _frames(self, reader: LogReader) -> Frames:
+        if not self._options.realtime:
+            return Frames(reader.frames)
+        pace = Pace()
+        return Frames(lambda: pace.frames(reader.frames()), pace.wake)
+
+    def _ends(self, place: Geometry, closing: ExitStack) -> Ends:
+        """Opens all outputs: what cannot be opened is said now."""
+        options, config = self._options, self._config
+        encode = Encoder(place.rig.T_base_rig, config.record.cloud_points)
+        bus = motor = recorder = None
+        if options.publish:
+            bus = BusSink(opened := Bus(config.bus), encode)
+            closing.callback(opened.close)
+        if config.motor.port:
+            motor, self._twin = open_motor(config.motor, closing)
+        if options.record:
+            attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
+            recorder = Recorder(options.record, attachments, config.bus.robot, encode)
+        ends = Ends({"tally": self._tally}, {}, recorder, bus, motor)
+        if options.tum:
+            ends.poses["trajectory"] = TrajectoryFile(options.tum)
+        if options.map:
+            ends.maps["map"] = MapFile(options.map)
+        if options.plan:
+            ends.maps["plan"] = PlanFile(options.plan)
+        return ends
+
+    def _show_progress(self, reader: LogReader) -> None:
+        if not self._options.quiet:
+            progress = Progress(self._tally, reader.pair_estimate())
+            self._graph.ticker("progress", progress.period_s, progress)
+
+    def _conclude(self, reader: LogReader, pair: PairSync) -> None:
+        for warning in reader.warnings:
+            print(f"omnid: warning: {warning}", file=sys.stderr)
+        values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
+        if self._twin is not None:
+            values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
+        print(summary(values, self._graph.telemetry.summary()))
+
+    def _dropped(self, reader: LogReader, pair: PairSync) -> dict[str, int]:
+        """Everything that was lost on the way, by reason; zeros too."""
+        drops = {name: reader.counts[name] for name in READER_DROPS}
+        drops |= {name: count for name, count in pair.counts.items() if name.startswith("unpaired")}
+        drops["broken"] += pair.counts["broken"]
+        drops["queue"] = sum(stage.dropped for stage in self._graph.telemetry.stages if stage.name != "progress")
+        return drops
+
+    @contextmanager
+    def _stopped_by_signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM end the run whole; a second one ends it at once."""
+        before = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        again, self._signal = self._signal, number
+        self._graph.stop()
+        if again and self._options.inline:  # nothing else reaches a stage that this thread is stuck in
+            raise KeyboardInterrupt

@@ -1,0 +1,42 @@
+"""Mirror pictures to panoramas (Dang et al. 2012, section III.A)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.panorama import Maps, remap_tables, visible
+from omnid.config import PanoramaConfig
+from omnid.core.klt import Wrapped
+from omnid.messages import FramePair, Panoramas
+from omnid.stages.geometry import Geometry
+
+
+class Dewarp:
+    """Rectifies both pictures of a pair; the tables are made once."""
+
+    def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
+        self._pad_px = config.pad_px
+        rig, cylinder = geometry.rig, geometry.cylinder
+        self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
+        both = visible(rig.lower, self._lower, config.rim_margin_px)
+        both &= visible(rig.upper, self._upper, config.rim_margin_px)
+        self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
+        self._visible.setflags(write=False)
+
+    def process(self, pair: FramePair) -> Panoramas:
+        """The panoramas of a pair."""
+        lower, upper = self._wrapped(pair.lower, self._lower), self._wrapped(pair.upper, self._upper)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible)
+
+    def _wrapped(self, picture: NDArray[np.uint8], maps: Maps) -> Wrapped:
+        return Wrapped(np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), np.uint8), self._pad_px)
+
+
+def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
+    """The region (H, W) less a margin along its border and along the first and last rows."""
+    side = 2 * margin_px + 1
+    inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1) > 0
+    inner[: margin_px + 1], inner[len(inner) - margin_px - 1 :] = False, False
+    return np.ascontiguousarray(inner)

@@ -1,0 +1,65 @@
+"""The map of a whole run: points of all frames in one frame, fused in voxels (Dang et al. 2012, section IV.G)."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.config import MappingConfig
+from omnid.core.ego_motion import TRACKING
+from omnid.core.voxel_map import VoxelMap
+from omnid.messages import MapUpdate, Odometry
+
+Array = NDArray[np.float64]
+
+
+class Path:
+    """Where the rig was, in bounded memory: every second point is forgotten when it is full."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._step, self._seen = limit, 1, 0
+        self._points: list[tuple[float, float]] = []
+        self._last: tuple[float, float] | None = None
+
+    def add(self, x_m: float, y_m: float) -> None:
+        """Takes the next point."""
+        self._last = (x_m, y_m)
+        if self._seen % self._step == 0:
+            self._points.append(self._last)
+        self._seen += 1
+        if len(self._points) > self._limit:
+            self._points, self._step = self._points[::2], 2 * self._step
+
+    def xy(self) -> Array:
+        """The points (N, 2) kept, and the last one."""
+        ends = () if self._last is None else (self._last,)
+        return np.array(list(chain(self._points, ends)), float).reshape(-1, 2)
+
+
+class Mapping:
+    """Fuses the points that are certain enough, at poses that are; the map comes at the end."""
+
+    def __init__(self, config: MappingConfig) -> None:
+        self._config = config
+        self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
+        self._path = Path(config.path_poses)
+        self._newest: tuple[int, int] | None = None
+
+    def process(self, odometry: Odometry) -> None:
+        """Takes the points of a pair."""
+        self._newest = odometry.seq, odometry.stamp_ns
+        self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
+        if odometry.state == TRACKING:
+            depth = odometry.depth
+            sure = depth.variance_m2 < self._config.max_sigma_m**2
+            points = se3.apply(odometry.T_odom_rig, depth.points[sure])
+            self._map.insert(points, depth.variance_m2[sure], odometry.seq)
+
+    def finish(self) -> list[MapUpdate]:
+        """The whole map, if there was a pair at all."""
+        if self._newest is None:
+            return []
+        return [MapUpdate(*self._newest, self._map.points(self._config.min_frames), self._path.xy())]

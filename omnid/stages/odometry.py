@@ -1,0 +1,78 @@
+"""The rig's motion, from the rectified frame of the numerics to the rig's own."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.config import OdometryConfig
+from omnid.core.ego_motion import Ego, EgoMotion
+from omnid.core.sight import Sight
+from omnid.messages import Depth, Odometry
+from omnid.stages.geometry import Geometry
+
+Array = NDArray[np.float64]
+
+
+class Follower(Protocol):
+    """Whatever follows the rectified frame through sights."""
+
+    def process(self, sight: Sight, dt_s: float) -> Ego:
+        """The pose at a sight, dt_s after the one before (0 for the first)."""
+
+
+class OdometryStage:
+    """Poses in odom, which is the rig frame of the first pair."""
+
+    def __init__(self, geometry: Geometry, config: OdometryConfig) -> None:
+        self._follower = _follower(geometry, config)
+        self._T_rig_rect = geometry.T_rig_rect
+        self._to_rig = se3.adjoint(self._T_rig_rect)
+        self._last_ns: int | None = None
+
+    def process(self, depth: Depth) -> Odometry:
+        """The pose at a pair."""
+        dt_s = 0.0 if self._last_ns is None else (depth.stamp_ns - self._last_ns) * 1e-9
+        self._last_ns = depth.stamp_ns
+        seen = depth.panoramas
+        ego = self._follower.process(Sight(depth.seq, seen.lower, seen.upper, depth.disparity, seen.visible), dt_s)
+        T_odom_rig = self._T_rig_rect @ ego.T_odom_rect @ se3.inverse(self._T_rig_rect)
+        covariance = in_axes(T_odom_rig, self._in_rig(ego.covariance))
+        velocity = self._to_rig @ ego.velocity
+        return Odometry(depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity,
+                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.agreeing, ego.tracked, depth)
+
+    def _in_rig(self, covariance: Array) -> Array:
+        """Covariance (6, 6) of a small motion of the rectified frame, as one of the rig frame."""
+        return np.asarray(self._to_rig @ covariance @ self._to_rig.T)
+
+
+def in_axes(T_a_b: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) [t; r] of a pose T_a_b, given in the axes of b, in the axes of a."""
+    R = np.kron(np.eye(2), T_a_b[:3, :3])
+    return np.asarray(R @ covariance @ R.T)
+
+
+def of_base(odometry: Odometry, T_base_rig: Array) -> tuple[Array, Array, Array, Array]:
+    """What a base that carries the rig does: T_odom_base, its covariance in odom axes, velocity and its covariance.
+
+    odom is here the base's frame at the first pair; the velocity is in the base frame.
+    """
+    T_rig_base = se3.inverse(T_base_rig)
+    A = se3.adjoint(T_base_rig)
+    T_odom_base = T_base_rig @ odometry.T_odom_rig @ T_rig_base
+    of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
+    covariance = in_axes(T_odom_base, A @ of_rig @ A.T)
+    return T_odom_base, covariance, A @ odometry.velocity, A @ odometry.velocity_covariance @ A.T
+
+
+def _follower(geometry: Geometry, config: OdometryConfig) -> Follower:
+    model = geometry.model(config.noise_px)
+    if config.method == "default":
+        return EgoMotion(model, config.klt, config.limits)
+    from omnid.core.paper_motion import PaperMotion  # only whoever asks for it pays for it
+
+    return PaperMotion(model, config.klt, "klt" if config.tracker == "klt" else "improved")
