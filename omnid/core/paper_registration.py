@@ -1,4 +1,4 @@
-"""The motion between two clouds of the same points, 3-D to 3-D: RANSAC and Gauss-Newton of Dang et al. 2012, IV.B, C."""
+"""The motion between two clouds of the same points: RANSAC and Gauss-Newton of Dang et al. 2012, IV.B and IV.C."""
 
 from __future__ import annotations
 

@@ -1,0 +1,103 @@
+"""Small pictures for the tests of the core: random panoramas, and what a rendered rig sees of a corridor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
+from calib.rig import Rig
+from omnid.core.klt import Wrapped
+from omnid.core.motion import StereoModel
+from omnid.core.sight import Sight
+from omnid.core.stereo_matching import Matcher, Matching
+from tests.scenes import Exposure, Scene, Sensor, render_grey
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+PAD_PX = 48
+BORDER_PX = 8
+
+
+def texture(seed: int, shape: tuple[int, int] = (120, 480), sigma_px: float = 2.0) -> Image:
+    """A smooth random panorama (H, W) that goes on across its seam."""
+    noise = np.random.default_rng(seed).standard_normal(shape)
+    around = cv2.GaussianBlur(np.hstack([noise] * 3), (0, 0), sigma_px)[:, shape[1] : 2 * shape[1]]
+    return np.clip(128 + 45 * around / around.std(), 0, 255).astype(np.uint8)
+
+
+def wrapped(panorama: Image) -> Wrapped:
+    """The panorama with PAD_PX columns repeated on either side."""
+    return Wrapped(np.hstack([panorama[:, -PAD_PX:], panorama, panorama[:, :PAD_PX]]), PAD_PX)
+
+
+def turned(panorama: Image, columns: float) -> Image:
+    """The panorama moved right by that many columns, to sub-pixels, around the seam: what a turn to the left does."""
+    spectrum = np.fft.rfft(panorama.astype(float), axis=1)
+    phase = np.exp(-2j * np.pi * columns * np.arange(spectrum.shape[1]) / panorama.shape[1])
+    return np.clip(np.rint(np.fft.irfft(spectrum * phase, panorama.shape[1], axis=1)), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """A rig in a scene, and all that turns its pictures into sights; the rig stands at T_world_rig."""
+
+    rig: Rig
+    scene: Scene
+    cylinder: Cylinder
+    maps: tuple[Maps, Maps]
+    usable: Flags
+    exposures: tuple[Exposure, Exposure]
+    matcher: Matcher
+
+    @staticmethod
+    def of(rig: Rig, scene: Scene) -> Eyes:
+        """The eyes of a rig; no sensor fault but noise and blur."""
+        cylinder = fit_cylinder(rig)
+        maps = remap_tables(rig, rig.lower, cylinder, PAD_PX), remap_tables(rig, rig.upper, cylinder, PAD_PX)
+        seen = visible(rig.lower, maps[0], 2) & visible(rig.upper, maps[1], 2)
+        seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
+        sensors = [Exposure.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+        return Eyes(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
+                    Matcher(seen.shape, Matching(disparities=32)))
+
+    @property
+    def model(self) -> StereoModel:
+        """The stereo model of the panoramas."""
+        return StereoModel(self.cylinder, self.rig.baseline_m)
+
+    def sight(self, seq: int, T_world_rig: Array) -> Sight:
+        """What is seen from a pose."""
+        rng = np.random.default_rng([seq, 99])
+        mounted = (self.rig.lower, self.rig.upper)
+        pictures = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
+                    for e, m in zip(self.exposures, mounted, strict=True)]
+        return self._sight(seq, pictures[0], pictures[1])
+
+    def darkness(self, seq: int) -> Sight:
+        """What is seen with the light off."""
+        black = np.zeros(self.rig.lower.camera.size[::-1], np.uint8)
+        return self._sight(seq, black, black)
+
+    def _sight(self, seq: int, lower: Image, upper: Image) -> Sight:
+        panoramas = [np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), np.uint8)
+                     for picture, maps in zip((lower, upper), self.maps, strict=True)]
+        padded = np.zeros(panoramas[0].shape, bool)
+        padded[:, PAD_PX:-PAD_PX] = self.usable
+        pixels, found = self.matcher.match(panoramas[0], panoramas[1], padded)
+        disparity = np.full(padded.shape, np.nan, np.float32)
+        disparity.reshape(-1)[pixels] = found
+        inner = np.ascontiguousarray(disparity[:, PAD_PX:-PAD_PX])
+        return Sight(seq, Wrapped(panoramas[0], PAD_PX), Wrapped(panoramas[1], PAD_PX), inner, self.usable)
+
+
+def motion_errors(estimated: Array, truth: Array) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses (4, 4)."""
+    difference = se3.log(se3.inverse(truth) @ estimated)
+    return float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))

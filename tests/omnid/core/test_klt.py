@@ -1,0 +1,77 @@
+"""Tracking on panoramas that wrap around."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.klt import Klt, flow, track
+from tests.omnid.core.scenery import texture, turned, wrapped
+
+Array = NDArray[np.float64]
+
+KLT = Klt()
+
+
+def grid(width: int = 480, height: int = 120) -> Array:
+    """Points (N, 2) all around, the seam included."""
+    columns, rows = np.meshgrid(np.arange(0, width, 12.0), np.arange(24, height - 20, 16.0))
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def column_error(found: Array, expected: Array, width: int = 480) -> Array:
+    return np.asarray((found[:, 0] - expected[:, 0] + width / 2) % width - width / 2)
+
+
+@pytest.mark.parametrize("columns", [0.0, 0.4, -3.3, 7.25])
+def test_a_shift_is_found_to_a_twentieth_of_a_pixel_also_across_the_seam(columns: float) -> None:
+    before, points = texture(1), grid()
+    there, found = track(wrapped(before), wrapped(turned(before, columns)), points, points, KLT)
+    assert found.mean() > 0.99
+    error = column_error(there[found], points[found] + (columns, 0))
+    assert np.median(np.abs(error)) < 0.02 and np.abs(error).max() < 0.05
+    assert np.abs(there[found, 1] - points[found, 1]).max() < 0.05
+    assert (there[:, 0] >= 0).all() and (there[:, 0] < 480).all()
+
+
+def test_a_guess_leads_to_what_is_out_of_reach() -> None:
+    before, points = texture(2), grid()
+    after = turned(before, 171)
+    there, found = track(wrapped(before), wrapped(after), points, points + (170.0, 0), KLT)
+    assert found.mean() > 0.98
+    assert np.abs(column_error(there[found], points[found] + (171, 0))).max() < 0.05
+    _, found = track(wrapped(before), wrapped(after), points, points, KLT)
+    assert found.mean() < 0.2
+
+
+def test_any_turn_of_the_guess_is_the_same_place() -> None:
+    before, points = texture(3), grid()
+    there, found = track(wrapped(before), wrapped(before), points, points + (-960.0, 0), KLT)
+    assert found.mean() > 0.99
+    assert np.abs(column_error(there[found], points[found])).max() < 0.05
+
+
+def test_what_is_gone_is_called_gone_though_lucas_and_kanade_report_it() -> None:
+    before, points = texture(4), grid()
+    after = before.copy()
+    after[:, 200:280] = texture(5)[:, 200:280]
+    inside = (points[:, 0] > 212) & (points[:, 0] < 268)
+    _, reported = flow(wrapped(before), wrapped(after), points, points, KLT)
+    _, found = track(wrapped(before), wrapped(after), points, points, KLT)
+    assert reported[inside].mean() > 0.8
+    assert found[inside].mean() < 0.2
+    assert found[(points[:, 0] < 180) | (points[:, 0] > 300)].mean() > 0.98
+
+
+def test_a_blank_picture_gives_no_tracks_and_no_points_none() -> None:
+    blank, points = wrapped(np.full((120, 480), 90, np.uint8)), grid()
+    assert not track(wrapped(texture(6)), blank, points, points, KLT)[1].any()
+    there, found = track(blank, blank, np.zeros((0, 2)), np.zeros((0, 2)), KLT)
+    assert there.shape == (0, 2) and found.shape == (0,)
+
+
+def test_the_panorama_is_what_was_padded() -> None:
+    picture = texture(7)
+    np.testing.assert_array_equal(wrapped(picture).panorama, picture)
+    assert wrapped(picture).width == 480

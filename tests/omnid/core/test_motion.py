@@ -1,0 +1,146 @@
+"""Motions from landmarks and views: the closed form, RANSAC with liars, Gauss-Newton and its covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.motion import StereoModel, gauss_newton, ransac, rigid_fit, whitening
+from omnid.core.triangulation import point_covariance, view
+from tests.omnid.core.scenery import motion_errors
+
+Array = NDArray[np.float64]
+
+MODEL = StereoModel(Cylinder(1304, 383, 128.5), 0.2, sigma_px=0.2)
+MOTION = se3.exp([0.08, -0.05, 0.02, 0.01, -0.02, 0.9])  # T_curr_ref
+
+
+def landmarks(count: int, seed: int = 0) -> Array:
+    """Points (N, 3) [m] on all sides."""
+    rng = np.random.default_rng(seed)
+    azimuth, r = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.8, 3, count)
+    return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), rng.uniform(-1, 1, count)])
+
+
+def views_of(points: Array, T: Array = MOTION) -> Array:
+    """Their exact views (N, 3) after the motion."""
+    return view(se3.apply(T, points), MODEL.cylinder, MODEL.baseline_m)
+
+
+def certain(count: int) -> Array:
+    """Covariances (N, 3, 3) of landmarks known exactly."""
+    return np.zeros((count, 3, 3))
+
+
+def test_a_rigid_fit_is_exact_also_for_many_at_once() -> None:
+    points = landmarks(15).reshape(5, 3, 3)
+    motions = se3.exp(np.random.default_rng(1).normal(0, 1, (5, 6)))
+    np.testing.assert_allclose(rigid_fit(points, se3.apply(motions, points)), motions, atol=1e-9)
+
+
+def test_a_rigid_fit_never_reflects() -> None:
+    points = landmarks(8)
+    for b in (points * (1, 1, -1), points * (-1, -1, -1)):
+        assert np.linalg.det(rigid_fit(points, b)[:3, :3]) == pytest.approx(1)
+    flat = points[:3] - points[:3].mean(axis=0)
+    assert np.linalg.det(rigid_fit(flat, se3.apply(MOTION, flat))[:3, :3]) == pytest.approx(1)
+
+
+def test_residuals_wrap_at_the_seam_and_keep_the_unknown() -> None:
+    behind = np.array([[-2.0, 0.001, 0.1], [-2.0, 0.001, 0.1]])
+    views = np.array([[0.0, 0, 0], [1303.5, 0, np.nan]])
+    error = MODEL.residual(behind, views)
+    assert (np.abs(error[:, 0]) < 2).all()
+    assert np.isnan(error[1, 2]) and np.isfinite(error[0]).all()
+
+
+def test_ransac_finds_the_motion_among_liars() -> None:
+    points = landmarks(200)
+    views = views_of(points) + np.random.default_rng(2).normal(0, 0.1, (200, 3))
+    liars = np.arange(200) % 5 < 3
+    views[liars] = views_of(landmarks(120, 5), np.eye(4))
+    T, agree = ransac(points, views, MODEL, np.random.default_rng(3))
+    assert not agree[liars].sum() > 3
+    assert agree[~liars].sum() > 70
+    distance, angle = motion_errors(T, MOTION)
+    assert distance < 0.03 and angle < 0.02
+
+
+def test_ransac_takes_no_hypothesis_from_lower_views_but_lets_them_vote() -> None:
+    points = landmarks(40)
+    views = views_of(points)
+    views[6:, 2] = np.nan
+    T, agree = ransac(points, views, MODEL, np.random.default_rng(0))
+    assert agree.all()
+    np.testing.assert_allclose(T, MOTION, atol=1e-6)
+    views[2:, 2] = np.nan
+    assert not ransac(points, views, MODEL, np.random.default_rng(0))[1].any()
+
+
+def test_gauss_newton_is_exact_without_noise() -> None:
+    points = landmarks(60)
+    start = MOTION @ se3.exp([0.03, 0.02, -0.03, 0.02, 0.01, 0.03])
+    estimate = gauss_newton(points, certain(60), views_of(points), start, MODEL)
+    np.testing.assert_allclose(estimate.T, MOTION, atol=1e-8)
+    assert estimate.squared.max() < 1e-8
+
+
+def test_gauss_newton_manages_with_a_row_missing() -> None:
+    points, views = landmarks(60), views_of(landmarks(60))
+    views[::2, 2] = np.nan
+    estimate = gauss_newton(points, certain(60), views, MOTION @ se3.exp(np.full(6, 0.01)), MODEL)
+    np.testing.assert_allclose(estimate.T, MOTION, atol=1e-8)
+    both = gauss_newton(points, certain(60), views_of(points), MOTION, MODEL)
+    assert np.trace(estimate.covariance) > np.trace(both.covariance)
+
+
+def test_a_few_wrong_landmarks_hardly_matter() -> None:
+    points, views = landmarks(80), views_of(landmarks(80))
+    views[:8] += 60
+    estimate = gauss_newton(points, certain(80), views, MOTION @ se3.exp(np.full(6, 0.005)), MODEL)
+    distance, angle = motion_errors(estimate.T, MOTION)
+    assert distance < 2e-3 and angle < 1e-3
+    assert estimate.squared[:8].min() > 1e3 > estimate.squared[8:].max()
+
+
+def test_landmarks_with_a_large_covariance_say_less() -> None:
+    points, views = landmarks(60), views_of(landmarks(60))
+    wrong = points.copy()
+    wrong[::2] += (0.01, 0, 0)
+    covariance = certain(60)
+    even = motion_errors(gauss_newton(wrong, covariance, views, MOTION, MODEL).T, MOTION)[0]
+    covariance[::2] = 0.1**2 * np.eye(3)
+    assert motion_errors(gauss_newton(wrong, covariance, views, MOTION, MODEL).T, MOTION)[0] < even / 10
+
+
+def test_whitened_errors_have_deviation_one() -> None:
+    points, rng = landmarks(4000), np.random.default_rng(6)
+    covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
+    noisy = points + (np.linalg.cholesky(covariance) @ rng.standard_normal((4000, 3, 1)))[:, :, 0]
+    views = views_of(points) + MODEL.sigma_px * rng.standard_normal((4000, 3))
+    views[::4, 2] = np.nan
+    W = whitening(points, covariance, views, MOTION, MODEL)
+    error = np.nan_to_num(MODEL.residual(se3.apply(MOTION, noisy), views))
+    white = (W @ error[:, :, None])[:, :, 0]
+    both, lower_only = np.delete(white, slice(None, None, 4), axis=0), white[::4]
+    np.testing.assert_allclose(both.T @ both / len(both), np.eye(3), atol=0.1)
+    np.testing.assert_allclose(lower_only.T @ lower_only / len(lower_only), np.diag([1, 1, 0]), atol=0.15)
+
+
+def test_the_covariance_is_what_noise_scatters() -> None:
+    """Every direction of the six, landmarks and views both noisy, within 30 % in deviation."""
+    points, rng = landmarks(60), np.random.default_rng(7)
+    covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
+    roots, errors, said = np.linalg.cholesky(covariance), [], []
+    for _ in range(300):
+        noisy = points + (roots @ rng.standard_normal((60, 3, 1)))[:, :, 0]
+        views = views_of(points) + MODEL.sigma_px * rng.standard_normal((60, 3))
+        estimate = gauss_newton(noisy, covariance, views, MOTION, MODEL)
+        errors.append(se3.log(estimate.T @ se3.inverse(MOTION)))
+        said.append(estimate.covariance)
+    W = np.linalg.inv(np.linalg.cholesky(np.mean(said, axis=0)))
+    spread = np.sqrt(np.linalg.eigvalsh(W @ np.cov(np.array(errors).T) @ W.T))
+    assert spread.min() > 0.7 and spread.max() < 1.3
