@@ -13,6 +13,7 @@ from omnid.core.stereo_matching import METHODS, Matching
 from omnid.settings import Knob, knob
 from omnid.transport.bus import BusConfig
 
+
 @dataclass(frozen=True, slots=True)
 class LogConfig:
     """How a log is read."""

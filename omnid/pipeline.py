@@ -54,7 +54,7 @@ def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends:
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
     spoken: list[Stream[Outgoing]] = [odometry, commands]
     if ends.maps or ends.recorder or ends.bus:
-        maps = graph.stage("mapping", Mapping(config.mapping), odometry)
+        maps: Stream[MapUpdate] = graph.stage("mapping", Mapping(config.mapping), odometry)
         spoken.append(maps)
         for name, file in ends.maps.items():
             graph.sink(name, file, maps)

@@ -46,6 +46,7 @@ class Options:
     plan: Path | None = None
     record: Path | None = None
     publish: bool = False
+    bus_optional: bool = False  # without a bus, go on without
     inline: bool = False
     realtime: bool = False
     quiet: bool = False
@@ -109,10 +110,8 @@ class Replay:
         """Opens all outputs: what cannot be opened is said now."""
         options, config = self._options, self._config
         encode = Encoder(place.rig.T_base_rig, config.record.cloud_points)
-        bus = motor = recorder = None
-        if options.publish:
-            bus = BusSink(opened := Bus(config.bus), encode)
-            closing.callback(opened.close)
+        motor = recorder = None
+        bus = self._bus(encode, closing) if options.publish else None
         if config.motor.port:
             motor, self._twin = open_motor(config.motor, closing)
         if options.record:
@@ -126,6 +125,17 @@ class Replay:
         if options.plan:
             ends.maps["plan"] = PlanFile(options.plan)
         return ends
+
+    def _bus(self, encode: Encoder, closing: ExitStack) -> BusSink | None:
+        try:
+            bus = Bus(self._config.bus)
+        except OmnidError as error:
+            if not self._options.bus_optional:
+                raise
+            print(f"omnid: warning: going on without a bus: {error}", file=sys.stderr)
+            return None
+        closing.callback(bus.close)
+        return BusSink(bus, encode)
 
     def _show_progress(self, reader: LogReader) -> None:
         if not self._options.quiet:

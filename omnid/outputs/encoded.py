@@ -46,8 +46,9 @@ class Encoder:
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
         stamp_ns = odometry.stamp_ns
-        T_odom_base, *uncertain_motion = of_base(odometry, self._T_base_rig)
-        yield Encoded("odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T_odom_base, *uncertain_motion))
+        T_odom_base, covariance, *velocity = of_base(odometry, self._T_base_rig)
+        pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
+        yield Encoded("odom", codec.ODOMETRY_SCHEMA, pose)
         yield Encoded("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
         edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
                  codec.FrameTransform("base_link", "rig", self._T_base_rig)]

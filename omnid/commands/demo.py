@@ -1,0 +1,49 @@
+"""`omnid demo`: the sample log of the package in real time, with everything on, and how far it is from the truth."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from omnid.commands.config import add_settings
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `demo` to the command line."""
+    parser = subparsers.add_parser("demo", help="replay a sample in real time: files, bus and a simulated motor")
+    parser.add_argument("--output", type=Path, default=Path("omnid-demo"), metavar="FOLDER", help="where files go")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replays the sample and prints its errors."""
+    from omnid.config import Config
+    from omnid.core.evaluation import evaluate, format_metrics
+    from omnid.core.trajectory import read_tum
+    from omnid.replay import Options, Replay
+    from omnid.settings import load
+
+    _make(args.output)
+    tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
+    options = Options(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
+                      bus_optional=True, realtime=True, quiet=args.quiet)
+    config = load(Config, args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
+    sample = files("omnid.sample")
+    with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
+        code = Replay(log, config, options).run(rig=None, topics=(None, None))
+        if code == 0:
+            print(f"\nagainst the truth:\n{format_metrics(evaluate(read_tum(tum), read_tum(truth)))}")
+    print(f"\nfiles: {', '.join(str(path) for _, path in options.files)}")
+    return code
+
+
+def _make(folder: Path) -> None:
+    from omnid.errors import OmnidError
+
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another") from error
