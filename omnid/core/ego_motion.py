@@ -36,6 +36,7 @@ class Limits:
 
     features: int = 500
     refresh: float = 0.7  # share of the most landmarks since the last keyframe, below which one is added
+    sparse_every: int = 5  # sights after which a keyframe is added where the features wanted are not reached
     keyframes: int = 5
     min_inliers: int = 20
     min_share: float = 0.4
@@ -77,30 +78,31 @@ class EgoMotion:
         self._refused = self._strange = self._resets = 0
         self._blind_s = 0.0
         self._most_agreeing = 0  # landmarks, since the last keyframe: what this place can give
+        self._since_keyframe = 0
 
     def process(self, sight: Sight, dt_s: float) -> Ego:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
         usable = self._pattern.without(sight.usable)
-        if not len(self._map):
+        if self._previous is None:
             return self._begin(sight, usable)
         expected = self._T @ self._filter.predict(dt_s)
-        fit = self._locate(sight, usable, expected, dt_s)
+        fit = self._locate(sight, usable, expected, dt_s) if self._worth_a_look(sight, usable) else None
         return self._refuse(sight, usable, expected, dt_s) if fit is None else self._accept(sight, usable, fit, dt_s)
 
     def _begin(self, sight: Sight, usable: Flags) -> Ego:
         """Starts, or starts again, a map at the present pose if the sight has enough corners."""
         self._add_keyframe(sight, usable, np.zeros((0, 2)))
-        enough = len(self._map) >= self._limits.min_inliers
-        if not enough:
+        if len(self._map) < self._limits.min_inliers:
             self._map.clear()
+            return self._ego(LOST, 0, 0)
         self._previous, self._refused, self._strange, self._blind_s = sight.lower, 0, 0, 0.0
-        return self._ego(TRACKING if enough else LOST, 0, len(self._map))
+        return self._ego(TRACKING, len(self._map), len(self._map))
 
     def _locate(self, sight: Sight, usable: Flags, expected: Array, dt_s: float) -> Fit | None:
         """The best supported pose of all guesses: as expected; in doubt, after a turn; once refused, at a keyframe."""
         fit = self._search.from_guess(sight, expected)
-        if not self._convincing(fit) and self._previous is not None:
-            guess = self._search.best_turn(sight, self._previous, self._T, usable)
+        if not self._convincing(fit):
+            guess = self._search.best_turn(sight, self._previous, (self._T, expected), usable)
             fit = _better(fit, self._search.from_guess(sight, guess))
         if self._refused and not self._believable(fit, dt_s):
             fit = self._relocaliser.locate(sight)
@@ -151,10 +153,15 @@ class EgoMotion:
     def _restart(self, sight: Sight, usable: Flags) -> Ego:
         """A new map from here on: the gap stays in the covariance, and the reset counter says so."""
         self._map.clear()
+        self._previous = None
         self._relocaliser.forget()
         self._filter.reset()
         self._resets += 1
         return self._begin(sight, usable)
+
+    def _worth_a_look(self, sight: Sight, usable: Flags) -> bool:
+        """False in the dark: once a pose was refused, a picture without corners is not searched again."""
+        return self._refused == 0 or self._is_textured(sight, usable)
 
     def _is_textured(self, sight: Sight, usable: Flags) -> bool:
         return len(corners(sight.lower, usable, 4 * self._limits.min_inliers)) >= 2 * self._limits.min_inliers
@@ -162,8 +169,11 @@ class EgoMotion:
     def _refresh_map(self, sight: Sight, usable: Flags, fit: Fit) -> None:
         """Forgets landmarks that stay away, and adds a keyframe where too few are left."""
         self._map.keep(fit.landmarks)
-        self._most_agreeing = max(self._most_agreeing, fit.agreeing)
-        if fit.agreeing < self._limits.refresh * self._most_agreeing:
+        agreeing, limits = len(fit.landmarks), self._limits
+        self._most_agreeing = max(self._most_agreeing, agreeing)
+        self._since_keyframe += 1
+        sparse = agreeing < limits.refresh * limits.features and self._since_keyframe >= limits.sparse_every
+        if sparse or agreeing < limits.refresh * self._most_agreeing or agreeing < limits.sure_inliers:
             self._add_keyframe(sight, usable, fit.pixels)
 
     def _add_keyframe(self, sight: Sight, usable: Flags, known: Array) -> None:
@@ -177,7 +187,7 @@ class EgoMotion:
         slopes = disparity_slopes(sight.disparity, points[located], (rows - points[:, 1])[located])
         self._map.add(keyframe, np.column_stack([points, rows])[located], slopes)
         self._relocaliser.remember(sight, self._T)
-        self._most_agreeing = 0
+        self._most_agreeing = self._since_keyframe = 0
 
     def _inherited(self, fit: Fit) -> Array:
         """Covariance (6, 6) that comes with the keyframes in which the agreeing landmarks are anchored."""

@@ -1,10 +1,12 @@
 """What turns with the camera: struts, hub, rim, the robot itself. It must never count as a feature.
 
-A pixel that keeps its grey level while the view around it has moved by many pixels, again and again, belongs to the
-rig and not to the world.
+Structure that keeps its place in the panorama while everything about it should have moved by many pixels, again and
+again, belongs to the rig and not to the world.
 """
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
@@ -16,13 +18,18 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
+LEAST_FLOW_RAD = 0.04  # what must have moved less than this says nothing
+USUAL_RANGE_M = 3.0  # at which a shift is turned into an angle
+SAME_LEVEL = 6  # grey levels
+CONTRAST = 25  # grey levels within REACH_PX, without which there is no structure to hold its place
+REACH_PX = 4  # at half resolution
+EVIDENCE = 5  # comparisons running
+
 
 class FixedPattern:
-    """Learns, at half resolution, which pixels stay the same while the robot moves."""
+    """Learns, at half resolution, where structure stays the same while the robot moves."""
 
-    def __init__(self, least_motion: float = 0.08, same_level: int = 6, evidence: int = 6, margin_px: int = 9) -> None:
-        self._least_motion, self._same_level = least_motion, same_level
-        self._evidence, self._margin_px = evidence, margin_px
+    def __init__(self) -> None:
         self._reference: tuple[Image, Array] | None = None
         self._streak: NDArray[np.uint8] | None = None
         self._blocked: Flags | None = None
@@ -31,23 +38,36 @@ class FixedPattern:
         """Takes the panorama (H, W) at a trusted pose; compares it once the view has moved since the last time."""
         if self._reference is None:
             self._reference = (_half(panorama), T_odom_rect)
-        elif _motion(se3.inverse(self._reference[1]) @ T_odom_rect) > self._least_motion:
-            self._compare(_half(panorama), panorama.shape)
-            self._reference = (_half(panorama), T_odom_rect)
+            return
+        flow = expected_flow(se3.inverse(self._reference[1]) @ T_odom_rect, self._reference[0].shape[1])
+        if np.mean(flow > LEAST_FLOW_RAD) > 0.5:
+            half = _half(panorama)
+            self._compare(half, flow > LEAST_FLOW_RAD, panorama.shape)
+            self._reference = (half, T_odom_rect)
 
     def without(self, usable: Flags) -> Flags:
         """usable (H, W) less what is known to be fixed, and a margin about it."""
         return usable if self._blocked is None else usable & ~self._blocked
 
-    def _compare(self, half: Image, shape: tuple[int, ...]) -> None:
+    def _compare(self, half: Image, moving: Flags, shape: tuple[int, ...]) -> None:
+        """Counts one comparison; columns (W/2,) that should not have moved keep what is known of them."""
         assert self._reference is not None
-        same = cv2.absdiff(half, self._reference[0]) <= self._same_level
+        before = self._reference[0]
+        same = (cv2.absdiff(half, before) <= SAME_LEVEL) & _structured(half) & _structured(before)
         streak = np.zeros(half.shape, np.uint8) if self._streak is None else self._streak
-        # One change halves the evidence: a plain wall loses it as soon as something else comes into view.
-        self._streak = np.where(same, np.minimum(streak + 1, 4 * self._evidence), streak // 2).astype(np.uint8)
-        fixed = cv2.resize((self._streak >= self._evidence).astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
-        side = 2 * self._margin_px + 1
-        self._blocked = cv2.dilate(fixed, np.ones((side, side), np.uint8)) > 0
+        # One change halves the evidence: the world loses it as soon as something else comes into view.
+        counted = np.where(same, np.minimum(streak + 1, 4 * EVIDENCE), streak // 2).astype(np.uint8)
+        self._streak = np.where(moving, counted, streak)
+        fixed = cv2.resize((self._streak >= EVIDENCE).astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
+        self._blocked = cv2.dilate(fixed, np.ones((4 * REACH_PX + 1, 4 * REACH_PX + 1), np.uint8)) > 0
+
+
+def expected_flow(T_before_after: Array, columns: int) -> Array:
+    """About how far [rad] each of `columns` of a panorama should have moved: by the turn, and by the shift across it."""
+    twist = se3.log(T_before_after)
+    azimuth = math.pi - (np.arange(columns) + 0.5) * 2 * math.pi / columns
+    across = np.abs(twist[1] * np.cos(azimuth) - twist[0] * np.sin(azimuth))
+    return np.asarray(abs(twist[5]) + across / USUAL_RANGE_M)
 
 
 def _half(panorama: Image) -> Image:
@@ -55,7 +75,7 @@ def _half(panorama: Image) -> Image:
     return np.asarray(cv2.resize(panorama, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _motion(T: Array) -> float:
-    """About how far [rad] the view has moved: the turn, and the shift as seen two metres away."""
-    twist = se3.log(T)
-    return float(np.linalg.norm(twist[3:]) + np.linalg.norm(twist[:3]) / 2)
+def _structured(half: Image) -> Flags:
+    """Where there is contrast close by."""
+    around = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
+    return np.asarray(cv2.morphologyEx(half, cv2.MORPH_GRADIENT, around) > CONTRAST)

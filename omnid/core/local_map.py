@@ -77,16 +77,18 @@ class LocalMap:
         self._misses = np.concatenate([self._misses, np.zeros(len(points), np.intp)])
         self._forget_oldest()
 
-    def track(self, lower: Wrapped, T_odom_rect: Array, sample: int = 0) -> Tracks:
+    def track(self, lower: Wrapped, T_odom_rect: Array, most: int | None = None) -> Tracks:
         """Looks for the landmarks in a panorama, from where a guessed pose predicts them.
 
-        sample > 0: only about so many, evenly chosen, to compare guesses.
+        most: only about so many, of the keyframe that anchors most, to compare guesses cheaply.
         """
         predicted = view(se3.apply(se3.inverse(T_odom_rect), self.points), self._model.cylinder, self._model.baseline_m)
         height = self._model.cylinder.height
         visible = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < height - 1 - EDGE_ROWS))
-        if sample:
-            visible = visible[:: max(1, len(visible) // sample)]
+        if most is not None and len(visible):
+            anchors, counts = np.unique(self.anchor[visible], return_counts=True)
+            visible = visible[self.anchor[visible] == anchors[counts.argmax()]]
+            visible = visible[:: -(-len(visible) // most)]
         pixels, found = np.empty((len(visible), 2)), np.zeros(len(visible), bool)
         for seq, keyframe in self.keyframes.items():
             at = np.flatnonzero(self.anchor[visible] == seq)

@@ -84,7 +84,7 @@ class Estimate:
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 steps: int = 8) -> Estimate:
+                 steps: int = 6) -> Estimate:
     """The motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Geman-McClure-like Cauchy kernel,
@@ -97,7 +97,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
         H, g, _ = _normal_equations(landmarks, clean, T, W, model)
         step = np.linalg.solve(H, g)
         T = se3.exp(step) @ T
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-6:
             break
     H, _, squared = _normal_equations(landmarks, clean, T, W, model)
     return Estimate(T, np.linalg.inv(H), squared)

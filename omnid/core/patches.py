@@ -27,7 +27,7 @@ CELLS_A_ROW = 32
 HALF_PX = 4.0  # half the base over which the warp is taken
 
 
-def disparity_slopes(disparity: NDArray[np.float32], points: Array, centre: Array, reach_px: int = 8) -> Array:
+def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: int = 8) -> Array:
     """Slopes (N, 2) of the disparity [px/px] along column and row about points (N, 2) with disparity centre (N,).
 
     A plane through the centre, by least squares with a pull to zero (an upright surface facing the camera); neighbours
@@ -66,7 +66,7 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     return np.where(sane[:, None, None], warps, np.eye(2))
 
 
-def align(templates: Floats, current: Wrapped, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+def align(templates: Image, current: Wrapped, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Where patches (N, CELL, CELL), centred on predicted (N, 2), really are, and which of them moved little enough."""
     cells = _cut(current, np.rint(predicted))
     centres = _centres(len(predicted))
@@ -79,16 +79,15 @@ def align(templates: Floats, current: Wrapped, predicted: Array) -> tuple[Array,
     return predicted + shift, close
 
 
-def warped_templates(keyframe: Wrapped, pixels: Array, warps: Array, predicted: Array) -> NDArray[np.uint8]:
+def warped_templates(keyframe: Wrapped, pixels: Array, warps: Array, predicted: Array) -> Image:
     """Patches (N, CELL, CELL) uint8 of a keyframe about pixels (N, 2), as seen about predicted (N, 2) after warps."""
     offsets = _cell_offsets() + (np.rint(predicted) - predicted)[:, None]
-    positions = pixels[:, None] + offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2)
-    return _sample(keyframe, positions)
+    return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2))
 
 
-def _cut(image: Wrapped, centres: Array) -> NDArray[np.uint8]:
+def _cut(image: Wrapped, centres: Array) -> Image:
     """Patches (N, CELL, CELL) about whole pixels (N, 2)."""
-    return _sample(image, centres[:, None] + _cell_offsets())
+    return _sample(image, centres, _cell_offsets()[None])
 
 
 def _cell_offsets() -> Array:
@@ -97,16 +96,15 @@ def _cell_offsets() -> Array:
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(float)
 
 
-def _sample(image: Wrapped, positions: Array) -> NDArray[np.uint8]:
-    """Patches (N, CELL, CELL) at positions (N, CELL * CELL, 2) of the panorama, across the seam if need be."""
-    centre = positions.mean(axis=1, keepdims=True)[:, :, 0]
-    columns = positions[..., 0] - np.floor(centre / image.width) * image.width + image.pad_px
-    maps = np.stack([columns, positions[..., 1]], axis=-1).astype(np.float32)
-    patches = cv2.remap(image.image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _sample(image: Wrapped, centres: Array, offsets: Array) -> Image:
+    """Patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), across the seam if need be."""
+    padded = np.column_stack([centres[:, 0] % image.width + image.pad_px, centres[:, 1]]).astype(np.float32)
+    positions = padded[:, None] + offsets.astype(np.float32)
+    patches = cv2.remap(image.image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
 
 
-def _atlas(patches: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _atlas(patches: Image) -> Image:
     """Patches laid out in rows of CELLS_A_ROW, one picture."""
     rows = -(-len(patches) // CELLS_A_ROW)
     filled = np.zeros((rows * CELLS_A_ROW, CELL_PX, CELL_PX), np.uint8)

@@ -1,4 +1,4 @@
-"""From a guess to a pose: tracks, RANSAC, Gauss-Newton; and where to get guesses from."""
+"""From a guess to a pose: tracks, RANSAC, Gauss-Newton, aligned patches; and where to get guesses from."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from omnid.core.features import rows_in_upper
 from omnid.core.fit import Fit
 from omnid.core.klt import Klt, Wrapped
 from omnid.core.local_map import LocalMap, Tracks
-from omnid.core.motion import StereoModel, gauss_newton, ransac
+from omnid.core.motion import Estimate, StereoModel, gauss_newton, ransac
 from omnid.core.sight import Sight
 from omnid.core.yaw import correlation_peaks, steps
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 LEAST = 6  # landmarks, below which six unknowns are no estimate
 OUTLIER = 16.0  # squared deviations
 SAMPLE = 150  # landmarks that decide between turns
+ENOUGH = 0.5  # share of them, tracked, that ends the search
 
 
 class PoseSearch:
@@ -40,18 +42,29 @@ class PoseSearch:
         T_guess_odom = se3.inverse(guess)
         in_guess = se3.apply(T_guess_odom, self._map.points[tracks.index])
         T_curr_guess, agree = ransac(in_guess, views, self._model, np.random.default_rng(sight.seq))
-        T_curr_odom, agree = self._refine(tracks, views, agree, T_curr_guess @ T_guess_odom)
-        return self._polish(sight, tracks, views, agree, T_curr_odom)
+        coarse, kept = self._solve(tracks.index[agree], views[agree], T_curr_guess @ T_guess_odom, 1)
+        if coarse is None:
+            return None
+        return self._polish(sight, tracks, (tracks.index[agree][kept], views[agree][kept]), coarse.T)
 
-    def best_turn(self, sight: Sight, previous: Wrapped, T_odom_previous: Array, usable: Flags) -> Array:
-        """The pose guess with the most forward-backward tracks among turns of the previous pose.
+    def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
+        """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.
 
-        The turns are the peaks of the circular correlation and the paper's steps (Dang et al. 2012, section IV.F).
+        guess: the previous pose, and the expected one, whose position is kept. The turns are the peaks of the circular
+        correlation, and where none of these will do the paper's steps (Dang et al. 2012, section IV.F).
         """
-        turns = correlation_peaks(previous.panorama, sight.lower.panorama, usable) + steps()
-        guesses = [T_odom_previous @ se3.exp([0, 0, 0, 0, 0, turn]) for turn in turns]
-        found = [len(self._map.track(sight.lower, guess, sample=SAMPLE).index) for guess in guesses]
-        return guesses[int(np.argmax(found))]
+        T_odom_previous, expected = guess
+        best, most = expected, -1.0
+        for turn in correlation_peaks(previous.panorama, sight.lower.panorama, usable) + steps():
+            turned = T_odom_previous @ se3.exp([0, 0, 0, 0, 0, turn])
+            turned[:3, 3] = expected[:3, 3]
+            tracks = self._map.track(sight.lower, turned, most=SAMPLE)
+            share = len(tracks.index) / max(1, tracks.visible)
+            if share > most:
+                best, most = turned, share
+            if most > ENOUGH:
+                break
+        return best
 
     def _views(self, sight: Sight, tracks: Tracks) -> Array:
         """Views (M, 3): tracked pixels and, where the upper panorama confirms them, the rows there."""
@@ -59,34 +72,34 @@ class PoseSearch:
         found = rows_in_upper((sight.lower, sight.upper), tracks.pixels, rows, self._stereo_klt)
         return np.column_stack([tracks.pixels, found])
 
-    def _polish(self, sight: Sight, tracks: Tracks, views: Array, agree: Flags, T_curr_odom: Array) -> Fit | None:
-        """The pose from the same landmarks once their patches, warped as the coarse pose predicts, are aligned."""
-        if agree.sum() < LEAST: return None
-        index=tracks.index[agree]
-        pixels, fitted = self._map.align(sight.lower, se3.inverse(T_curr_odom), index)
-        v=views[agree].copy()
-        # the upper row goes along: the disparity was measured between two panoramas of one instant
-        v[:,2] += pixels[:,1]-v[:,1]
-        v[:,:2] = pixels
-        index, v = index[fitted], v[fitted]
-        for _ in range(2):
-            if len(index) < LEAST: return None
-            estimate = gauss_newton(self._map.points[index], self._map.covariance[index], v, T_curr_odom, self._model)
-            T_curr_odom = estimate.T
-            good = estimate.squared < OUTLIER
-            index, v, squared = index[good], v[good], estimate.squared[good]
-        scale = max(1.0, float(squared.mean()) / 3)
-        self.debug=squared.mean()/3
-        return Fit(se3.inverse(T_curr_odom), scale * estimate.covariance, tracks.visible, len(tracks.index),
-                   len(index), index, v[:, :2])
-
-    def _refine(self, tracks: Tracks, views: Array, agree: Flags, T_curr_odom: Array):
-        for _ in range(2):
-            if agree.sum() < LEAST:
-                return T_curr_odom, agree
-            index = tracks.index[agree]
-            estimate = gauss_newton(self._map.points[index], self._map.covariance[index], views[agree], T_curr_odom,
+    def _solve(self, landmarks: Indices, views: Array, T_curr_odom: Array, rounds: int) -> tuple[Estimate | None, Flags]:
+        """Gauss-Newton on landmarks (N,), each further round on those (flags) that fitted; None where too few do."""
+        kept = np.ones(len(landmarks), bool)
+        estimate = None
+        for _ in range(rounds):
+            if kept.sum() < LEAST:
+                return None, kept
+            chosen = landmarks[kept]
+            estimate = gauss_newton(self._map.points[chosen], self._map.covariance[chosen], views[kept], T_curr_odom,
                                     self._model)
             T_curr_odom = estimate.T
-            agree[agree] = estimate.squared < OUTLIER
-        return T_curr_odom, agree
+            squared = np.full(len(landmarks), np.inf)
+            squared[kept] = estimate.squared
+            kept = squared < OUTLIER
+        return estimate, kept
+
+    def _polish(self, sight: Sight, tracks: Tracks, agreeing: tuple[Indices, Array], T_curr_odom: Array) -> Fit | None:
+        """The pose again, once the agreeing landmarks' patches are aligned as the coarse pose predicts them.
+
+        The upper row goes along with the lower one: their difference was measured between pictures of one instant.
+        """
+        landmarks, views = agreeing
+        pixels, fitted = self._map.align(sight.lower, se3.inverse(T_curr_odom), landmarks)
+        views = np.column_stack([pixels, views[:, 2] + pixels[:, 1] - views[:, 1]])[fitted]
+        landmarks = landmarks[fitted]
+        estimate, kept = self._solve(landmarks, views, T_curr_odom, 2)
+        if estimate is None:
+            return None
+        scale = max(1.0, float(estimate.squared.mean()) / 3)
+        return Fit(se3.inverse(estimate.T), scale * estimate.covariance, tracks.visible, len(tracks.index),
+                   int(kept.sum()), landmarks[kept], views[kept, :2])
