@@ -66,7 +66,9 @@ class PaperMotion:
     def _located(self, previous: Sight, sight: Sight) -> tuple[Array, Array]:
         """Ma, Mb (N, 3): the same features before and now, those that SAD has located in both sights (section IV.A)."""
         F_a = corners(previous.lower, previous.usable, FEATURES)
-        F_b, found = self._tracked(previous, sight, F_a)
+        F_b, found = self._tracked(previous, sight, F_a) if len(F_a) else (F_a, np.zeros(0, bool))
+        if not found.any():
+            return np.zeros((0, 3)), np.zeros((0, 3))
         Ma, Mb = self._points(previous, F_a[found]), self._points(sight, F_b[found])
         both = np.isfinite(Ma).all(axis=1) & np.isfinite(Mb).all(axis=1)
         return Ma[both], Mb[both]

@@ -100,4 +100,4 @@ def test_the_fraction_of_a_v_is_exact(fraction: float) -> None:
 def test_the_fraction_stays_within_half_a_pixel_also_on_a_plain() -> None:
     flat = np.full((5, 1), 7, np.uint16)
     assert subpixel(flat, np.array([2]))[0] == 2
-    assert subpixel(np.array([[60000], [50], [60], [70]], np.uint16), np.array([2]))[0] == 2.5 - 1.0
+    assert subpixel(np.array([[60000], [50], [60], [70]], np.uint16), np.array([2]))[0] == 1.5

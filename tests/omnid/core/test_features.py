@@ -1,0 +1,93 @@
+"""Corners spread over the panorama, and what stereo knows about them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnid.core.features import clear_around, corners, nearby_disparity, rows_in_upper
+from omnid.core.klt import Klt
+from tests.omnid.core.scenery import texture, turned, wrapped
+
+ALL = np.ones((120, 480), bool)
+
+
+def test_a_poster_full_of_contrast_does_not_take_all() -> None:
+    faint = (texture(1) // 5 + 100).astype(np.uint8)
+    faint[:, 200:280] = texture(2)[:, 200:280]
+    found = corners(wrapped(faint), ALL, 100)
+    on_poster = (found[:, 0] >= 195) & (found[:, 0] < 285)
+    assert len(found) == 100
+    assert on_poster.mean() < 0.4
+    assert (np.histogram(found[:, 0], bins=10, range=(0, 480))[0] >= 4).all()
+
+
+def test_within_a_cell_the_strongest_come_first() -> None:
+    picture = (texture(3) // 5 + 100).astype(np.uint8)
+    strong = [(24 + 48 * k, 24) for k in range(10)]
+    for column, row in strong:
+        picture[row : row + 6, column : column + 6] = 255
+    first = corners(wrapped(picture), np.arange(120)[:, None] * np.ones((1, 480)) < 48, 10)
+    assert all(np.min(np.hypot(*(first - (c + 2.5, r + 2.5)).T)) < 6 for c, r in strong)
+
+
+def test_corners_keep_apart_and_to_what_is_usable() -> None:
+    usable = ALL.copy()
+    usable[:, 100:300] = False
+    found = corners(wrapped(texture(4)), usable, 1000)
+    assert usable[found[:, 1].astype(int), found[:, 0].astype(int)].all()
+    assert len(found) > 50
+    apart = np.abs(found[:, None] - found[None]).max(axis=2) + 100 * np.eye(len(found))
+    assert apart.min() >= 5
+    assert len(corners(wrapped(texture(4)), ALL, 7)) == 7
+
+
+def test_the_seam_is_like_any_other_place() -> None:
+    """The same corners, turned with the picture."""
+    found = corners(wrapped(texture(5)), ALL, 1000)
+    after = corners(wrapped(turned(texture(5), 200)), ALL, 1000)
+    assert set(map(tuple, (found + (200, 0)) % (480, 1000))) == set(map(tuple, after))
+
+
+def test_a_blank_wall_has_no_corners() -> None:
+    assert corners(wrapped(np.full((120, 480), 80, np.uint8)), ALL, 100).shape == (0, 2)
+
+
+def test_discs_about_known_points_are_taken_out() -> None:
+    free = clear_around(ALL, np.array([[50.2, 60.0], [0.0, 0.0]]), 9)
+    rows, columns = np.nonzero(~free)
+    assert np.minimum(np.hypot(columns - 50, rows - 60), np.hypot(columns, rows)).max() <= 9.5
+    assert not free[60, 41:60].any() and free[60, 62] and free[60, 38]
+    assert ALL.all()
+
+
+def test_the_disparity_is_the_median_of_what_is_near_also_across_the_seam() -> None:
+    disparity = np.full((120, 480), np.nan, np.float32)
+    disparity[60, [100, 101, 102]] = 7.0, 9.0, 30.0
+    disparity[80, 479] = 5.0
+    disparity[0, 300] = 4.0
+    points = np.array([[101.4, 61.0], [101, 64], [1.0, 79.0], [300, 2], [250, 50]])
+    np.testing.assert_array_equal(nearby_disparity(disparity, points), [9, np.nan, 5, 4, np.nan])
+    assert np.isnan(nearby_disparity(disparity, points, 0)[0])
+    assert nearby_disparity(disparity, np.zeros((0, 2))).shape == (0,)
+
+
+def test_rows_in_the_upper_panorama_to_sub_pixels_or_not_at_all() -> None:
+    lower = texture(6)
+    upper = np.rot90(turned(np.ascontiguousarray(np.rot90(lower)), 10.4), -1)  # 10.4 rows down
+    points = corners(wrapped(lower), np.arange(120)[:, None] * np.ones((1, 480)) < 90, 200)
+    points = points[points[:, 1] > 15]
+    pair = wrapped(lower), wrapped(np.ascontiguousarray(upper))
+    rows = rows_in_upper(pair, points, points[:, 1] + 9.5, Klt(levels=1))
+    assert np.isfinite(rows).mean() > 0.9
+    assert np.nanmax(np.abs(rows - points[:, 1] - 10.4)) < 0.1
+    guess = points[:, 1] + np.where(np.arange(len(points)) % 2, 9.5, np.nan)
+    assert np.isnan(rows_in_upper(pair, points, guess, Klt(levels=1))[::2]).all()
+
+
+def test_a_match_beside_its_column_or_above_the_point_is_none() -> None:
+    lower = texture(7)
+    points = corners(wrapped(lower), ALL, 100)
+    aside = wrapped(np.roll(turned(lower, 1.5), 6, axis=0))
+    assert np.isnan(rows_in_upper((wrapped(lower), aside), points, points[:, 1] + 6, Klt(levels=1))).mean() > 0.95
+    above = wrapped(np.roll(lower, -6, axis=0))
+    assert np.isnan(rows_in_upper((wrapped(lower), above), points, points[:, 1] - 6, Klt(levels=1))).all()

@@ -1,0 +1,146 @@
+"""The paper's own ego-motion: its algebra exactly, its trackers, and a short rendered run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.ego_motion import LOST, TRACKING
+from omnid.core.features import corners
+from omnid.core.klt import Klt
+from omnid.core.paper_motion import PaperMotion, turned_track
+from omnid.core.paper_registration import consensus, euler_matrix, euler_parameters, register
+from omnid.core.sight import Sight
+from omnid.errors import OmnidError
+from tests.omnid.core.scenery import Eyes, motion_errors, texture, turned, wrapped
+from tests.scenes.paths import planar_poses
+
+Array = NDArray[np.float64]
+
+MOTION = se3.exp([0.1, -0.05, 0.02, 0.05, -0.1, 1.6])
+PATH = planar_poses(np.array([[0.05 * k, 0] for k in range(4)] + [[0.15, 0.05 * k] for k in range(4)]),
+                    np.repeat([0.0, np.pi / 2], 4))
+
+
+def cloud(count: int, seed: int = 0) -> Array:
+    """Points (N, 3) [m] on all sides."""
+    return np.random.default_rng(seed).normal(0, 1.5, (count, 3))
+
+
+def picture(panorama: NDArray[np.uint8], seq: int = 0) -> Sight:
+    nothing = np.full(panorama.shape, np.nan, np.float32)
+    return Sight(seq, wrapped(panorama), wrapped(panorama), nothing, np.ones(panorama.shape, bool))
+
+
+def test_the_matrix_is_rz_ry_rx_as_eq_7_writes_it() -> None:
+    rx, ry, rz, *t = parameters = np.array([0.3, -0.5, 2.2, 1.0, 2.0, 3.0])
+    sx, sy, sz = np.sin([rx, ry, rz])
+    cx, cy, cz = np.cos([rx, ry, rz])
+    written = [[cy * cz, -cx * sz + sx * sy * cz, sx * sz + cx * sy * cz, t[0]],
+               [cy * sz, cx * cz + sx * sy * sz, -sx * cz + cx * sy * sz, t[1]],
+               [-sy, sx * cy, cx * cy, t[2]], [0, 0, 0, 1]]
+    np.testing.assert_allclose(euler_matrix(parameters), written, atol=1e-12)
+    np.testing.assert_allclose(euler_parameters(euler_matrix(parameters)), parameters, atol=1e-12)
+
+
+def test_the_consensus_is_found_among_liars() -> None:
+    a = cloud(100)
+    b = se3.apply(MOTION, a) + np.random.default_rng(1).normal(0, 0.005, (100, 3))
+    b[:60] = cloud(60, 2)
+    M, agree = consensus(a, b, np.random.default_rng(3), 0.05)
+    assert agree[60:].mean() > 0.9 and agree[:60].sum() <= 3
+    assert motion_errors(M, MOTION)[0] < 0.05
+    assert not consensus(a[:2], b[:2], np.random.default_rng(3), 0.05)[1].any()
+
+
+def test_gauss_newton_on_eq_9_finds_the_least_squares() -> None:
+    """Exact without noise from far off, and with noise no small motion makes the sum smaller."""
+    a = cloud(40)
+    exact = register(a, se3.apply(MOTION, a), MOTION @ se3.exp(np.full(6, 0.1)))
+    np.testing.assert_allclose(exact.M, MOTION, atol=1e-8)
+    b = se3.apply(MOTION, a) + np.random.default_rng(4).normal(0, 0.05, a.shape)
+    M = register(a, b, MOTION).M
+    least = ((b - se3.apply(M, a)) ** 2).sum()
+    for axis in np.vstack([np.eye(6), -np.eye(6)]):
+        assert ((b - se3.apply(se3.exp(1e-4 * axis) @ M, a)) ** 2).sum() > least
+
+
+def test_the_covariance_is_what_noise_scatters_though_far_points_have_more() -> None:
+    a, rng = cloud(80), np.random.default_rng(5)
+    sigma = 0.004 * (a**2).sum(axis=1, keepdims=True)
+    errors, said = [], []
+    for _ in range(300):
+        found = register(a, se3.apply(MOTION, a) + sigma * rng.standard_normal(a.shape), MOTION)
+        errors.append(se3.log(found.M @ se3.inverse(MOTION)))
+        said.append(found.covariance)
+    W = np.linalg.inv(np.linalg.cholesky(np.mean(said, axis=0)))
+    spread = np.sqrt(np.linalg.eigvalsh(W @ np.cov(np.array(errors).T) @ W.T))
+    assert spread.min() > 0.7 and spread.max() < 1.3
+
+
+@pytest.mark.parametrize("degrees", [0.0, 26.0, -45.0, 94.0, 180.0])
+def test_the_improved_tracker_finds_features_through_any_turn(degrees: float) -> None:
+    columns = round(degrees / 360 * 480)
+    before, after = picture(texture(1)), picture(turned(texture(1), columns))
+    features = corners(before.lower, before.usable, 300)
+    there, found = turned_track(before, after, features, Klt())
+    assert found.mean() > 0.5
+    error = (there[found, 0] - features[found, 0] - columns + 240) % 480 - 240
+    assert np.mean(np.abs(error) < 0.5) > 0.95
+
+
+def test_where_no_turn_finds_enough_the_best_is_taken() -> None:
+    """A third of the picture turned by 90 degrees, the rest is new."""
+    after = texture(2)
+    after[:, 100:260] = turned(texture(1), 120)[:, 100:260]
+    before = picture(texture(1))
+    features = corners(before.lower, before.usable, 300)
+    there, found = turned_track(before, picture(after), features, Klt())
+    assert 0.1 < found.mean() < 0.5
+    error = (there[found, 0] - features[found, 0] - 120 + 240) % 480 - 240
+    assert np.mean(np.abs(error) < 0.5) > 0.9
+
+
+@pytest.fixture(scope="module")
+def sights(eyes: Eyes) -> list[Sight]:
+    return [eyes.sight(k, T) for k, T in enumerate(PATH)]
+
+
+def test_a_path_through_a_right_angle(eyes: Eyes, sights: list[Sight]) -> None:
+    motion = PaperMotion(eyes.model, Klt())
+    for k, sight in enumerate(sights):
+        ego = motion.process(sight, 0.1 if k else 0.0)
+        distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
+        assert distance < 0.025 and angle < 0.01, k
+        assert (ego.state, ego.resets) == (TRACKING, 0)
+    deviations = np.sqrt(np.diag(ego.covariance))
+    assert 5e-4 < deviations.min() and deviations.max() < 0.02
+
+
+def test_the_covariance_accumulates_frame_by_frame(eyes: Eyes, sights: list[Sight]) -> None:
+    motion = PaperMotion(eyes.model, Klt())
+    traces = [np.trace(motion.process(sight, 0.1).covariance[:3, :3]) for sight in sights[:4]]
+    assert traces[0] == 0 and (np.diff(traces) > 0).all()
+
+
+@pytest.mark.parametrize("tracker", ["improved", "klt"])
+def test_darkness_is_lost_and_stays_where_it_was(eyes: Eyes, sights: list[Sight], tracker: str) -> None:
+    motion = PaperMotion(eyes.model, Klt(), tracker)
+    motion.process(sights[0], 0.0)
+    before = motion.process(sights[1], 0.1)
+    into, out = motion.process(eyes.darkness(9), 0.1), motion.process(sights[1], 0.1)
+    for ego in (into, out):
+        assert ego.state == LOST
+        np.testing.assert_array_equal(ego.T_odom_rect, before.T_odom_rect)
+    assert np.trace(out.covariance) > np.trace(into.covariance) > np.trace(before.covariance)
+    again = motion.process(sights[2], 0.1)
+    assert again.state == TRACKING
+    moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
+    assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
+
+
+def test_an_unknown_tracker_is_refused(eyes: Eyes) -> None:
+    with pytest.raises(OmnidError, match="improved, klt, found 'sift'"):
+        PaperMotion(eyes.model, Klt(), "sift")

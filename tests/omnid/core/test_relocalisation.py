@@ -1,0 +1,65 @@
+"""A remembered place is known again from close by, and no other is taken for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.core.relocalisation import Relocaliser
+from omnid.core.sight import Sight
+from tests.omnid.core.scenery import Eyes, motion_errors
+from tests.scenes import corridor
+from tests.scenes.paths import planar_poses
+
+T_ODOM_KEYFRAME = se3.exp([3.0, 1.0, 0, 0, 0, 2.0])
+PLACES = planar_poses(np.array([[0.0, 0], [0.25, 0.17]]), np.array([0.0, 0.7]))
+
+
+@pytest.fixture(scope="module")
+def keyframe(eyes: Eyes) -> Sight:
+    return eyes.sight(1, PLACES[0])
+
+
+@pytest.fixture(scope="module")
+def nearby(eyes: Eyes) -> Sight:
+    """0.3 m away and turned by 40 degrees."""
+    return eyes.sight(2, PLACES[1])
+
+
+def test_the_pose_beside_a_keyframe_is_found(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
+    places = Relocaliser(eyes.model)
+    places.remember(keyframe, T_ODOM_KEYFRAME)
+    fit = places.locate(nearby)
+    assert fit is not None and fit.agreeing >= 12 and fit.agreeing <= fit.tracked
+    truth = T_ODOM_KEYFRAME @ se3.inverse(PLACES[0]) @ PLACES[1]
+    distance, angle = motion_errors(fit.T_odom_rect, truth)
+    assert distance < 0.02 and angle < 0.01
+    deviations = np.sqrt(np.diag(fit.covariance))
+    assert distance < 4 * np.linalg.norm(deviations[:3]) and deviations.max() < 0.02
+
+
+def test_another_place_and_darkness_fit_nowhere(eyes: Eyes, keyframe: Sight) -> None:
+    elsewhere = replace(eyes, scene=corridor(7)).sight(3, PLACES[0])
+    places = Relocaliser(eyes.model)
+    assert places.locate(keyframe) is None
+    places.remember(keyframe, T_ODOM_KEYFRAME)
+    fit = places.locate(elsewhere)
+    assert fit is None or fit.agreeing < 20 or fit.share < 0.4
+    assert places.locate(eyes.darkness(4)) is None
+    places.forget()
+    assert places.locate(keyframe) is None
+
+
+def test_of_many_keyframes_a_bounded_number_is_kept_the_newest(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
+    """Blank sights push the good one out; one at the same place replaces the last."""
+    places = Relocaliser(eyes.model, places=3)
+    places.remember(keyframe, T_ODOM_KEYFRAME)
+    for k in range(2):
+        places.remember(eyes.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
+        places.remember(eyes.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
+    assert places.locate(nearby) is not None
+    places.remember(eyes.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
+    assert places.locate(nearby) is None
