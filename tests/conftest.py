@@ -1,0 +1,29 @@
+"""A small rendered run for everybody: 24 pairs between two walls at 256 px, a second to make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.scenes import build, write_log
+
+PAIRS = 24
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with log.mcap, rig.toml and truth.txt."""
+    folder = tmp_path_factory.mktemp("scene")
+    run = build("two_walls", seed=3, size=256, pairs=PAIRS)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another world, seen by the cameras of `scene`."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    run, other = build("two_walls", seed=3, size=256, pairs=PAIRS), build("two_walls", seed=8, size=256, pairs=PAIRS)
+    write_log(folder, run.rig, run.poses, other.scene, sensor=run.sensor, seed=8)
+    return folder

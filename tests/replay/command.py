@@ -1,0 +1,57 @@
+"""Runs the command line in this process, and reads what it wrote."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from omnid.cli import main
+
+
+class Result(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    def count(self, name: str) -> int:
+        """A counter of the summary, such as `pairs`, `late`, `unpaired_lower`."""
+        found = re.search(rf"\b{name} +(\d+)", self.out)
+        assert found, f"{name} is not in:\n{self.out}"
+        return int(found[1])
+
+
+class Command:
+    """omnid, called as a function."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *words: object) -> Result:
+        self._capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        return Result(code, *self._capsys.readouterr())
+
+    def replay(self, log: Path, *words: object, rig: Path | None = None) -> Result:
+        """`omnid replay` without progress."""
+        return self("replay", log, *(["--rig", rig] if rig else []), "--quiet", *words)
+
+    def refused(self, *words: object) -> str:
+        """The one line with which the command refuses its input."""
+        code, out, err = self(*words)
+        assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("omnid: "), (code, out, err)
+        return err
+
+
+def rows(tum: Path) -> Sequence[str]:
+    """The lines of a trajectory, each of which must be whole."""
+    text = tum.read_text("ascii")
+    assert text == "" or text.endswith("\n")
+    assert all(len(line.split()) == 8 for line in text.splitlines())
+    return text.splitlines()

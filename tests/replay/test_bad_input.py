@@ -1,0 +1,147 @@
+"""Bad input on real bytes: what can be used is used and counted, what cannot is refused in one line."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import PAIRS
+from tests.drivers.mcap_logs import Entry, text, write_log
+from tests.replay.command import Command, rows
+from tests.replay.edited import pictures, save
+
+
+@pytest.mark.parametrize("content", [b"", b"omnid\n" * 1000, bytes(range(256)) * 64])
+def test_no_mcap(omnid: Command, tmp_path: Path, scene: Path, content: bytes) -> None:
+    (tmp_path / "log.mcap").write_bytes(content)
+    error = omnid.refused("replay", tmp_path / "log.mcap", "--rig", scene / "rig.toml")
+    assert "log.mcap" in error
+
+
+def test_no_such_log(omnid: Command, tmp_path: Path) -> None:
+    assert "absent.mcap" in omnid.refused("replay", tmp_path / "absent.mcap")
+
+
+def test_truncated_log_is_used_as_far_as_it_is_whole(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log, tum = save(tmp_path / "log.mcap", pictures(scene / "log.mcap")), tmp_path / "est.txt"
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len(whole) * 6 // 10])
+    code, out, err = result = omnid.replay(log, "--tum", tum, rig=scene / "rig.toml")
+    assert code == 0 and err.startswith("omnid: warning: ") and "cut" in err, out
+    assert PAIRS // 3 < result.count("pairs") < PAIRS
+    assert len(rows(tum)) == result.count("pairs")
+
+
+def test_no_image_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", [Entry("/chatter", "std_msgs/msg/String", text("hello"), 10**18)])
+    assert "no image topics" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
+
+
+@pytest.mark.parametrize("camera", ["lower", "upper"])
+def test_one_camera_only(omnid: Command, tmp_path: Path, scene: Path, camera: str) -> None:
+    log = save(tmp_path / "log.mcap", [p for p in pictures(scene / "log.mcap") if p.camera == camera])
+    missing = {"lower": "upper", "upper": "lower"}[camera]
+    assert f"no {missing} camera" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_rig_of_another_image_size(omnid: Command, tmp_path: Path, scene: Path, masks: bool) -> None:
+    rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
+    (tmp_path / "rig.toml").write_text(rig if masks else without_masks(rig))
+    error = omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet")
+    assert "256x256" in error and "640x640" in error
+
+
+def without_masks(rig: str) -> str:
+    tables = rig.split("\n\n")
+    return "\n\n".join(table for table in tables if ".mask]" not in table) + "\n"
+
+
+def test_no_rig(omnid: Command, scene: Path) -> None:
+    assert "omnid calibrate import" in omnid.refused("replay", scene / "log.mcap")
+
+
+def test_broken_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "rig.toml").write_text("schema = 1\n[lower]\nmodel = 7\n")
+    assert "rig.toml" in omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml")
+
+
+def test_broken_jpegs_are_counted_and_skipped(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = pictures(scene / "log.mcap")
+    broken = {0: b"", 9: b"no picture at all", 20: taken[20].jpeg[: len(taken[20].jpeg) // 2]}
+    log = save(tmp_path / "log.mcap", [replace(p, jpeg=broken.get(i, p.jpeg)) for i, p in enumerate(taken)])
+    result = omnid.replay(log, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("broken") == 3
+    assert result.count("unpaired_lower") + result.count("unpaired_upper") == 3
+    assert len(rows(tmp_path / "est.txt")) == result.count("pairs") == PAIRS - 3
+
+
+def test_all_jpegs_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log = save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in pictures(scene / "log.mcap")])
+    result = omnid.replay(log, "--tum", tmp_path / "t", "--map", tmp_path / "m", rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("broken") == 2 * PAIRS and result.count("pairs") == 0
+
+
+def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = pictures(scene / "log.mcap")
+    shuffled = sorted(taken, key=lambda p, rng=random.Random(1): p.pair + rng.uniform(0, 5))  # type: ignore[misc]
+    assert [p.stamp_ns for p in shuffled] != sorted(p.stamp_ns for p in shuffled)
+    log = save(tmp_path / "log.mcap", shuffled)
+    for name, source in (("est.txt", scene / "log.mcap"), ("shuffled.txt", log)):
+        assert omnid.replay(source, "--tum", tmp_path / name, rig=scene / "rig.toml").code == 0
+    assert (tmp_path / "est.txt").read_bytes() == (tmp_path / "shuffled.txt").read_bytes()
+
+
+def test_late_and_double_pictures_are_counted(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = pictures(scene / "log.mcap")
+    late, rest = taken[10], taken[:10] + taken[11:]
+    log = save(tmp_path / "log.mcap", [*rest[:8], rest[7], *rest[8:40], late, *rest[40:]])
+    result = omnid.replay(log, "--set", "log.reorder_frames=8", rig=scene / "rig.toml")
+    assert result.code == 0 and "warning" in result.err
+    assert (result.count("late"), result.count("duplicate"), result.count("pairs")) == (1, 1, PAIRS - 1)
+
+
+@pytest.mark.parametrize("option", ["--tum", "--map", "--plan", "--record"])
+def test_unwritable_output_is_said_before_the_work(omnid: Command, tmp_path: Path, scene: Path, option: str) -> None:
+    kept = tmp_path / "kept.txt"
+    kept.write_text("yesterday's work")
+    other = "--tum" if option != "--tum" else "--map"
+    for path, reason in ((tmp_path / "absent" / "x", "no folder"), (tmp_path, "folder"), (Path("/proc/x"), "/proc/x")):
+        error = omnid.refused("replay", tmp_path / "absent.mcap", other, kept, option, path)
+        assert reason in error and option in error
+    assert kept.read_text() == "yesterday's work" and list(tmp_path.iterdir()) == [kept]
+
+
+def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log = scene / "log.mcap"
+    before = log.read_bytes()
+    assert "the log that is read" in omnid.refused("replay", log, "--record", scene / ".." / scene.name / "log.mcap")
+    assert "--tum" in omnid.refused("replay", log, "--tum", tmp_path / "x", "--map", tmp_path / "x")
+    assert log.read_bytes() == before
+
+
+def test_a_device_is_not_replaced_by_a_map(omnid: Command, scene: Path) -> None:
+    assert "device" in omnid.refused("replay", scene / "log.mcap", "--map", "/dev/null")
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [("stereo.matching.window=9", "stereo.matching.window_px"), ("odometry.noise_px=fine", "odometry.noise_px"),
+     ("pair.tolerance_ms=-1", "pair.tolerance_ms"), ("nonsense", "="), ("odometry.method=magic", "'paper'")],
+)
+def test_wrong_setting_is_named(omnid: Command, scene: Path, setting: str, named: str) -> None:
+    assert named in omnid.refused("replay", scene / "log.mcap", "--set", setting)
+
+
+def test_wrong_arguments_are_one_line(omnid: Command) -> None:
+    for words in ([], ["fly"], ["replay"], ["replay", "x", "--method", "magic"], ["eval", "a"], ["--what"]):
+        omnid.refused(*words)
+
+
+def test_absent_motor_is_said_before_the_work(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", tmp_path / "tty")
+    assert "motor port" in error
