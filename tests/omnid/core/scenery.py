@@ -29,7 +29,7 @@ def texture(seed: int, shape: tuple[int, int] = (120, 480), sigma_px: float = 2.
     """A smooth random panorama (H, W) that goes on across its seam."""
     noise = np.random.default_rng(seed).standard_normal(shape)
     around = cv2.GaussianBlur(np.hstack([noise] * 3), (0, 0), sigma_px)[:, shape[1] : 2 * shape[1]]
-    return np.clip(128 + 45 * around / around.std(), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(128 + 45 * around / around.std(), 0, 255), np.uint8)
 
 
 def wrapped(panorama: Image) -> Wrapped:

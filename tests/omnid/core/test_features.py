@@ -45,7 +45,7 @@ def test_the_seam_is_like_any_other_place() -> None:
     """The same corners, turned with the picture."""
     found = corners(wrapped(texture(5)), ALL, 1000)
     after = corners(wrapped(turned(texture(5), 200)), ALL, 1000)
-    assert set(map(tuple, (found + (200, 0)) % (480, 1000))) == set(map(tuple, after))
+    assert set(map(tuple, (found + np.array([200, 0])) % (480, 1000))) == set(map(tuple, after))
 
 
 def test_a_blank_wall_has_no_corners() -> None:

@@ -18,7 +18,7 @@ BETWEEN_PX = 12
 
 
 def seen(k: int) -> Image:
-    """The world after k turns of 12 columns to the left, behind a strut and a rim with scratches of their own, and noise."""
+    """The world after k turns of 12 columns to the left, behind a strut and a rim with scratches on them; noise."""
     picture = turned(texture(1), BETWEEN_PX * k)
     picture[STRUT] = texture(2)[STRUT] // 2
     return np.clip(picture + np.random.default_rng(k).normal(0, 1.5, picture.shape), 0, 255).astype(np.uint8)
@@ -53,7 +53,7 @@ def test_nothing_is_known_before_enough_was_seen_and_what_was_masked_stays_maske
 
 def test_standing_still_proves_nothing() -> None:
     pattern = FixedPattern()
-    for k in range(30):
+    for _ in range(30):
         pattern.observe(seen(0), pose(0))
     assert pattern.without(ALL).all()
 

@@ -38,7 +38,7 @@ def test_a_shift_is_found_to_a_twentieth_of_a_pixel_also_across_the_seam(columns
 def test_a_guess_leads_to_what_is_out_of_reach() -> None:
     before, points = texture(2), grid()
     after = turned(before, 171)
-    there, found = track(wrapped(before), wrapped(after), points, points + (170.0, 0), KLT)
+    there, found = track(wrapped(before), wrapped(after), points, points + np.array([170.0, 0]), KLT)
     assert found.mean() > 0.98
     assert np.abs(column_error(there[found], points[found] + (171, 0))).max() < 0.05
     _, found = track(wrapped(before), wrapped(after), points, points, KLT)
@@ -47,7 +47,7 @@ def test_a_guess_leads_to_what_is_out_of_reach() -> None:
 
 def test_any_turn_of_the_guess_is_the_same_place() -> None:
     before, points = texture(3), grid()
-    there, found = track(wrapped(before), wrapped(before), points, points + (-960.0, 0), KLT)
+    there, found = track(wrapped(before), wrapped(before), points, points - np.array([960.0, 0]), KLT)
     assert found.mean() > 0.99
     assert np.abs(column_error(there[found], points[found])).max() < 0.05
 

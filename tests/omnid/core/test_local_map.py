@@ -109,8 +109,8 @@ def test_keyframes_are_bounded_and_the_oldest_goes_with_its_landmarks(landmarks:
         assert len(landmarks.keyframes) <= 3
     assert sorted(landmarks.keyframes) == [7, 8, 9]
     assert set(landmarks.anchor) == {7, 8, 9}
-    sizes = {len(a) for a in (landmarks.points, landmarks.covariance, landmarks.views, landmarks.slopes, landmarks.anchor)}
-    assert sizes == {3 * len(views(30))}
+    parts = landmarks.points, landmarks.covariance, landmarks.views, landmarks.slopes, landmarks.anchor
+    assert {len(part) for part in parts} == {3 * len(views(30))}
     assert landmarks.anchor_shares(np.arange(len(landmarks))) == pytest.approx({7: 1 / 3, 8: 1 / 3, 9: 1 / 3})
 
 

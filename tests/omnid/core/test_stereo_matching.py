@@ -132,7 +132,7 @@ def test_the_difference_along_lines_is_that_of_the_pixels_on_them() -> None:
 
 def test_more_lines_than_a_short_counts() -> None:
     picture = texture(15, SHAPE)
-    ends = [np.tile(np.float32([[x, y]]), (70_000, 1)) for x, y in ((10, 20), (40, 80), (10, 20), (40, 80))]
+    ends = [np.tile(np.array([[x, y]], np.float32), (70_000, 1)) for x, y in ((10, 20), (40, 80), (10, 20), (40, 80))]
     ends[2][-1] = 100, 100
     difference = line_difference(picture, picture, (ends[0], ends[1], ends[2], ends[3]), samples=4)
     assert (difference[:-1] == 0).all() and difference[-1] > 5

@@ -35,7 +35,7 @@ def test_a_turn_to_the_left_is_positive_and_moves_the_picture_right() -> None:
 
 
 def test_what_turns_with_the_camera_locks_the_peak_at_zero_unless_left_out() -> None:
-    before = texture(3) // 3 + 80
+    before = (texture(3) // 3 + 80).astype(np.uint8)
     after = turned(before, 97)
     strut = np.zeros((120, 480), bool)
     strut[:, 40:60] = strut[:, 200:220] = strut[:, 360:380] = strut[100:] = True
