@@ -26,7 +26,8 @@ def test_a_horizontal_edge_is_found_once_a_column_and_a_vertical_one_not_at_all(
 
 
 def test_the_threshold_counts_eight_for_a_grey_level_and_pixel() -> None:
-    ramp = np.tile(np.array([0] * 20 + [10, 20, 30] + [30] * 37, np.uint8)[:, None], (1, 80))  # 10 a pixel: 80 at its middle
+    column = np.array([0] * 20 + [10, 20, 30] + [30] * 37, np.uint8)  # 10 a pixel: a response of 80 in the middle
+    ramp = np.tile(column[:, None], (1, 80))
     assert len(edge_pixels(ramp, EVERYWHERE, 78, 10_000)) == 80
     assert len(edge_pixels(ramp, EVERYWHERE, 82, 10_000)) == 0
 

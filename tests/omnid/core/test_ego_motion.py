@@ -100,6 +100,18 @@ def test_a_long_darkness_is_lost_and_the_place_known_again(motion: EgoMotion, si
     assert (back[-1].state, back[-1].resets) == (TRACKING, 0)
 
 
+def test_a_robot_carried_back_in_the_dark_knows_a_place_that_the_local_map_has_forgotten(eyes: Eyes) -> None:
+    path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
+    motion = EgoMotion(eyes.model, Klt(), Limits(keyframes=1))
+    follow(motion, [eyes.sight(k, T) for k, T in enumerate(path)])
+    follow(motion, [eyes.darkness(100 + k) for k in range(6)], first=False)
+    (T_world_rig,) = planar_poses(np.array([[0.1, -0.1]]), np.array([2.0]))
+    back = follow(motion, [eyes.sight(200 + k, T_world_rig) for k in range(2)], first=False)
+    distance, angle = motion_errors(back[-1].T_odom_rect, se3.inverse(path[0]) @ T_world_rig)
+    assert distance < 0.01 and angle < 0.005
+    assert [ego.state for ego in back] == [DEGRADED, TRACKING] and back[-1].resets == 0
+
+
 def test_what_fits_nowhere_is_refused_and_after_a_while_begun_anew(motion: EgoMotion, sights: list[Sight],
                                                                   eyes: Eyes) -> None:
     """The robot is carried into another corridor: no pose is made up, and then the reset counter says so."""

@@ -35,12 +35,12 @@ def test_a_turn_to_the_left_is_positive_and_moves_the_picture_right() -> None:
 
 
 def test_what_turns_with_the_camera_locks_the_peak_at_zero_unless_left_out() -> None:
-    before = (texture(3) // 3 + 80).astype(np.uint8)
+    before = np.asarray(texture(3) // 3 + 80, np.uint8)
     after = turned(before, 97)
     strut = np.zeros((120, 480), bool)
     strut[:, 40:60] = strut[:, 200:220] = strut[:, 360:380] = strut[100:] = True
-    pattern = np.random.default_rng(4).integers(0, 2, (120, 480)).astype(np.uint8) * 255
-    pattern = cv2.GaussianBlur(pattern, (0, 0), 0.8)
+    dots = 255 * np.random.default_rng(4).integers(0, 2, (120, 480)).astype(np.uint8)
+    pattern = cv2.GaussianBlur(dots, (0, 0), 0.8)
     for picture in (before, after):
         picture[strut] = pattern[strut]
     usable = cv2.erode((~strut).astype(np.uint8), np.ones((5, 5))) > 0
