@@ -32,7 +32,7 @@ class PairConfig:
 class PanoramaConfig:
     """What is shown on the cylinder."""
 
-    width_px: int = knob(0, "columns of a full turn, px; 0: the pictures' own resolution", low=0, high=8192)
+    width_px: int = knob(0, "columns of a full turn, px; 0: the pictures' own resolution", low=0, high=4096)
     elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
     pad_px: int = knob(48, "columns repeated on either side, so that windows run across the seam", low=16, high=256)
     rim_margin_px: float = knob(4.0, "what is left out along rim and hub in the pictures, px", low=0, high=100)
@@ -148,6 +148,7 @@ KLT: Mapping[str, Knob] = {
 LIMITS: Mapping[str, Knob] = {
     "features": _knob("landmarks wanted in a keyframe", 20, 10_000),
     "refresh": _knob("a keyframe is added when this share of the last one's landmarks is left", 0, 1),
+    "sparse_every": _knob("sights after which a keyframe is added where the features wanted are not reached", 1, 1000),
     "keyframes": _knob("keyframes in the local map", 1, 50),
     "min_inliers": _knob("landmarks that must agree with a pose", 4, 10_000),
     "min_share": _knob("share of the found landmarks that must agree", 0, 1),

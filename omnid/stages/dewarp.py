@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig
 from omnid.core.klt import Wrapped
+from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
+
+LEAST_SHARE = 0.05  # of the panorama that both cameras must see
 
 
 class Dewarp:
@@ -24,6 +27,11 @@ class Dewarp:
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
+        if self._visible.mean() < LEAST_SHARE:
+            raise OmnidError(
+                f"the cameras share {self._visible.mean():.1%} of the panorama, less than {LEAST_SHARE:.0%}: check the "
+                "rig's transforms and masks, panorama.rim_margin_px and panorama.margin_px"
+            )
 
     def process(self, pair: FramePair) -> Panoramas:
         """The panoramas of a pair."""

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
-from omnid.core.stereo_matching import Matcher
+from omnid.core.stereo_matching import Matcher, Matching
 from omnid.core.triangulation import triangulate
+from omnid.errors import OmnidError
 from omnid.messages import Depth, Panoramas
 from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
+
+STEP_PX, SPARE_ROWS = 32, 16  # the semi-global prior searches in such steps, and wants rows to spare
 
 
 class Stereo:
@@ -39,7 +44,8 @@ class Stereo:
         """Columns (N,), rows (N,) and disparities (N,) [px] of the located pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
         if self._matcher is None:
-            self._matcher = Matcher((lower.image.shape[0], lower.image.shape[1]), self._config.matching)
+            height, width = lower.image.shape
+            self._matcher = Matcher((height, width), _fitting(self._config.matching, height))
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
         pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
@@ -50,3 +56,14 @@ class Stereo:
         r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
         per_px = r2 / (self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m)
         return np.asarray((1 + z2 / r2) * (per_px * self._config.noise_px) ** 2)
+
+
+def _fitting(matching: Matching, height: int) -> Matching:
+    """The matching for panoramas of so many rows: a larger disparity than they are high cannot be."""
+    most = (height - SPARE_ROWS) // STEP_PX * STEP_PX
+    if most < STEP_PX:
+        raise OmnidError(
+            f"the panoramas are only {height} px high, {STEP_PX + SPARE_ROWS} px are needed for stereo: larger "
+            "pictures, or a rig whose cameras share more of their view"
+        )
+    return replace(matching, disparities=min(matching.disparities, most))

@@ -87,7 +87,8 @@ def test_all_jpegs_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
 
 def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = pictures(scene / "log.mcap")
-    shuffled = sorted(taken, key=lambda p, rng=random.Random(1): p.pair + rng.uniform(0, 5))  # type: ignore[misc]
+    delays = random.Random(1)
+    shuffled = sorted(taken, key=lambda p: p.pair + delays.uniform(0, 5))
     assert [p.stamp_ns for p in shuffled] != sorted(p.stamp_ns for p in shuffled)
     log = save(tmp_path / "log.mcap", shuffled)
     for name, source in (("est.txt", scene / "log.mcap"), ("shuffled.txt", log)):
@@ -126,6 +127,17 @@ def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tm
 def test_a_device_is_not_replaced_by_a_map(omnid: Command, scene: Path) -> None:
     assert "device" in omnid.refused("replay", scene / "log.mcap", "--map", "/dev/null")
     assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("setting", ["panorama.margin_px=100", "panorama.width_px=64"])
+def test_too_little_to_see(omnid: Command, scene: Path, setting: str) -> None:
+    assert "panorama" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--set",
+                                       setting)
+
+
+def test_disparities_beyond_the_picture(omnid: Command, scene: Path) -> None:
+    result = omnid.replay(scene / "log.mcap", "--set", "stereo.matching.disparities=512", rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("pairs") == PAIRS
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,206 @@
+"""The stages one by one, on real frames of a rendered run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.rig_file import read_rig
+from drivers.frame import Camera, Frame
+from drivers.mcap_reader import LogReader
+from drivers.motor import is_stop
+from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
+from omnid.core.trajectory import read_tum
+from omnid.graph import Graph
+from omnid.messages import Depth, FramePair, Odometry
+from omnid.pipeline import Ends, Frames, wire
+from omnid.realtime import Pace
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.guidance import Guidance
+from omnid.stages.mapping import Mapping
+from omnid.stages.mapping import Path as Way
+from omnid.stages.odometry import in_axes, of_base
+from omnid.stages.pair import PairSync
+from omnid.stages.stereo import Stereo
+from tests.conftest import PAIRS
+
+CONFIG = Config()
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def frames(scene: Path) -> list[Frame]:
+    return list(LogReader(scene / "log.mcap").frames())
+
+
+@pytest.fixture(scope="module")
+def place(scene: Path) -> Geometry:
+    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
+
+
+def stamped(frames: list[Frame], *order: tuple[Camera, int]) -> list[Frame]:
+    """Frames of these cameras at these stamps [ms]."""
+    first = {frame.camera: frame for frame in reversed(frames)}
+    return [replace(first[camera], stamp_ns=stamp * MS) for camera, stamp in order]
+
+
+def run_pairs(place: Geometry, frames: list[Frame]) -> tuple[list[FramePair], dict[str, int]]:
+    sync = PairSync(place.rig, PairConfig())
+    made = [pair for frame in frames if (pair := sync.process(frame)) is not None]
+    sync.finish()
+    return made, sync.counts
+
+
+@pytest.mark.parametrize(
+    ("order", "stamps", "unpaired"),
+    [
+        ([("lower", 0), ("upper", 2), ("upper", 99), ("lower", 100)], [0, 100], (0, 0)),
+        ([("lower", 0), ("upper", 10)], [0], (0, 0)),
+        ([("lower", 0), ("upper", 11)], [], (1, 1)),
+        ([("lower", 0), ("lower", 5), ("upper", 6)], [5], (1, 0)),
+        ([("upper", 0), ("upper", 100), ("lower", 101), ("lower", 200)], [101], (1, 1)),
+    ],
+)
+def test_pairs_by_stamp(
+    place: Geometry, frames: list[Frame], order: list[tuple[Camera, int]], stamps: list[int], unpaired: tuple[int, int]
+) -> None:
+    made, counts = run_pairs(place, stamped(frames, *order))
+    assert [pair.stamp_ns for pair in made] == [stamp * MS for stamp in stamps]
+    assert [pair.seq for pair in made] == list(range(len(stamps)))
+    assert (counts["unpaired_lower"], counts["unpaired_upper"]) == unpaired
+
+
+def test_pair_keeps_the_cameras_apart(place: Geometry, frames: list[Frame]) -> None:
+    (pair,), _ = run_pairs(place, stamped(frames, ("upper", 0), ("lower", 1)))
+    (other,), _ = run_pairs(place, stamped(frames, ("lower", 0), ("upper", 1)))
+    assert np.array_equal(pair.lower, other.lower) and np.array_equal(pair.upper, other.upper)
+    assert not np.array_equal(pair.lower, pair.upper)
+
+
+def depth_of(place: Geometry, frames: list[Frame]) -> Depth:
+    (pair,), _ = run_pairs(place, frames[:2])
+    return Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
+
+
+def test_points_lie_on_the_world(scene: Path, place: Geometry, frames: list[Frame]) -> None:
+    """The floor of the rendered corridor is z = 0: points below the rig must lie on it, others above."""
+    depth = depth_of(place, frames)
+    points = se3.apply(read_tum(scene / "truth.txt").T[0], depth.points)
+    sure = depth.variance_m2 < 0.05**2
+    assert sure.sum() > 500
+    assert np.quantile(points[sure, 2], 0.02) > -0.1
+    assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2)
+    assert np.isfinite(depth.disparity).sum() >= len(depth.points)
+
+
+def test_variance_is_that_of_the_disparity(place: Geometry, frames: list[Frame]) -> None:
+    """Half a pixel more or less of disparity moves a point by about its deviation."""
+    depth = depth_of(place, frames)
+    rect = se3.apply(place.rig.T_rect_rig, depth.points)
+    range_m = np.linalg.norm(rect, axis=1)
+    disparity = place.cylinder.focal_px * place.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
+    moved = range_m * CONFIG.stereo.noise_px / disparity
+    np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
+
+
+def odometry(T: np.ndarray, *, state: str = "tracking", covariance: np.ndarray | None = None, seq: int = 0,
+             depth: Depth | None = None) -> Odometry:
+    zero = np.zeros((6, 6))
+    cov = zero if covariance is None else covariance
+    velocity = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
+    return Odometry(seq, seq * 100 * MS, T, cov, velocity, zero, state, 0, 0, 0, depth)  # type: ignore[arg-type]
+
+
+def test_covariance_of_the_base_is_what_the_rigs_motion_makes_it() -> None:
+    """Random small motions of the rig, carried over to the base: their spread is the covariance that is published."""
+    rng = np.random.default_rng(0)
+    T_odom_rig, T_base_rig = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
+    root = rng.normal(0, 1e-4, (6, 6))
+    T_odom_base, covariance, velocity, _ = of_base(
+        odometry(T_odom_rig, covariance=in_axes(T_odom_rig, root @ root.T)), T_base_rig
+    )
+    small = se3.exp(rng.normal(0, 1, (100_000, 6)) @ root.T)
+    moved = T_base_rig @ (T_odom_rig @ small) @ se3.inverse(T_base_rig)
+    shift = moved[:, :3, 3] - T_odom_base[:3, 3]
+    turn = se3.rotation_log(moved[:, :3, :3] @ T_odom_base[:3, :3].T)
+    spread = np.cov(np.hstack([shift, turn]).T)
+    assert np.abs(spread - covariance).max() < 0.03 * np.abs(covariance).max()
+    ahead = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3]) * 1e-6)
+    base_moved = T_base_rig @ ahead @ se3.inverse(T_base_rig)
+    np.testing.assert_allclose(se3.log(base_moved) / 1e-6, velocity, rtol=1e-4)
+
+
+def test_base_starts_at_the_origin() -> None:
+    T_base_rig = se3.exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    np.testing.assert_allclose(of_base(odometry(np.eye(4)), T_base_rig)[0], np.eye(4), atol=1e-12)
+
+
+def test_map_takes_only_what_is_sure(place: Geometry, frames: list[Frame]) -> None:
+    depth = depth_of(place, frames)
+    for state, kept in (("tracking", True), ("degraded", False), ("lost", False)):
+        mapping = Mapping(MappingConfig(min_frames=1))
+        mapping.process(odometry(np.eye(4), state=state, depth=depth))
+        (update,) = mapping.finish()
+        assert (len(update.points.xyz) > 0) == kept and len(update.path_xy) == 2
+    strict = Mapping(MappingConfig(min_frames=1, max_sigma_m=0.001))
+    strict.process(odometry(np.eye(4), depth=depth))
+    assert len(strict.finish()[0].points.xyz) == 0
+    assert Mapping(MappingConfig()).finish() == []
+
+
+def test_path_is_thinned_but_keeps_its_ends() -> None:
+    way = Way(100)
+    for k in range(10_000):
+        way.add(float(k), 0.0)
+    x = way.xy()[:, 0]
+    assert len(x) <= 102 and x[0] == 0 and x[-1] == 9999 and (np.diff(x) <= 128).all()
+
+
+def test_guidance_turns_towards_the_heading_and_stops_when_lost() -> None:
+    config = GuidanceConfig(velocity_mps=0.3, heading_deg=90.0)
+    guidance = Guidance(config, np.eye(4))
+    for seq in range(20):
+        command = guidance.process(odometry(np.eye(4), seq=seq))
+    assert command.yaw_rate_radps > 0.5 and command.velocity_mps == pytest.approx(0.3)
+    assert command.heading_rad == pytest.approx(np.pi / 2)
+    assert is_stop(guidance.process(odometry(np.eye(4), state="lost", seq=20)))
+    again = guidance.process(odometry(np.eye(4), seq=21))
+    assert 0 < again.velocity_mps < 0.1, "after a stop it speeds up again from standing"
+
+
+def test_guidance_steers_the_base_and_not_the_rig() -> None:
+    """A rig that looks backwards on the base: where the rig has turned left about z, so has the base."""
+    T_base_rig = se3.exp([0, 0, 0, 0, 0, np.pi])
+    turned = se3.exp([0, 0, 0, 0, 0, 0.5])
+    guidance = Guidance(GuidanceConfig(heading_deg=np.degrees(0.5)), T_base_rig)
+    guidance.process(odometry(turned))
+    assert guidance.process(odometry(turned, seq=1)).yaw_rate_radps == pytest.approx(0, abs=1e-9)
+
+
+def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:
+    apart = stamped(frames, ("lower", 0), ("lower", 3_600_000))
+    pace = Pace()
+    waiting = pace.frames(apart)
+    assert next(waiting) is apart[0]
+    pace.wake()
+    assert next(waiting) is apart[1]
+
+
+@pytest.mark.parametrize("threaded", [True, False])
+def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> None:
+    """The pipeline needs no log: any iterable of frames will do."""
+    poses: list[Odometry] = []
+
+    class Keep:
+        def process(self, message: Odometry) -> None:
+            poses.append(message)
+
+    graph = Graph(threaded=threaded)
+    pair = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
+    graph.run()
+    assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

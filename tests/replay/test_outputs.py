@@ -1,0 +1,153 @@
+"""What a replay gives: the same bytes however it is run, and files that other programs read."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from calib import se3
+from calib.rig_file import parse_rig, read_rig, write_rig
+from omnid.config import Config
+from omnid.core.evaluation import evaluate
+from omnid.core.ply import read_ply
+from omnid.core.trajectory import read_tum
+from omnid.settings import parse
+from omnid.transport.codec import odometry_from_cdr
+from tests.conftest import PAIRS
+from tests.replay.command import Command, rows
+
+METHODS = ([], ["--method", "paper"], ["--method", "paper", "--tracker", "klt"])
+
+
+@pytest.mark.parametrize("method", METHODS, ids=" ".join)
+def test_inline_and_threaded_give_the_same_bytes(
+    omnid: Command, tmp_path: Path, scene: Path, method: list[str]
+) -> None:
+    for name, more in (("a", []), ("b", []), ("c", ["--inline"])):
+        outputs = ("--tum", tmp_path / f"{name}.txt", "--map", tmp_path / f"{name}.ply", "--plan", tmp_path / name)
+        assert omnid.replay(scene / "log.mcap", *outputs, *method, *more, rig=scene / "rig.toml").code == 0
+    for suffix in (".txt", ".ply", ""):
+        first, *others = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "abc")
+        assert others == [first, first]
+
+
+def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    tum, ply, plan = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "plan.png"
+    result = omnid.replay(
+        scene / "log.mcap", "--tum", tum, "--map", ply, "--plan", plan, rig=scene / "rig.toml"
+    )
+    assert (result.count("pairs"), result.count("poses"), len(rows(tum))) == (PAIRS, PAIRS, PAIRS)
+    estimate, truth = read_tum(tum), read_tum(scene / "truth.txt")
+    np.testing.assert_allclose(estimate.T[0], np.eye(4), atol=1e-9)
+    assert np.array_equal(estimate.stamps_ns, truth.stamps_ns)
+    assert evaluate(estimate, truth).ate_max_m < 0.01
+    assert_corridor(read_ply(ply).xyz, truth.T[0])
+    assert cv2.imread(str(plan)) is not None
+
+
+def assert_corridor(points: np.ndarray, T_world_odom: np.ndarray) -> None:
+    """The points of the map lie on floor, ceiling and walls of the rendered corridor, whose floor is z = 0."""
+    z = se3.apply(T_world_odom, points.astype(float))[:, 2]
+    assert len(points) > 500
+    assert np.quantile(z, 0.02) > -0.15 and np.quantile(z, 0.98) < 2.6 + 0.15
+
+
+def test_eval_prints_the_errors(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    omnid.replay(scene / "log.mcap", "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
+    result = omnid("eval", tmp_path / "est.txt", scene / "truth.txt")
+    assert result.code == 0
+    for word in ("100.0% of the truth", "path length", "ATE", "heading", "RPE"):
+        assert word in result.out
+
+
+def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    T_base_rig = se3.exp([0.2, -0.1, 0.5, 0.1, -0.2, 1.0])
+    write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), T_base_rig=T_base_rig))
+    out, tum = tmp_path / "out.mcap", tmp_path / "est.txt"
+    assert omnid.replay(scene / "log.mcap", "--record", out, "--tum", tum, rig=tmp_path / "rig.toml").code == 0
+    T_odom_rig = read_tum(tum).T
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        found = [odometry_from_cdr(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
+    np.testing.assert_allclose(
+        [record.T_odom_base for record in found], T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig), atol=1e-8
+    )
+    assert {record.frames for record in found} == {("odom", "base_link")}
+    assert all(np.linalg.eigvalsh(record.covariance).min() > -1e-12 for record in found)
+
+
+def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    out = tmp_path / "out.mcap"
+    omnid.replay(scene / "log.mcap", "--record", out, "--set", "bus.robot=rover", rig=scene / "rig.toml")
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+        attachments = {a.name: a.data for a in reader.iter_attachments()}
+        assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
+                for chunk in summary.chunk_indexes[:1]] == [True, True]
+    assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/cmd": PAIRS,
+                      "/rover/cloud": 1, "/rover/status": 2}
+    rig = parse_rig(attachments["rig.toml"])
+    np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
+    assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
+
+
+def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """A log that holds its rig needs no --rig: the sample's way."""
+    from tests.drivers.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+    from tests.replay.edited import pictures
+
+    topics = {"lower": LOWER, "upper": UPPER}
+    entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
+               for p in pictures(scene / "log.mcap")]
+    log = write_log(tmp_path / "log.mcap", entries, [("rig.toml", (scene / "rig.toml").read_bytes())])
+    for name, source, rig in (("a", log, None), ("b", scene / "log.mcap", scene / "rig.toml")):
+        assert omnid.replay(source, "--tum", tmp_path / name, rig=rig).code == 0
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    rig = (scene / "rig.toml").read_text()
+    bare = "\n\n".join(table for table in rig.split("\n\n") if ".mask]" not in table) + "\n"
+    assert bare != rig
+    (tmp_path / "rig.toml").write_text(bare)
+    out = tmp_path / "out.mcap"
+    assert omnid.replay(scene / "log.mcap", "--record", out, rig=tmp_path / "rig.toml").code == 0
+    with out.open("rb") as file:
+        attachments = {a.name: a.data for a in make_reader(file).iter_attachments()}
+    truth, found = read_rig(scene / "rig.toml"), parse_rig(attachments["rig.toml"])
+    for seen, exact in ((found.lower.mask, truth.lower.mask), (found.upper.mask, truth.upper.mask)):
+        assert seen is not None and exact is not None
+        assert abs(seen.outer_px - exact.outer_px) < 4 and np.hypot(*np.subtract(seen.center, exact.center)) < 2
+
+
+def test_nobody_speaks_unasked(omnid: Command, scene: Path) -> None:
+    """A replay on a robot must not use the robot's own voice: without --publish a bus is not even opened."""
+    result = omnid.replay(scene / "log.mcap", "--set", 'bus.listen=["tcp/256.0.0.1:1"]', rig=scene / "rig.toml")
+    assert result.code == 0
+    assert "bus" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--publish",
+                                  "--set", 'bus.listen=["tcp/256.0.0.1:1"]')
+
+
+def test_config_is_what_replay_reads(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "omnid.toml").write_text(omnid("config", "--set", "pair.tolerance_ms=0.5").out)
+    assert tomllib.loads((tmp_path / "omnid.toml").read_text())["pair"]["tolerance_ms"] == 0.5
+    result = omnid.replay(scene / "log.mcap", "--config", tmp_path / "omnid.toml", rig=scene / "rig.toml")
+    assert 0 < result.count("unpaired_lower") == PAIRS - result.count("pairs")
+
+
+def test_every_knob_says_what_it_is(omnid: Command) -> None:
+    lines = omnid("config").out.splitlines()
+    knobs = [i for i, line in enumerate(lines) if "=" in line and not line.startswith("#")]
+    assert len(knobs) > 50
+    for i in knobs:
+        name = lines[i].split(" = ")[0]
+        assert lines[i - 2].startswith("# ") and lines[i - 2] != "# " + name.replace("_", " "), name

@@ -1,0 +1,159 @@
+"""Replays as programs of their own: stopped by signals, heard over the bus, driving a motor on a pty."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from mcap.reader import make_reader
+
+from drivers.motor import VelocityCommand, is_stop
+from drivers.serial_motor import SerialMotor
+from drivers.simulated_motor import SimulatedMotor
+from omnid.core.ply import read_ply
+from omnid.core.trajectory import read_tum
+from omnid.outputs.motor import MotorTick
+from omnid.transport.codec import OdometryRecord, odometry_from_cdr
+from tests.conftest import PAIRS
+from tests.replay.command import Command, rows
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 60.0
+
+
+def replaying(scene: Path, *words: object) -> list[str]:
+    return [sys.executable, "-m", "omnid", "replay", str(scene / "log.mcap"), "--rig", str(scene / "rig.toml"),
+            *map(str, words)]
+
+
+@contextmanager
+def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    """A program, ended at the latest with the block."""
+    pipe = subprocess.PIPE
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_until(happens: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not happens():
+        assert time.monotonic() < deadline_s, "it did not happen"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("manner", [[], ["--inline"]], ids=["threaded", "inline"])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_leave_whole_results(tmp_path: Path, scene: Path, manner: list[str], number: int, code: int) -> None:
+    tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
+    command = replaying(scene, "--realtime", "--tum", tum, "--map", ply, "--record", log, *manner)
+    with started(command) as process:
+        wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == code, err
+    assert "Traceback" not in err and "poses" in out
+    written = len(rows(tum))
+    assert 3 <= written < PAIRS and len(read_ply(ply).xyz) > 0
+    with log.open("rb") as file:
+        assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"])) == written
+
+
+def test_another_process_hears_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
+    endpoint = f"tcp/127.0.0.1:{unused_tcp_port}"
+    heard: list[OdometryRecord] = []
+    config = zenoh.Config()
+    for key, value in (("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false")):
+        config.insert_json5(key, value)
+    tum = tmp_path / "est.txt"
+    with zenoh.open(config) as session:
+        session.declare_subscriber("rover/odom", lambda sample: heard.append(odometry_from_cdr(bytes(sample.payload))))
+        settings = ("--set", "bus.robot=rover", "--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
+        with started(replaying(scene, "--publish", "--realtime", "--quiet", "--tum", tum, *settings)) as process:
+            _, err = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, err
+        wait_until(lambda: len(heard) >= PAIRS // 2)
+    truth = {int(stamp): T for stamp, T in zip(read_tum(tum).stamps_ns, read_tum(tum).T, strict=True)}
+    for record in heard:
+        np.testing.assert_allclose(record.T_odom_base, truth[record.stamp_ns], atol=1e-8)
+
+
+def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Path) -> None:
+    motor = SimulatedMotor()
+    try:
+        result = omnid.replay(scene / "log.mcap", "--realtime", "--motor", motor.port, "--set",
+                              "guidance.velocity_mps=0.4", "--set", "guidance.heading_deg=10", rig=scene / "rig.toml")
+        assert result.code == 0, result.err
+        assert motor.commands > 20 and motor.errors == 0
+        assert motor.pose[0] > 0.1, "the wheels have turned"
+        assert motor.last_command is not None and is_stop(motor.last_command)
+        wait_until(lambda: motor.state.velocity_mps == 0)
+    finally:
+        motor.close()
+
+
+def test_simulated_motor_of_the_command_itself(omnid: Command, scene: Path) -> None:
+    result = omnid.replay(scene / "log.mcap", "--motor", "simulated", "--realtime", rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("motor") > 20 and "0 errors" in result.out
+
+
+def test_stale_commands_become_stops() -> None:
+    motor = SimulatedMotor()
+    tick = MotorTick(SerialMotor(motor.port), stale_s=0.1)
+    try:
+        tick()
+        assert motor.last_command is not None and is_stop(motor.last_command), "before the first command"
+        tick.process(VelocityCommand(0, 0.5, 0.0, 0.1))
+        tick()
+        assert motor.last_command.velocity_mps == 0.5
+        time.sleep(0.11)
+        tick()
+        assert is_stop(motor.last_command) and (tick.sent, tick.stops) == (3, 2)
+    finally:
+        tick.close()
+        motor.close()
+
+
+def test_motor_that_vanishes_ends_the_run(tmp_path: Path, scene: Path) -> None:
+    motor = SimulatedMotor()
+    tum = tmp_path / "est.txt"
+    with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
+        wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
+        motor.close()
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2 and err.startswith("omnid: motor on") and err.count("\n") == 1
+    assert len(rows(tum)) >= 3
+
+
+def test_demo(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "omnid", "demo", "--quiet", "--output", str(tmp_path / "out")]
+    with started(command) as process:
+        out, err = process.communicate(timeout=2 * PATIENCE_S)
+    assert process.returncode == 0, err
+    assert "against the truth" in out and "commands received, 0 errors" in out
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.tum", "map.ply", "plan.png", "log.mcap"}
+
+
+def test_progress_where_there_is_no_terminal(scene: Path) -> None:
+    with started(replaying(scene)) as process:
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0 and "\r" not in err and out.startswith("pairs ")
+
+
+def test_a_reader_that_leaves_early_gets_no_traceback(scene: Path) -> None:
+    shell = " ".join(replaying(scene, "--quiet")) + " | head -1"
+    with started(["sh", "-c", shell]) as process:
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert out.count("\n") == 1 and "Traceback" not in err
