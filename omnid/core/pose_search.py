@@ -23,6 +23,7 @@ Indices = NDArray[np.intp]
 LEAST = 6  # landmarks, below which six unknowns are no estimate
 OUTLIER = 16.0  # squared deviations
 SAMPLE = 150  # landmarks that decide between turns
+COARSE_SIGMA_PX = 0.3  # of a track before its patch is bent to the new viewpoint
 ENOUGH = 0.5  # share of them, tracked, that ends the search
 
 
@@ -31,6 +32,7 @@ class PoseSearch:
 
     def __init__(self, local_map: LocalMap, model: StereoModel, klt: Klt) -> None:
         self._map, self._model = local_map, model
+        self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         self._stereo_klt = replace(klt, levels=1)
 
     def from_guess(self, sight: Sight, guess: Array) -> Fit | None:
@@ -42,10 +44,11 @@ class PoseSearch:
         T_guess_odom = se3.inverse(guess)
         in_guess = se3.apply(T_guess_odom, self._map.points[tracks.index])
         T_curr_guess, agree = ransac(in_guess, views, self._model, np.random.default_rng(sight.seq))
-        coarse, kept = self._solve(tracks.index[agree], views[agree], T_curr_guess @ T_guess_odom, 1)
+        agreeing = tracks.index[agree], views[agree]
+        coarse, kept = self._solve(agreeing, T_curr_guess @ T_guess_odom, self._coarse_model)
         if coarse is None:
             return None
-        return self._polish(sight, tracks, (tracks.index[agree][kept], views[agree][kept]), coarse.T)
+        return self._polish(sight, tracks, (agreeing[0][kept], agreeing[1][kept]), coarse.T)
 
     def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
         """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.
@@ -72,16 +75,18 @@ class PoseSearch:
         found = rows_in_upper((sight.lower, sight.upper), tracks.pixels, rows, self._stereo_klt)
         return np.column_stack([tracks.pixels, found])
 
-    def _solve(self, landmarks: Indices, views: Array, T_curr_odom: Array, rounds: int) -> tuple[Estimate | None, Flags]:
-        """Gauss-Newton on landmarks (N,), each further round on those (flags) that fitted; None where too few do."""
+    def _solve(self, agreeing: tuple[Indices, Array], T_curr_odom: Array, model: StereoModel
+               ) -> tuple[Estimate | None, Flags]:
+        """Gauss-Newton on landmarks and their views, then once more on those (flags) that fit; None where too few do."""
+        landmarks, views = agreeing
         kept = np.ones(len(landmarks), bool)
         estimate = None
-        for _ in range(rounds):
+        for _ in range(2):
             if kept.sum() < LEAST:
                 return None, kept
             chosen = landmarks[kept]
             estimate = gauss_newton(self._map.points[chosen], self._map.covariance[chosen], views[kept], T_curr_odom,
-                                    self._model)
+                                    model)
             T_curr_odom = estimate.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = estimate.squared
@@ -97,7 +102,7 @@ class PoseSearch:
         pixels, fitted = self._map.align(sight.lower, se3.inverse(T_curr_odom), landmarks)
         views = np.column_stack([pixels, views[:, 2] + pixels[:, 1] - views[:, 1]])[fitted]
         landmarks = landmarks[fitted]
-        estimate, kept = self._solve(landmarks, views, T_curr_odom, 2)
+        estimate, kept = self._solve((landmarks, views), T_curr_odom, self._model)
         if estimate is None:
             return None
         scale = max(1.0, float(estimate.squared.mean()) / 3)
