@@ -104,6 +104,31 @@ def test_two_distances_side_by_side(method: str) -> None:
         assert np.mean(np.abs(disparity[side] - expected) < 0.3) > 0.95
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_every_row_is_matched_whose_match_lies_in_the_picture(method: str) -> None:
+    """Down to the floor: a small disparity needs no room for the largest."""
+    lower, valid = texture(16, SHAPE), middle((12, SHAPE[0] - 16))
+    pixels, disparity = matched(method, lower, np.roll(lower, 8, axis=0), valid)
+    assert np.abs(disparity - 8).max() < 0.6
+    assert (np.histogram(pixels // SHAPE[1], bins=11, range=(12, SHAPE[0] - 16))[0] > 50).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_disparity_of_the_range_is_found(method: str) -> None:
+    lower, valid = texture(17, SHAPE), middle()
+    for shift in (3, 17, 33, DISPARITIES - 3):
+        pixels, disparity = matched(method, lower, np.roll(lower, shift, axis=0), valid)
+        assert len(pixels) > 800 and np.mean(np.abs(disparity - shift) < 0.6) > 0.98, shift
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_panorama_lower_than_the_range_is_matched_all_the_same(method: str) -> None:
+    lower = texture(18, (DISPARITIES - 4, 240))
+    pixels, disparity = matched(method, lower, np.roll(lower, 6, axis=0), np.ones(lower.shape, bool))
+    inside = (pixels // 240 > 8) & (pixels // 240 < DISPARITIES - 16)
+    assert inside.sum() > 100 and np.mean(np.abs(disparity[inside] - 6) < 0.6) > 0.95
+
+
 def test_the_nearest_anchor_is_the_nearest() -> None:
     rng = np.random.default_rng(12)
     anchors, points = np.sort(rng.choice(160 * 240, 30, replace=False)), rng.choice(160 * 240, 200)
