@@ -70,5 +70,5 @@ class MapUpdate:
 
     seq: int
     stamp_ns: int
-    points: MapPoints  # in odom
-    path_xy: Array  # (N, 2) m in odom, thinned where the run is long
+    points: MapPoints  # m, in the rig frame of the first pair
+    path_xy: Array  # (N, 2) m, likewise, thinned where the run is long

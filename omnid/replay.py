@@ -34,6 +34,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus
 
+NO_PAIR = "not one pair of pictures: see the drops below; pair.tolerance_ms says how near their stamps must be"
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
 
@@ -117,6 +118,7 @@ class Replay:
         if options.record:
             attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
             recorder = Recorder(options.record, attachments, config.bus.robot, encode)
+            closing.callback(recorder.close)
         ends = Ends({"tally": self._tally}, {}, recorder, bus, motor)
         if options.tum:
             ends.poses["trajectory"] = TrajectoryFile(options.tum)
@@ -143,7 +145,8 @@ class Replay:
             self._graph.ticker("progress", progress.period_s, progress)
 
     def _conclude(self, reader: LogReader, pair: PairSync) -> None:
-        for warning in reader.warnings:
+        nothing = [] if pair.counts["pairs"] or self._signal else [NO_PAIR]
+        for warning in [*reader.warnings, *nothing]:
             print(f"omnid: warning: {warning}", file=sys.stderr)
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
         if self._twin is not None:

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.voxel_map import MapPoints
 from omnid.messages import MapUpdate, Odometry
@@ -26,7 +27,7 @@ class Encoded(NamedTuple):
 
 
 class Encoder:
-    """Turns messages into those of ROS 2; poses are odom -> base_link."""
+    """Turns messages into those of ROS 2; their odom is the base's frame at the first pair, not the rig's."""
 
     def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int) -> None:
         self._T_base_rig, self._cloud_points = T_base_rig, cloud_points
@@ -40,8 +41,9 @@ class Encoder:
                 payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
                 yield Encoded("cmd", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
-                points = _surest(message.points, self._cloud_points)
-                payload = codec.point_cloud_cdr(message.stamp_ns, "odom", *points)
+                points, confidence = _surest(message.points, self._cloud_points)
+                in_odom = se3.apply(self._T_base_rig, points.astype(float))
+                payload = codec.point_cloud_cdr(message.stamp_ns, "odom", in_odom, confidence)
                 yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:

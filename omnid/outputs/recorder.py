@@ -29,6 +29,10 @@ class Recorder:
     def finish(self) -> None:
         """Makes the file whole."""
         self._write([summary_report(self._newest_ns, self.report())], self._newest_ns)
+        self.close()
+
+    def close(self) -> None:
+        """Ends the file as it is; a second call does nothing."""
         self._writer.close()
 
     def _write(self, messages: Iterable[Encoded], stamp_ns: int) -> None:

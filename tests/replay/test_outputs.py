@@ -20,6 +20,7 @@ from omnid.core.trajectory import read_tum
 from omnid.settings import parse
 from omnid.transport.codec import odometry_from_cdr
 from tests.conftest import PAIRS
+from tests.drivers.mcap_logs import STORE
 from tests.replay.command import Command, rows
 
 METHODS = ([], ["--method", "paper"], ["--method", "paper", "--tracker", "klt"])
@@ -69,12 +70,17 @@ def test_eval_prints_the_errors(omnid: Command, tmp_path: Path, scene: Path) -> 
 def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Path) -> None:
     T_base_rig = se3.exp([0.2, -0.1, 0.5, 0.1, -0.2, 1.0])
     write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), T_base_rig=T_base_rig))
-    out, tum = tmp_path / "out.mcap", tmp_path / "est.txt"
-    assert omnid.replay(scene / "log.mcap", "--record", out, "--tum", tum, rig=tmp_path / "rig.toml").code == 0
+    out, tum, ply = tmp_path / "out.mcap", tmp_path / "est.txt", tmp_path / "map.ply"
+    files = ("--record", out, "--tum", tum, "--map", ply)
+    assert omnid.replay(scene / "log.mcap", *files, rig=tmp_path / "rig.toml").code == 0
     T_odom_rig = read_tum(tum).T
     with out.open("rb") as file:
         reader = make_reader(file)
         found = [odometry_from_cdr(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
+        (cloud,) = [STORE.deserialize_cdr(m.data, s.name) for s, _, m in reader.iter_messages(["/omnid/cloud"])]
+    assert cloud.header.frame_id == "odom"
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
+    np.testing.assert_allclose(points, se3.apply(T_base_rig, read_ply(ply).xyz.astype(float)), atol=1e-5)
     np.testing.assert_allclose(
         [record.T_odom_base for record in found], T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig), atol=1e-8
     )

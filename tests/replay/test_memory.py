@@ -1,0 +1,66 @@
+"""Long runs: the sample forwards and backwards, again and again, must not fill the memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.resources import files
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig_file import parse_rig
+from drivers.frame import Frame
+from drivers.mcap_reader import LogReader
+from omnid.config import Config
+from omnid.graph import Graph
+from omnid.messages import Odometry
+from omnid.outputs.files import MapFile, TrajectoryFile
+from omnid.outputs.tally import Tally
+from omnid.pipeline import Ends, Frames, wire
+from omnid.stages.geometry import geometry, with_rims
+
+PAIRS = 2000
+PERIOD_NS = 100_000_000
+SETTLED, GROWTH_MIB = 200, 12.0
+
+
+def to_and_fro(frames: list[Frame], pairs: int) -> Iterator[Frame]:
+    """Frames of so many pairs, there and back, with stamps that go on."""
+    both = [frames[i : i + 2] for i in range(0, len(frames), 2)]
+    path = cycle([*both, *both[-2:0:-1]])
+    for k in range(pairs):
+        for frame in next(path):
+            yield replace(frame, stamp_ns=k * PERIOD_NS)
+
+
+class Watch:
+    """Notes the resident memory every hundred poses."""
+
+    def __init__(self) -> None:
+        self.mib: dict[int, float] = {}
+
+    def process(self, odometry: Odometry) -> None:
+        if odometry.seq % 100 == 99:
+            status = Path("/proc/self/status").read_text().split("VmRSS:")[1]
+            self.mib[odometry.seq + 1] = int(status.split()[0]) / 1024
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threaded", [True, False])
+def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
+    reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
+    config, frames = Config(), list(reader.frames())
+    place = geometry(with_rims(parse_rig(reader.attachments()["rig.toml"]), frames), config.panorama)
+    watch, tally = Watch(), Tally()
+    poses = {"watch": watch, "tally": tally, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
+    graph = Graph(threaded=threaded)
+    ends = Ends(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
+    wire(graph, Frames(lambda: to_and_fro(frames, PAIRS)), place, config, ends)
+    graph.run()
+    print(tally.states, watch.mib)
+    assert tally.poses == PAIRS
+    later = np.array([mib for seq, mib in watch.mib.items() if seq >= SETTLED])
+    assert later.max() - later[0] < GROWTH_MIB
