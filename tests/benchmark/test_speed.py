@@ -1,0 +1,52 @@
+"""Pairs a second through the whole pipeline, and where the time goes: `python -m pytest -m benchmark -s`."""
+
+from __future__ import annotations
+
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import pytest
+
+from calib.kalibr import import_kalibr
+from calib.rig import Rig
+from calib.rig_file import parse_rig
+from drivers.mcap_reader import LogReader
+from omnid.config import Config
+from omnid.graph import Graph
+from omnid.outputs.files import MapFile, TrajectoryFile
+from omnid.outputs.summary import counters, summary
+from omnid.outputs.tally import Tally
+from omnid.pipeline import Ends, Frames, wire
+from omnid.stages.geometry import geometry, with_rims
+from tests.replay.test_memory import to_and_fro
+
+TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"
+PAIRS = 300
+WANTED_HZ = 20.0
+
+
+def recording() -> tuple[LogReader, Rig]:
+    """Pictures of 768x768 where they are at hand, else the sample's of 512x512."""
+    if TWO_WALLS.is_dir():
+        return LogReader(TWO_WALLS / "log.mcap"), import_kalibr(TWO_WALLS / "camchain.yaml")
+    reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
+    return reader, parse_rig(reader.attachments()["rig.toml"])
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
+def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
+    reader, rig = recording()
+    config, frames, tally = Config(), list(reader.frames()), Tally()
+    cv2.setNumThreads(config.graph.opencv_threads)
+    place = geometry(with_rims(rig, frames), config.panorama)
+    graph = Graph(threaded=threaded)
+    ends = Ends({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
+    wire(graph, Frames(lambda: to_and_fro(frames, PAIRS)), place, config, ends)
+    started_s = time.perf_counter()
+    graph.run()
+    rate_hz = PAIRS / (time.perf_counter() - started_s)
+    print(f"\n{rate_hz:.1f} pairs/s\n{summary(counters(tally, {}), graph.telemetry.summary())}")
+    assert not threaded or rate_hz >= WANTED_HZ
