@@ -5,15 +5,17 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import TypeAlias
 
 import cv2
 
 from calib.rig import Rig
 from calib.rig_file import parse_rig, read_rig, rig_toml
+from drivers.errors import DriverError
 from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
@@ -35,6 +37,8 @@ from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus
 
 NO_PAIR = "not one pair of pictures: see the drops below; pair.tolerance_ms says how near their stamps must be"
+Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
+TICKERS = ("progress", "motor")  # what they drop are deadlines, not messages
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
 
@@ -70,23 +74,35 @@ class Replay:
         self._twin: SimulatedMotor | None = None
         self._signal = 0
 
-    def run(self, rig: Path | None, topics: tuple[str | None, str | None]) -> int:
+    def run(self, rig: Path | None, topics: Topics) -> int:
         """The exit code; prints warnings and the summary."""
         check_outputs(self._options.files, self._log)
         cv2.setNumThreads(self._config.graph.opencv_threads)
         with ExitStack() as closing:
-            reader = LogReader(self._log, *topics, window=self._config.log.reorder_frames)
+            reader = self._reader(rig, topics)
             closing.callback(reader.close)
             place = self._geometry(reader, rig)
             ends = self._ends(place, closing)
             pair = wire(self._graph, self._frames(reader), place, self._config, ends)
             if ends.recorder:
-                ends.recorder.report = lambda: counters(self._tally, self._dropped(reader, pair))
+                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
             self._show_progress(reader)
             with self._stopped_by_signals():
                 self._graph.run()
             self._conclude(reader, pair)
         return 128 + self._signal if self._signal else 0
+
+    def _reader(self, rig: Path | None, topics: Topics) -> LogReader:
+        """The log, with the topics that the rig names where their own names do not tell."""
+        window = self._config.log.reorder_frames
+        try:
+            return LogReader(self._log, *topics, window=window)
+        except DriverError as error:
+            named = read_rig(rig).topics if rig else ("", "")
+            with suppress(DriverError):
+                if all(named) and not all(topics):
+                    return LogReader(self._log, topics[0] or named[0], topics[1] or named[1], window=window)
+            raise error
 
     def _geometry(self, reader: LogReader, path: Path | None) -> Geometry:
         rig = read_rig(path) if path else self._attached_rig(reader)
@@ -158,7 +174,7 @@ class Replay:
         drops = {name: reader.counts[name] for name in READER_DROPS}
         drops |= {name: count for name, count in pair.counts.items() if name.startswith("unpaired")}
         drops["broken"] += pair.counts["broken"]
-        drops["queue"] = sum(stage.dropped for stage in self._graph.telemetry.stages if stage.name != "progress")
+        drops["queue"] = sum(stage.dropped for stage in self._graph.telemetry.stages if stage.name not in TICKERS)
         return drops
 
     @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -87,6 +87,3 @@ def _surest(points: MapPoints, most: int) -> tuple[NDArray[np.float32], NDArray[
         return points.xyz, points.confidence
     kept = np.sort(np.argsort(-points.confidence, kind="stable")[:most])
     return points.xyz[kept], points.confidence[kept]
-
-
-Report: TypeAlias = Callable[[], dict[str, str]]

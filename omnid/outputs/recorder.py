@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 from drivers.mcap_writer import LogWriter
 from omnid.messages import Odometry
-from omnid.outputs.encoded import Encoded, Encoder, Outgoing, Report, StateReports, summary_report
+from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports, summary_report
+from omnid.outputs.tally import Tally
+
+Report: TypeAlias = Callable[[Tally], dict[str, str]]
 
 
 class Recorder:
@@ -17,18 +21,20 @@ class Recorder:
         self._writer = LogWriter(path, attachments)
         self._robot, self._encode, self._states = robot, encode, StateReports()
         self._newest_ns = 0
-        self.report: Report = dict
+        self._tally = Tally()  # its own: the end of the run may reach others later
+        self.report: Report = lambda _: {}
 
     def process(self, message: Outgoing) -> None:
         """Adds what there is to say about a message."""
         self._newest_ns = max(self._newest_ns, message.stamp_ns)
         self._write(self._encode(message), message.stamp_ns)
         if isinstance(message, Odometry):
+            self._tally.process(message)
             self._write(self._states(message), message.stamp_ns)
 
     def finish(self) -> None:
         """Makes the file whole."""
-        self._write([summary_report(self._newest_ns, self.report())], self._newest_ns)
+        self._write([summary_report(self._newest_ns, self.report(self._tally))], self._newest_ns)
         self.close()
 
     def close(self) -> None:

@@ -17,11 +17,13 @@ from omnid.config import Config
 from omnid.core.evaluation import evaluate
 from omnid.core.ply import read_ply
 from omnid.core.trajectory import read_tum
-from omnid.settings import parse
+from omnid.replay import Options, Replay
+from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
 from tests.conftest import PAIRS
-from tests.drivers.mcap_logs import STORE
+from tests.drivers.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
+from tests.replay.edited import pictures
 
 METHODS = ([], ["--method", "paper"], ["--method", "paper", "--tracker", "klt"])
 
@@ -108,9 +110,6 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
 
 def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """A log that holds its rig needs no --rig: the sample's way."""
-    from tests.drivers.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
-    from tests.replay.edited import pictures
-
     topics = {"lower": LOWER, "upper": UPPER}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
                for p in pictures(scene / "log.mcap")]
@@ -118,6 +117,32 @@ def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, 
     for name, source, rig in (("a", log, None), ("b", scene / "log.mcap", scene / "rig.toml")):
         assert omnid.replay(source, "--tum", tmp_path / name, rig=rig).code == 0
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """Names that do not tell the cameras apart: the options do, and so does a rig that names its topics."""
+    topics = {"lower": "/cam0", "upper": "/cam1"}
+    entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
+               for p in pictures(scene / "log.mcap")]
+    log = write_log(tmp_path / "log.mcap", entries)
+    assert "--lower" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
+    write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), topics=("/cam0", "/cam1")))
+    given = ("--lower", "/cam0", "--upper", "/cam1")
+    for name, rig, words in (("a", scene / "rig.toml", given), ("b", tmp_path / "rig.toml", ())):
+        assert omnid.replay(log, "--tum", tmp_path / name, *words, rig=rig).code == 0
+    omnid.replay(scene / "log.mcap", "--tum", tmp_path / "c", rig=scene / "rig.toml")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
+
+
+def test_a_taken_port_silences_the_demo_only(omnid: Command, tmp_path: Path, scene: Path, taken_port: int,
+                                             capsys: pytest.CaptureFixture[str]) -> None:
+    listen = f'bus.listen=["tcp/127.0.0.1:{taken_port}"]'
+    words = ("--rig", scene / "rig.toml", "--quiet", "--publish", "--set", listen)
+    assert "bus" in omnid.refused("replay", scene / "log.mcap", *words)
+    options = Options(tum=tmp_path / "est.txt", publish=True, bus_optional=True, quiet=True)
+    code = Replay(scene / "log.mcap", load(Config, None, [listen]), options).run(scene / "rig.toml", (None, None))
+    assert code == 0 and len(rows(tmp_path / "est.txt")) == PAIRS
+    assert "going on without a bus" in capsys.readouterr().err
 
 
 def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -152,6 +152,17 @@ def test_progress_where_there_is_no_terminal(scene: Path) -> None:
     assert process.returncode == 0 and "\r" not in err and out.startswith("pairs ")
 
 
+def test_progress_bar_on_a_terminal(scene: Path) -> None:
+    screen, terminal = os.openpty()
+    with subprocess.Popen(replaying(scene, "--realtime"), stdout=subprocess.PIPE, stderr=terminal, cwd=ROOT) as process:
+        process.communicate(timeout=PATIENCE_S)
+    os.close(terminal)
+    drawn = os.read(screen, 1 << 16).decode()
+    os.close(screen)
+    assert f"/{PAIRS} " in drawn and "[####" in drawn and "pairs/s" in drawn and "tracking" in drawn
+    assert drawn.endswith(" \r"), "the line is left empty"
+
+
 def test_a_reader_that_leaves_early_gets_no_traceback(scene: Path) -> None:
     shell = " ".join(replaying(scene, "--quiet")) + " | head -1"
     with started(["sh", "-c", shell]) as process:
