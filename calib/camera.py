@@ -51,10 +51,10 @@ class Mask:
     def _painted(self, pixels: Array) -> NDArray[np.bool_]:
         assert self.image is not None
         height, width = self.image.shape
-        finite = np.isfinite(pixels).all(axis=1)
+        finite = np.asarray(np.isfinite(pixels).all(axis=1))
         column, row = np.rint(np.where(finite[:, None], pixels, -1)).astype(int).T
         inside = finite & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        return inside & (self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0)
+        return np.asarray(inside & (self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0))
 
 
 def inscribed_mask(camera: OmniCamera) -> Mask:

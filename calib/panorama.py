@@ -60,7 +60,7 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
         raise CalibError(f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
                          "of elevation; check the transforms and the masks")
     slopes = np.linspace(low, high, 400)[both]
-    row0 = focal * slopes.max()
+    row0 = float(focal * slopes.max())
     return Cylinder(width, math.ceil(row0 - focal * slopes.min()) + 1, row0)
 
 

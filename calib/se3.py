@@ -26,7 +26,7 @@ def inverse(T: ArrayLike) -> Array:
 def apply(T: ArrayLike, points: ArrayLike) -> Array:
     """Points (..., N, 3) moved by T (..., 4, 4)."""
     T = np.asarray(T, float)
-    return np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+    return np.asarray(np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
 def hat(w: ArrayLike) -> Array:
@@ -121,10 +121,10 @@ def quaternion(R: ArrayLike) -> Array:
 
 def rotation(q: ArrayLike) -> Array:
     """Rotation matrix (..., 3, 3) of a quaternion (..., 4) = (x, y, z, w), normalised here."""
-    q = np.asarray(q, float)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    W = hat(q[..., :3])
-    return np.asarray(np.eye(3) + 2 * q[..., 3, None, None] * W + 2 * W @ W)
+    given = np.asarray(q, float)
+    unit = given / np.linalg.norm(given, axis=-1, keepdims=True)
+    W = hat(unit[..., :3])
+    return np.asarray(np.eye(3) + 2 * unit[..., 3, None, None] * W + 2 * W @ W)
 
 
 def yaw(T: ArrayLike) -> Array:

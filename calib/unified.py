@@ -85,4 +85,4 @@ class UnifiedCamera:
         d = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
         ex, ey = (self._distort(m) - target).T
         determinant = a * d - b * b
-        return np.column_stack([d * ex - b * ey, a * ey - b * ex]) / determinant[:, None]
+        return np.asarray(np.column_stack([d * ex - b * ey, a * ey - b * ex]) / determinant[:, None])

@@ -24,7 +24,7 @@ def nearest_anchor(shape: tuple[int, int], anchors: NDArray[np.intp], points: ND
     _, labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     position = np.zeros(labels.max() + 1, np.intp)
     position[labels.reshape(-1)[anchors]] = np.arange(len(anchors))
-    return position[labels.reshape(-1)[points]]
+    return np.asarray(position[labels.reshape(-1)[points]])
 
 
 def line_difference(lower: Image, upper: Image, ends: tuple[Array, Array, Array, Array], samples: int = 32) -> Array:
@@ -43,6 +43,8 @@ def line_difference(lower: Image, upper: Image, ends: tuple[Array, Array, Array,
 
 def _sample(image: Image, positions: Array) -> Image:
     """Grey levels (N, S) uint8 at positions (N, S, 2)."""
-    chunks = [cv2.remap(image, np.ascontiguousarray(positions[k : k + REMAP_ROWS]), None, cv2.INTER_LINEAR,
-                        borderMode=cv2.BORDER_REPLICATE) for k in range(0, len(positions), REMAP_ROWS)]
+    columns, rows = np.ascontiguousarray(np.moveaxis(positions, 2, 0))
+    starts = range(0, len(positions), REMAP_ROWS)
+    chunks = [cv2.remap(image, columns[k : k + REMAP_ROWS], rows[k : k + REMAP_ROWS], cv2.INTER_LINEAR,
+                        borderMode=cv2.BORDER_REPLICATE) for k in starts]
     return np.asarray(np.concatenate(chunks), np.uint8)

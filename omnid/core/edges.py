@@ -24,4 +24,4 @@ def edge_pixels(smoothed: Image, valid: NDArray[np.bool_], threshold: int, limit
     response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=0.5)
     crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > threshold // 2)
     chosen = np.flatnonzero(crest & valid[1:-1]) + smoothed.shape[1]
-    return chosen[:: max(1, -(-len(chosen) // limit))]
+    return np.asarray(chosen[:: max(1, -(-len(chosen) // limit))])

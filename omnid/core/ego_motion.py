@@ -83,28 +83,36 @@ class EgoMotion:
     def process(self, sight: Sight, dt_s: float) -> Ego:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
         usable = self._pattern.without(sight.usable)
+        dt_s = max(dt_s, 0.0)
         if self._previous is None:
-            return self._begin(sight, usable)
-        expected = self._T @ self._filter.predict(dt_s)
-        fit = self._locate(sight, usable, expected, dt_s) if self._worth_a_look(sight, usable) else None
+            return self._begin(sight, usable, dt_s)
+        expected = self._T @ self._filter.predict(min(dt_s, self._limits.max_gap_s))
+        fit = self._locate((sight, usable), self._previous, expected, dt_s)
         return self._refuse(sight, usable, expected, dt_s) if fit is None else self._accept(sight, usable, fit, dt_s)
 
-    def _begin(self, sight: Sight, usable: Flags) -> Ego:
+    def _begin(self, sight: Sight, usable: Flags, dt_s: float) -> Ego:
         """Starts, or starts again, a map at the present pose if the sight has enough corners."""
         self._add_keyframe(sight, usable, np.zeros((0, 2)))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
+            self._doubt(dt_s)
             return self._ego(LOST, 0, 0)
         self._previous, self._refused, self._strange, self._blind_s = sight.lower, 0, 0, 0.0
         return self._ego(TRACKING, len(self._map), len(self._map))
 
-    def _locate(self, sight: Sight, usable: Flags, expected: Array, dt_s: float) -> Fit | None:
-        """The best supported pose of all guesses: as expected; in doubt, after a turn; once refused, at a keyframe."""
+    def _locate(self, seen: tuple[Sight, Flags], previous: Wrapped, expected: Array, dt_s: float) -> Fit | None:
+        """The best supported pose of all guesses: as expected; in doubt, after a turn; after a break, at a keyframe.
+
+        In the dark nothing is searched: once a pose was refused, a picture without corners is not worth it.
+        """
+        sight, usable = seen
+        if self._refused and not self._is_textured(sight, usable):
+            return None
         fit = self._search.from_guess(sight, expected)
         if not self._convincing(fit):
-            guess = self._search.best_turn(sight, self._previous, (self._T, expected), usable)
+            guess = self._search.best_turn(sight, previous, (self._T, expected), usable)
             fit = _better(fit, self._search.from_guess(sight, guess))
-        if self._refused and not self._believable(fit, dt_s):
+        if not self._believable(fit, dt_s) and (self._refused or dt_s > self._limits.max_gap_s):
             fit = self._relocaliser.locate(sight)
         return fit if self._believable(fit, dt_s) else None
 
@@ -123,11 +131,11 @@ class EgoMotion:
     def _accept(self, sight: Sight, usable: Flags, fit: Fit, dt_s: float) -> Ego:
         """Takes the pose over."""
         doubtful = self._refused > 0 or dt_s > self._limits.max_gap_s or fit.agreeing < self._limits.sure_inliers
-        if self._refused or dt_s <= 0:
+        if self._refused or not 0 < dt_s <= self._limits.max_gap_s:
             self._filter.reset()
         else:
             self._filter.update(se3.inverse(self._T) @ fit.T_odom_rect, fit.covariance, dt_s)
-        self._covariance = fit.covariance + self._inherited(fit)
+        self._covariance = fit.covariance + (self._inherited(fit) if len(fit.landmarks) else 0.0)
         self._T, self._previous = fit.T_odom_rect, sight.lower
         self._refused = self._strange = 0
         self._blind_s = 0.0
@@ -138,30 +146,30 @@ class EgoMotion:
     def _refuse(self, sight: Sight, usable: Flags, expected: Array, dt_s: float) -> Ego:
         """Goes on as expected, slowing down, with a covariance that grows; starts anew when nothing helps."""
         self._refused += 1
-        self._blind_s += dt_s
-        self._T = expected
+        A = se3.adjoint(se3.inverse(expected) @ self._T)
+        self._T, self._covariance = expected, A @ self._covariance @ A.T
         self._filter.slow_down(math.exp(-dt_s / SLOWING_S))
-        growth = BLIND_SPEED**2 * (self._blind_s**2 - (self._blind_s - dt_s) ** 2)
-        self._covariance = self._covariance + growth * np.eye(6)
+        self._doubt(dt_s)
         lost = self._refused >= self._limits.lost_after
         if lost and self._is_textured(sight, usable):
             self._strange += 1
         if self._strange >= self._limits.restart_after:
-            return self._restart(sight, usable)
+            return self._restart(sight, usable, dt_s)
         return self._ego(LOST if lost else DEGRADED, 0, 0)
 
-    def _restart(self, sight: Sight, usable: Flags) -> Ego:
+    def _doubt(self, dt_s: float) -> None:
+        """Lets the covariance grow by what may have happened unseen, as an unknown but steady motion does."""
+        before, self._blind_s = self._blind_s, self._blind_s + dt_s
+        self._covariance = self._covariance + BLIND_SPEED**2 * (self._blind_s**2 - before**2) * np.eye(6)
+
+    def _restart(self, sight: Sight, usable: Flags, dt_s: float) -> Ego:
         """A new map from here on: the gap stays in the covariance, and the reset counter says so."""
         self._map.clear()
         self._previous = None
         self._relocaliser.forget()
         self._filter.reset()
         self._resets += 1
-        return self._begin(sight, usable)
-
-    def _worth_a_look(self, sight: Sight, usable: Flags) -> bool:
-        """False in the dark: once a pose was refused, a picture without corners is not searched again."""
-        return self._refused == 0 or self._is_textured(sight, usable)
+        return self._begin(sight, usable, dt_s)
 
     def _is_textured(self, sight: Sight, usable: Flags) -> bool:
         return len(corners(sight.lower, usable, 4 * self._limits.min_inliers)) >= 2 * self._limits.min_inliers
@@ -186,7 +194,8 @@ class EgoMotion:
         keyframe = Keyframe(sight.seq, sight.lower, self._T, self._covariance)
         slopes = disparity_slopes(sight.disparity, points[located], (rows - points[:, 1])[located])
         self._map.add(keyframe, np.column_stack([points, rows])[located], slopes)
-        self._relocaliser.remember(sight, self._T)
+        if len(self._map) >= self._limits.min_inliers:
+            self._relocaliser.remember(sight, keyframe)
         self._most_agreeing = self._since_keyframe = 0
 
     def _inherited(self, fit: Fit) -> Array:

@@ -28,7 +28,7 @@ def corners(lower: Wrapped, usable: Flags, most: int, apart_px: int = 9, weakest
     strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
     rows, columns = rows[strongest], columns[strongest]
     turn = _rank_within((rows // CELL_PX) * 4096 + columns // CELL_PX)
-    chosen = np.argsort(turn, kind="stable")[:most]
+    chosen = np.argsort(turn, kind="stable")[: max(0, most)]
     return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
 
 
@@ -75,7 +75,7 @@ def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: in
     offsets = np.arange(-reach_px, reach_px + 1)
     columns = (np.rint(points[:, 0]).astype(int)[:, None, None] + offsets[None, None, :]) % width
     rows = np.clip(np.rint(points[:, 1]).astype(int)[:, None, None] + offsets[None, :, None], 0, height - 1)
-    around = disparity[rows, columns].reshape(len(points), -1)
+    around = disparity[rows, columns].reshape(len(points), len(offsets) ** 2)
     return _nanmedian(around)
 
 

@@ -12,7 +12,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A pose T_odom_rect, its covariance given the landmarks, and how many landmarks were tried, tracked and agree."""
+    """A pose T_odom_rect, its covariance, and how many landmarks were tried, tracked and agree.
+
+    The covariance takes the landmarks of the local map as they are; without any (known by a keyframe), it is whole.
+    """
 
     T_odom_rect: Array
     covariance: Array  # (6, 6) [t; r] in the rectified frame

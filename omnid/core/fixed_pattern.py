@@ -58,12 +58,14 @@ class FixedPattern:
         # One change halves the evidence: the world loses it as soon as something else comes into view.
         counted = np.where(same, np.minimum(streak + 1, 4 * EVIDENCE), streak // 2).astype(np.uint8)
         self._streak = np.where(moving, counted, streak)
-        fixed = cv2.resize((self._streak >= EVIDENCE).astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
-        self._blocked = cv2.dilate(fixed, np.ones((4 * REACH_PX + 1, 4 * REACH_PX + 1), np.uint8)) > 0
+        fixed = (self._streak >= EVIDENCE).astype(np.uint8)
+        fixed = np.asarray(cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        margin = np.ones((4 * REACH_PX + 1, 4 * REACH_PX + 1), np.uint8)
+        self._blocked = np.asarray(cv2.dilate(fixed, margin) > 0)
 
 
 def expected_flow(T_before_after: Array, columns: int) -> Array:
-    """About how far [rad] each of `columns` of a panorama should have moved: by the turn, and by the shift across it."""
+    """About how far [rad] each of `columns` of a panorama should have moved: by turn, and by shift across it."""
     twist = se3.log(T_before_after)
     azimuth = math.pi - (np.arange(columns) + 0.5) * 2 * math.pi / columns
     across = np.abs(twist[1] * np.cos(azimuth) - twist[0] * np.sin(azimuth))

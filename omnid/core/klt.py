@@ -22,7 +22,7 @@ class Wrapped:
     @property
     def width(self) -> int:
         """Columns of one full turn [px]."""
-        return self.image.shape[1] - 2 * self.pad_px
+        return int(self.image.shape[1]) - 2 * self.pad_px
 
     @property
     def panorama(self) -> Image:
@@ -58,7 +58,6 @@ def track(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tupl
 def flow(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple[Array, NDArray[np.bool_]]:
     """One way of pyramidal Lucas-Kanade from a guess; found (N,) where it converged inside the picture."""
     start, target = _padded(points, a), _padded(guess, b)
-    # A point near the seam has two images in the padded picture; take the guess on the start's own side of it.
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, 0.01)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         a.image, b.image, start, target, winSize=(klt.window_px, klt.window_px), maxLevel=klt.levels,

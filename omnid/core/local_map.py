@@ -41,7 +41,7 @@ class Tracks:
 
 
 class LocalMap:
-    """Landmarks (N) with position in odom, covariance, keyframe and pixel there; bounded by keyframes and count."""
+    """Landmarks (N) with position in odom, covariance, keyframe and pixel there; bounded by the keyframes kept."""
 
     def __init__(self, model: StereoModel, klt: Klt, max_keyframes: int = 5, max_misses: int = 3) -> None:
         self._model, self._klt = model, klt
@@ -98,9 +98,10 @@ class LocalMap:
         return Tracks(index, pixels[found], predicted[index], len(visible))
 
     def align(self, lower: Wrapped, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
-        """Pixels (M, 2) of landmarks (indices) in a panorama whose pose is known well, by warped patches, and which fit."""
+        """Pixels (M, 2) of landmarks (indices) by warped patches, in a panorama whose pose is known well; which fit."""
         T_rect_odom = se3.inverse(T_odom_rect)
-        predicted = view(se3.apply(T_rect_odom, self.points[index]), self._model.cylinder, self._model.baseline_m)[:, :2]
+        points = se3.apply(T_rect_odom, self.points[index])
+        predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2]
         templates = np.zeros((len(index), CELL_PX, CELL_PX), np.uint8)
         for seq, keyframe in self.keyframes.items():
             at = np.flatnonzero(self.anchor[index] == seq)

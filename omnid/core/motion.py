@@ -100,7 +100,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
         if np.abs(step).max() < 1e-6:
             break
     H, _, squared = _normal_equations(landmarks, clean, T, W, model)
-    return Estimate(T, np.linalg.inv(H), squared)
+    return Estimate(T, np.asarray(np.linalg.inv(H), float), squared)
 
 
 def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 class MotionFilter:
     """Filters twists [m/s; rad/s] in the rig frame; state (v, a), v <- v + dt a, measured v = (t, r) / dt.
 
-    jerk_psd: spectral density of the acceleration's change, for translation and rotation [(m/s^3)^2/Hz, (rad/s^3)^2/Hz].
+    jerk_psd: spectral density of the jerk, for translation and rotation [(m/s^3)^2/Hz, (rad/s^3)^2/Hz].
     """
 
     def __init__(self, jerk_psd: tuple[float, float] = (10.0, 40.0)) -> None:

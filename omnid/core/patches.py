@@ -43,7 +43,7 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
     change = np.where(near, change, 0.0)
     xx, yy, xy = near @ (dx * dx) + 50.0, near @ (dy * dy) + 50.0, near @ (dx * dy)
     x, y = change @ dx, change @ dy
-    return np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None]
+    return np.asarray(np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None])
 
 
 def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
@@ -98,9 +98,9 @@ def _cell_offsets() -> Array:
 
 def _sample(image: Wrapped, centres: Array, offsets: Array) -> Image:
     """Patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), across the seam if need be."""
-    padded = np.column_stack([centres[:, 0] % image.width + image.pad_px, centres[:, 1]]).astype(np.float32)
-    positions = padded[:, None] + offsets.astype(np.float32)
-    patches = cv2.remap(image.image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    columns = (centres[:, :1] % image.width + image.pad_px + offsets[..., 0]).astype(np.float32)
+    rows = (centres[:, 1:] + offsets[..., 1]).astype(np.float32)
+    patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
 
 

@@ -77,13 +77,13 @@ class PoseSearch:
 
     def _solve(self, agreeing: tuple[Indices, Array], T_curr_odom: Array, model: StereoModel
                ) -> tuple[Estimate | None, Flags]:
-        """Gauss-Newton on landmarks and their views, then once more on those (flags) that fit; None where too few do."""
+        """Gauss-Newton on landmarks and their views, once more on those (flags) that fit; None where too few do."""
         landmarks, views = agreeing
         kept = np.ones(len(landmarks), bool)
         estimate = None
+        if len(landmarks) < LEAST:
+            return None, kept
         for _ in range(2):
-            if kept.sum() < LEAST:
-                return None, kept
             chosen = landmarks[kept]
             estimate = gauss_newton(self._map.points[chosen], self._map.covariance[chosen], views[kept], T_curr_odom,
                                     model)
@@ -91,6 +91,8 @@ class PoseSearch:
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = estimate.squared
             kept = squared < OUTLIER
+            if kept.sum() < LEAST:
+                return None, kept
         return estimate, kept
 
     def _polish(self, sight: Sight, tracks: Tracks, agreeing: tuple[Indices, Array], T_curr_odom: Array) -> Fit | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.features import nearby_disparity
 from omnid.core.fit import Fit
+from omnid.core.local_map import Keyframe
 from omnid.core.motion import StereoModel, gauss_newton, ransac
 from omnid.core.sight import Sight
 from omnid.core.triangulation import point_covariance, triangulate
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 RATIO = 0.8  # a match must be this much nearer than the second best (Lowe 2004)
+FEATURES = 1500
 SIGMA_PX = 0.7  # deviation of SIFT positions and of the disparities beside them
 
 
@@ -38,14 +40,14 @@ class Relocaliser:
     def __init__(self, model: StereoModel, places: int = 8, apart_m: float = 0.3) -> None:
         self._model = StereoModel(model.cylinder, model.baseline_m, SIGMA_PX)
         self._apart_m = apart_m
-        self._sights: deque[tuple[Sight, Array]] = deque(maxlen=places)
+        self._sights: deque[tuple[Sight, Keyframe]] = deque(maxlen=places)
         self._places: dict[int, Place] = {}
 
-    def remember(self, sight: Sight, T_odom_rect: Array) -> None:
+    def remember(self, sight: Sight, keyframe: Keyframe) -> None:
         """Keeps a sight and its pose; one close to the last replaces it. Nothing is computed until it is needed."""
-        if self._sights and np.linalg.norm(self._sights[-1][1][:3, 3] - T_odom_rect[:3, 3]) < self._apart_m:
+        if self._sights and _distance_m(self._sights[-1][1], keyframe) < self._apart_m:
             self._sights.pop()
-        self._sights.append((sight, T_odom_rect))
+        self._sights.append((sight, keyframe))
         kept = {sight.seq for sight, _ in self._sights}
         self._places = {seq: place for seq, place in self._places.items() if seq in kept}
 
@@ -57,10 +59,10 @@ class Relocaliser:
     def locate(self, sight: Sight) -> Fit | None:
         """The best supported pose of a sight relative to the keyframes, newest first; None where none fits."""
         here = _describe(sight, self._model)
-        fits = (self._match(here, remembered, T_odom_rect, sight.seq) for remembered, T_odom_rect in reversed(self._sights))
+        fits = (self._match(here, *remembered, sight.seq) for remembered in reversed(self._sights))
         return max((fit for fit in fits if fit), key=lambda fit: fit.agreeing, default=None)
 
-    def _match(self, here: Place, remembered: Sight, T_odom_rect: Array, seed: int) -> Fit | None:
+    def _match(self, here: Place, remembered: Sight, keyframe: Keyframe, seed: int) -> Fit | None:
         if remembered.seq not in self._places:
             self._places[remembered.seq] = _describe(remembered, self._model)
         there = self._places[remembered.seq]
@@ -71,23 +73,30 @@ class Relocaliser:
         T_curr_ref, agree = ransac(points, views, self._model, np.random.default_rng(seed), 500, 3.0)
         if agree.sum() < 12:
             return None
-        covariance = point_covariance(points[agree], self._model.cylinder, self._model.baseline_m, SIGMA_PX)
-        estimate = gauss_newton(points[agree], covariance, views[agree], T_curr_ref, self._model)
+        spread = point_covariance(points[agree], self._model.cylinder, self._model.baseline_m, SIGMA_PX)
+        estimate = gauss_newton(points[agree], spread, views[agree], T_curr_ref, self._model)
         inliers = int((estimate.squared < 16).sum())
-        return Fit(T_odom_rect @ se3.inverse(estimate.T), estimate.covariance, len(a), len(a), inliers)
+        A = se3.adjoint(estimate.T)
+        covariance = estimate.covariance + A @ keyframe.covariance @ A.T
+        return Fit(keyframe.T_odom_rect @ se3.inverse(estimate.T), covariance, len(a), len(a), inliers)
+
+
+def _distance_m(a: Keyframe, b: Keyframe) -> float:
+    return float(np.linalg.norm(a.T_odom_rect[:3, 3] - b.T_odom_rect[:3, 3]))
 
 
 def _describe(sight: Sight, model: StereoModel) -> Place:
     """The SIFT features of the lower panorama whose disparity is known."""
     mask = np.where(sight.usable, 255, 0).astype(np.uint8)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=1500).detectAndCompute(np.ascontiguousarray(sight.lower.panorama), mask)
+    picture = np.ascontiguousarray(sight.lower.panorama)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(picture, mask)
     if descriptors is None:
         return Place(np.zeros((0, 128), np.float32), np.zeros((0, 3)), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints])
     views = np.column_stack([pixels, pixels[:, 1] + nearby_disparity(sight.disparity, pixels)])
     points = triangulate(views, model.cylinder, model.baseline_m)
     known = np.isfinite(points).all(axis=1)
-    return Place(descriptors[known], views[known], points[known])
+    return Place(np.asarray(descriptors, np.float32)[known], views[known], points[known])
 
 
 def _pairs(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

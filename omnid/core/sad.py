@@ -21,7 +21,7 @@ class SadVolume:
 
     def __init__(self, shape: tuple[int, int], disparities: int, window_px: int) -> None:
         self.window_px = window_px
-        self.planes = np.full((disparities, *shape), NEVER, np.uint16)
+        self.planes = np.full((min(disparities, shape[0]), *shape), NEVER, np.uint16)
         self._difference = np.empty(shape, np.uint8)
 
     def fill(self, lower: Image, upper: Image) -> None:
@@ -63,7 +63,7 @@ class SadVolume:
 
 def local_minima(costs: Costs, limit: Costs | int) -> NDArray[np.bool_]:
     """Which of costs (D, N) are minima along D and not above a limit; the ends of the range are none."""
-    inner = (costs[1:-1] < costs[:-2]) & (costs[1:-1] <= costs[2:]) & (costs[1:-1] <= limit)
+    inner = (costs[1:-1] < costs[:-2]) & (costs[1:-1] <= costs[2:]) & (costs[1:-1] <= limit) & (costs[2:] < NEVER)
     minima = np.zeros(costs.shape, bool)
     minima[1:-1] = inner
     return minima

@@ -24,21 +24,23 @@ class SemiGlobalPrior:
     """Disparities of the lower panorama from half-size pictures; keeps OpenCV's buffers."""
 
     def __init__(self, disparities: int) -> None:
-        half = 16 * max(1, round(disparities / 32))  # StereoSGBM wants a multiple of 16
-        self._matcher = cv2.StereoSGBM_create(
-            minDisparity=0, numDisparities=half, blockSize=BLOCK_PX, P1=SMALL_STEP, P2=LARGE_STEP,
+        self._rows = 16 * max(1, -(-disparities // 32))  # half the disparities; StereoSGBM wants a multiple of 16
+        self._matcher = cv2.StereoSGBM.create(
+            minDisparity=0, numDisparities=self._rows, blockSize=BLOCK_PX, P1=SMALL_STEP, P2=LARGE_STEP,
             disp12MaxDiff=LEFT_RIGHT_PX, preFilterCap=31, uniquenessRatio=0, mode=cv2.STEREO_SGBM_MODE_HH)
 
     def disparity(self, lower: Image, upper: Image) -> Floats:
         """Disparity (H, W) float32 [px of the full panorama], NaN where unknown; good to about half a pixel."""
-        found = self._matcher.compute(_half_on_its_side(lower), _half_on_its_side(upper))
-        half = found[:, ::-1].T.astype(np.float32) * (2 / SUBPIXEL)
+        found = self._matcher.compute(self._half_on_its_side(lower), self._half_on_its_side(upper))
+        half = found[:, : self._rows - 1 : -1].T.astype(np.float32) * (2 / SUBPIXEL)
         half[half <= 0] = np.nan
         return np.asarray(cv2.resize(half, lower.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
 
+    def _half_on_its_side(self, panorama: Image) -> Image:
+        """The panorama at half size, transposed and mirrored: its columns become rows, searched leftwards.
 
-def _half_on_its_side(panorama: Image) -> Image:
-    """The panorama at half size, transposed and mirrored: its columns become rows that StereoSGBM searches leftwards."""
-    half = cv2.resize(panorama, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(half.T[:, ::-1])
+        StereoSGBM leaves out as many pixels at the start of a row as it searches; repeated border stands there.
+        """
+        half = cv2.resize(panorama, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        return np.ascontiguousarray(cv2.copyMakeBorder(half, 0, self._rows, 0, 0, cv2.BORDER_REPLICATE).T[:, ::-1])
 

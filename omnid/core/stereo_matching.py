@@ -45,10 +45,11 @@ class Matcher:
 
     def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
         self._matching = matching
-        self._search = SemiGlobalSearch(shape, matching) if matching.method == "semiglobal" else ColumnSearch(shape, matching)
+        search = SemiGlobalSearch if matching.method == "semiglobal" else ColumnSearch
+        self._search: SemiGlobalSearch | ColumnSearch = search(shape, matching)
 
     def match(self, lower: Image, upper: Image, valid: Flags) -> Matches:
-        """The matched pixels of panoramas (H, W) uint8, whose seam the caller has padded; valid (H, W): where to look."""
+        """The matched pixels of panoramas (H, W) uint8 whose seam the caller has padded, where valid (H, W)."""
         lower, upper = smooth(lower, self._matching.sigma_px), smooth(upper, self._matching.sigma_px)
         pixels = edge_pixels(lower, valid, self._matching.edge_threshold, self._matching.max_points)
         return self._search.search(lower, upper, pixels)

@@ -42,4 +42,4 @@ def _spectrum(image: Image, usable: Flags) -> NDArray[np.complex64]:
     wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
     gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
     limited = np.clip(gradient, -100, 100) * usable
-    return np.fft.rfft(limited[::2], axis=1)
+    return np.fft.rfft(limited[::2], axis=1).astype(np.complex64)

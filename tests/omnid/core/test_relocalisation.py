@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.local_map import Keyframe
 from omnid.core.relocalisation import Relocaliser
 from omnid.core.sight import Sight
 from tests.omnid.core.scenery import Eyes, motion_errors
@@ -29,9 +31,13 @@ def nearby(eyes: Eyes) -> Sight:
     return eyes.sight(2, PLACES[1])
 
 
+def _remember(places: Relocaliser, sight: Sight, T_odom_rect: NDArray[np.float64]) -> None:
+    places.remember(sight, Keyframe(sight.seq, sight.lower, T_odom_rect, np.diag([1e-6] * 6)))
+
+
 def test_the_pose_beside_a_keyframe_is_found(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
     places = Relocaliser(eyes.model)
-    places.remember(keyframe, T_ODOM_KEYFRAME)
+    _remember(places, keyframe, T_ODOM_KEYFRAME)
     fit = places.locate(nearby)
     assert fit is not None and fit.agreeing >= 12 and fit.agreeing <= fit.tracked
     truth = T_ODOM_KEYFRAME @ se3.inverse(PLACES[0]) @ PLACES[1]
@@ -45,7 +51,7 @@ def test_another_place_and_darkness_fit_nowhere(eyes: Eyes, keyframe: Sight) -> 
     elsewhere = replace(eyes, scene=corridor(7)).sight(3, PLACES[0])
     places = Relocaliser(eyes.model)
     assert places.locate(keyframe) is None
-    places.remember(keyframe, T_ODOM_KEYFRAME)
+    _remember(places, keyframe, T_ODOM_KEYFRAME)
     fit = places.locate(elsewhere)
     assert fit is None or fit.agreeing < 20 or fit.share < 0.4
     assert places.locate(eyes.darkness(4)) is None
@@ -56,10 +62,10 @@ def test_another_place_and_darkness_fit_nowhere(eyes: Eyes, keyframe: Sight) -> 
 def test_of_many_keyframes_a_bounded_number_is_kept_the_newest(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
     """Blank sights push the good one out; one at the same place replaces the last."""
     places = Relocaliser(eyes.model, places=3)
-    places.remember(keyframe, T_ODOM_KEYFRAME)
+    _remember(places, keyframe, T_ODOM_KEYFRAME)
     for k in range(2):
-        places.remember(eyes.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
-        places.remember(eyes.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
+        _remember(places, eyes.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
+        _remember(places, eyes.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
     assert places.locate(nearby) is not None
-    places.remember(eyes.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
+    _remember(places, eyes.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
     assert places.locate(nearby) is None
