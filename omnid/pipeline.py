@@ -11,10 +11,8 @@ from omnid.config import Config
 from omnid.flow import nothing
 from omnid.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import MapUpdate, Odometry
-from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Outgoing
 from omnid.outputs.motor import MotorTick
-from omnid.outputs.recorder import Recorder
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.guidance import Guidance
@@ -30,8 +28,8 @@ class Ends:
 
     poses: dict[str, Sink[Odometry]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
-    recorder: Recorder | None = None
-    bus: BusSink | None = None
+    recorder: Sink[Outgoing] | None = None
+    bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None
 
 

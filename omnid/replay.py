@@ -84,7 +84,7 @@ class Replay:
             place = self._geometry(reader, rig)
             ends = self._ends(place, closing)
             pair = wire(self._graph, self._frames(reader), place, self._config, ends)
-            if ends.recorder:
+            if isinstance(ends.recorder, Recorder):
                 ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
             self._show_progress(reader)
             with self._stopped_by_signals():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from calib import se3
+from calib.panorama import remap_tables
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
 from drivers.mcap_reader import LogReader
@@ -17,6 +20,7 @@ from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
 from omnid.core.trajectory import read_tum
 from omnid.graph import Graph
 from omnid.messages import Depth, FramePair, Odometry
+from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, Frames, wire
 from omnid.realtime import Pace
 from omnid.stages.dewarp import Dewarp
@@ -28,6 +32,7 @@ from omnid.stages.odometry import in_axes, of_base
 from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 from tests.conftest import PAIRS
+from tests.scenes import build, render_grey
 
 CONFIG = Config()
 MS = 1_000_000
@@ -96,6 +101,33 @@ def test_points_lie_on_the_world(scene: Path, place: Geometry, frames: list[Fram
     assert np.quantile(points[sure, 2], 0.02) > -0.1
     assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2)
     assert np.isfinite(depth.disparity).sum() >= len(depth.points)
+
+
+def test_points_are_seen_where_they_were_found() -> None:
+    """In a crooked rig whose frame is neither camera's: back in both pictures, a point is where the tables say."""
+    run = build("crooked", seed=1, size=256, pairs=1)
+    place = geometry(run.rig, CONFIG.panorama)
+    pair = FramePair(0, 0, *(render_grey(run.scene, m, run.poses[0]) for m in (run.rig.lower, run.rig.upper)))
+    depth = Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
+    column, row = depth.pixels.astype(int).T
+    below = row + depth.disparity[row, column]
+    assert len(column) > 300
+    for mounted, rows in ((run.rig.lower, row), (run.rig.upper, below)):
+        seen = mounted.camera.project(se3.apply(mounted.T_cam_rig, depth.points))
+        tables = remap_tables(run.rig, mounted, place.cylinder)
+        expected = np.column_stack([cv2.remap(t, column.astype(np.float32), rows.astype(np.float32),
+                                              cv2.INTER_LINEAR).ravel() for t in tables])
+        assert np.abs(seen - expected).max() < 0.05
+
+
+def test_what_is_visible_keeps_a_margin(place: Geometry, frames: list[Frame]) -> None:
+    margin = CONFIG.panorama.margin_px
+    visible = depth_of(place, frames).panoramas.visible
+    assert not visible[: margin + 1].any() and not visible[-margin - 1 :].any() and visible.any()
+    none, wide = (Dewarp(place, replace(CONFIG.panorama, margin_px=m)) for m in (0, 20))
+    (pair,), _ = run_pairs(place, frames[:2])
+    shares = [dewarp.process(pair).visible.mean() for dewarp in (none, wide)]
+    assert shares[0] > visible.mean() > shares[1]
 
 
 def test_variance_is_that_of_the_disparity(place: Geometry, frames: list[Frame]) -> None:
@@ -189,6 +221,20 @@ def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:
     assert next(waiting) is apart[0]
     pace.wake()
     assert next(waiting) is apart[1]
+
+
+def test_nobody_waits_for_the_bus(place: Geometry, frames: list[Frame]) -> None:
+    """A bus that is slower than the cameras loses messages, and counts them; all poses are made all the same."""
+
+    class SlowBus:
+        def process(self, message: object) -> None:
+            time.sleep(0.2)
+
+    graph, tally = Graph(), Tally()
+    wire(graph, Frames(lambda: frames), place, CONFIG, Ends({"tally": tally}, bus=SlowBus()))
+    graph.run()
+    drops = {stage.name: stage.dropped for stage in graph.telemetry.stages}
+    assert tally.poses == PAIRS and drops["bus"] > PAIRS and sum(drops.values()) == drops["bus"]
 
 
 @pytest.mark.parametrize("threaded", [True, False])

@@ -117,6 +117,11 @@ def test_unwritable_output_is_said_before_the_work(omnid: Command, tmp_path: Pat
     assert kept.read_text() == "yesterday's work" and list(tmp_path.iterdir()) == [kept]
 
 
+def test_a_refused_run_leaves_nothing_behind(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    omnid.refused("replay", scene / "log.mcap", "--tum", tmp_path / "fresh", "--record", tmp_path / "absent" / "x")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = scene / "log.mcap"
     before = log.read_bytes()
