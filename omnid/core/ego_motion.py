@@ -35,9 +35,9 @@ class Limits:
     """What is enough: features wanted, and the support below which a pose is doubted or refused."""
 
     features: int = 500
-    refresh: float = 0.7  # share of the most landmarks since the last keyframe, below which one is added
+    refresh: float = 0.9  # share of the most landmarks since the last keyframe, below which one is added
     sparse_every: int = 5  # sights after which a keyframe is added where the features wanted are not reached
-    keyframes: int = 5
+    keyframes: int = 8
     min_inliers: int = 20
     min_share: float = 0.4
     sure_inliers: int = 50
@@ -176,7 +176,7 @@ class EgoMotion:
 
     def _refresh_map(self, sight: Sight, usable: Flags, fit: Fit) -> None:
         """Forgets landmarks that stay away, and adds a keyframe where too few are left."""
-        self._map.keep(fit.landmarks)
+        self._map.saw(sight.lower, fit.landmarks, fit.pixels)
         agreeing, limits = len(fit.landmarks), self._limits
         self._most_agreeing = max(self._most_agreeing, agreeing)
         self._since_keyframe += 1

@@ -22,8 +22,8 @@ class Fit:
     visible: int
     tracked: int
     agreeing: int
-    landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # indices into the local map
-    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (agreeing, 2) where they are seen
+    landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) of the local map
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where they are seen
 
     @property
     def share(self) -> float:

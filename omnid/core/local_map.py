@@ -56,7 +56,9 @@ class LocalMap:
         self.views = np.zeros((0, 3))  # (N, 3) px: column, lower row, upper row in the keyframe
         self.slopes = np.zeros((0, 2))  # (N, 2) px/px of the disparity about the view
         self.anchor = np.zeros(0, np.intp)  # (N,) seq of the keyframe
+        self._seen = np.zeros((0, 2))  # (N, 2) px in the last panorama whose pose was accepted; NaN: not there
         self._misses = np.zeros(0, np.intp)
+        self._last: Wrapped | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -74,28 +76,33 @@ class LocalMap:
         self.views = np.concatenate([self.views, views])
         self.slopes = np.concatenate([self.slopes, slopes])
         self.anchor = np.concatenate([self.anchor, np.full(len(points), keyframe.seq)])
+        self._seen = np.concatenate([self._seen, views[:, :2]])
         self._misses = np.concatenate([self._misses, np.zeros(len(points), np.intp)])
+        self._last = keyframe.lower
         self._forget_oldest()
 
     def track(self, lower: Wrapped, T_odom_rect: Array, most: int | None = None) -> Tracks:
-        """Looks for the landmarks in a panorama, from where a guessed pose predicts them.
+        """Looks for the landmarks of the last panorama in a new one, from where a guessed pose predicts them.
 
-        most: only about so many, of the keyframe that anchors most, to compare guesses cheaply.
+        most: only about so many, evenly chosen, to compare guesses cheaply.
         """
+        index, predicted = self.visible(T_odom_rect)
+        known = np.isfinite(self._seen[index, 0])
+        index, predicted = index[known], predicted[known]
+        if most is not None:
+            every = max(1, -(-len(index) // most))
+            index, predicted = index[::every], predicted[::every]
+        if self._last is None:
+            return Tracks(index[:0], np.zeros((0, 2)), predicted[:0], 0)
+        pixels, found = track(self._last, lower, self._seen[index], predicted[:, :2], self._klt)
+        return Tracks(index[found], pixels[found], predicted[found], len(index))
+
+    def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
+        """Landmarks (M,) that a pose predicts within the panorama, and their views (M, 3)."""
         predicted = view(se3.apply(se3.inverse(T_odom_rect), self.points), self._model.cylinder, self._model.baseline_m)
-        height = self._model.cylinder.height
-        visible = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < height - 1 - EDGE_ROWS))
-        if most is not None and len(visible):
-            anchors, counts = np.unique(self.anchor[visible], return_counts=True)
-            visible = visible[self.anchor[visible] == anchors[counts.argmax()]]
-            visible = visible[:: -(-len(visible) // most)]
-        pixels, found = np.empty((len(visible), 2)), np.zeros(len(visible), bool)
-        for seq, keyframe in self.keyframes.items():
-            at = np.flatnonzero(self.anchor[visible] == seq)
-            of = visible[at]
-            pixels[at], found[at] = track(keyframe.lower, lower, self.views[of, :2], predicted[of, :2], self._klt)
-        index = visible[found]
-        return Tracks(index, pixels[found], predicted[index], len(visible))
+        bottom = self._model.cylinder.height - 1 - EDGE_ROWS
+        index = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
+        return index, predicted[index]
 
     def align(self, lower: Wrapped, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
         """Pixels (M, 2) of landmarks (indices) by warped patches, in a panorama whose pose is known well; which fit."""
@@ -117,10 +124,13 @@ class LocalMap:
         anchors, counts = np.unique(self.anchor[index], return_counts=True)
         return {int(a): float(n) / len(index) for a, n in zip(anchors, counts, strict=True)}
 
-    def keep(self, seen: Indices) -> None:
-        """Drops the landmarks that were missed several times running; seen: indices of those that were not."""
+    def saw(self, lower: Wrapped, index: Indices, pixels: Array) -> None:
+        """Takes note of the landmarks (indices) seen in a panorama at pixels (M, 2); drops those missed too often."""
+        self._last = lower
+        self._seen[:] = np.nan
+        self._seen[index] = pixels
         self._misses += 1
-        self._misses[seen] = 0
+        self._misses[index] = 0
         self._select(self._misses < self._max_misses)
 
     def _forget_oldest(self) -> None:
@@ -131,6 +141,6 @@ class LocalMap:
     def _select(self, kept: Flags) -> None:
         self.points, self.covariance = self.points[kept], self.covariance[kept]
         self.views, self.slopes = self.views[kept], self.slopes[kept]
-        self.anchor, self._misses = self.anchor[kept], self._misses[kept]
+        self.anchor, self._seen, self._misses = self.anchor[kept], self._seen[kept], self._misses[kept]
         anchors = set(self.anchor.tolist())
         self.keyframes = {seq: k for seq, k in self.keyframes.items() if seq in anchors}

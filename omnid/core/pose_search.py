@@ -24,6 +24,7 @@ LEAST = 6  # landmarks, below which six unknowns are no estimate
 OUTLIER = 16.0  # squared deviations
 SAMPLE = 150  # landmarks that decide between turns
 COARSE_SIGMA_PX = 0.3  # of a track before its patch is bent to the new viewpoint
+ALIKE = 4.0  # landmarks that err alike, as neighbours do: squared errors are 1.2 to 11 times what independence gives
 ENOUGH = 0.5  # share of them, tracked, that ends the search
 
 
@@ -48,7 +49,10 @@ class PoseSearch:
         coarse, kept = self._solve(agreeing, T_curr_guess @ T_guess_odom, self._coarse_model)
         if coarse is None:
             return None
-        return self._polish(sight, tracks, (agreeing[0][kept], agreeing[1][kept]), coarse.T)
+        disparity = np.full(len(self._map), np.nan)
+        disparity[agreeing[0][kept]] = (agreeing[1][:, 2] - agreeing[1][:, 1])[kept]
+        fine = self._polish(sight, coarse.T, disparity)
+        return fine and replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=int(kept.sum()))
 
     def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
         """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.
@@ -95,18 +99,18 @@ class PoseSearch:
                 return None, kept
         return estimate, kept
 
-    def _polish(self, sight: Sight, tracks: Tracks, agreeing: tuple[Indices, Array], T_curr_odom: Array) -> Fit | None:
-        """The pose again, once the agreeing landmarks' patches are aligned as the coarse pose predicts them.
+    def _polish(self, sight: Sight, T_curr_odom: Array, disparity: Array) -> Fit | None:
+        """The pose again, from the patches of all landmarks in view, aligned as the coarse pose predicts them.
 
-        The upper row goes along with the lower one: their difference was measured between pictures of one instant.
+        disparity (N,): of the landmarks that were tracked, NaN else; measured between pictures of one instant, it
+        goes along with the lower row.
         """
-        landmarks, views = agreeing
+        landmarks, _ = self._map.visible(se3.inverse(T_curr_odom))
         pixels, fitted = self._map.align(sight.lower, se3.inverse(T_curr_odom), landmarks)
-        views = np.column_stack([pixels, views[:, 2] + pixels[:, 1] - views[:, 1]])[fitted]
-        landmarks = landmarks[fitted]
+        landmarks, pixels = landmarks[fitted], pixels[fitted]
+        views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
         estimate, kept = self._solve((landmarks, views), T_curr_odom, self._model)
         if estimate is None:
             return None
-        scale = max(1.0, float(estimate.squared.mean()) / 3)
-        return Fit(se3.inverse(estimate.T), scale * estimate.covariance, tracks.visible, len(tracks.index),
-                   int(kept.sum()), landmarks[kept], views[kept, :2])
+        scale = ALIKE * max(1.0, float(estimate.squared.mean()) / 3)
+        return Fit(se3.inverse(estimate.T), scale * estimate.covariance, 0, 0, 0, landmarks[kept], views[kept, :2])

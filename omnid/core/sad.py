@@ -24,12 +24,11 @@ class SadVolume:
         self.planes = np.full((min(disparities, shape[0]), *shape), NEVER, np.uint16)
         self._difference = np.empty(shape, np.uint8)
 
-    def fill(self, lower: Image, upper: Image) -> None:
-        """Computes all planes for a pair of panoramas (H, W)."""
-        height = lower.shape[0]
+    def fill(self, lower: Image, upper: Image, disparities: range | None = None) -> None:
+        """Computes the planes for a pair of panoramas (H, W): all, or those of the disparities asked for."""
         window = (self.window_px, self.window_px)
-        for d, plane in enumerate(self.planes):
-            rows = height - d
+        for d in disparities or range(len(self.planes)):
+            rows, plane = lower.shape[0] - d, self.planes[d]
             difference = cv2.absdiff(lower[:rows], upper[d:], self._difference[:rows])
             cv2.boxFilter(difference, cv2.CV_16U, window, plane[:rows], normalize=False,
                           borderType=cv2.BORDER_REPLICATE)

@@ -67,7 +67,10 @@ class SemiGlobalSearch:
         """The pixels with a prior, and a minimum of the SAD near it."""
         prior = self._prior.disparity(lower, upper).reshape(-1)[pixels]
         pixels, rounded = pixels[np.isfinite(prior)], np.rint(prior[np.isfinite(prior)]).astype(np.intp)
-        self._volume.fill(lower, upper)
+        if not len(pixels):
+            return pixels, np.zeros(0, np.float32)
+        first, last = max(0, int(rounded.min()) - REACH_PX), int(rounded.max()) + REACH_PX
+        self._volume.fill(lower, upper, range(first, min(last + 1, len(self._volume.planes))))
         costs = self._volume.around(pixels, rounded, REACH_PX)
         is_minimum = local_minima(costs, int(self._most))
         step = np.where(is_minimum, costs, NEVER).argmin(axis=0)
