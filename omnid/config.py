@@ -53,7 +53,7 @@ class OdometryConfig:
 
     method: str = knob("default", "how the motion is found", choices=("default", "paper"))
     tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
-    noise_px: float = knob(0.07, "deviation of a tracked corner, px", low=0.01, high=10)
+    noise_px: float = knob(0.1, "deviation of a tracked corner, px", low=0.01, high=10)
     klt: Klt = field(default_factory=Klt)
     limits: Limits = field(default_factory=Limits)
 

@@ -21,7 +21,7 @@ class StereoModel:
 
     cylinder: Cylinder
     baseline_m: float
-    sigma_px: float = 0.07
+    sigma_px: float = 0.1
 
     def residual(self, points: Array, views: Array) -> Array:
         """Views minus predictions (..., N, 3) [px], columns wrapped; views (N, 3), NaN in column 2 without upper."""
