@@ -110,13 +110,13 @@ class LocalMap:
         points = se3.apply(T_rect_odom, self.points[index])
         predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2]
         templates = np.zeros((len(index), CELL_PX, CELL_PX), np.uint8)
-        for seq, keyframe in self.keyframes.items():
-            at = np.flatnonzero(self.anchor[index] == seq)
-            of = index[at]
-            if not len(of):
-                continue
-            warps = affine_warps(self.views[of], self.slopes[of], T_rect_odom @ keyframe.T_odom_rect, self._model)
-            templates[at] = warped_templates(keyframe.lower, self.views[of, :2], warps, predicted[at])
+        anchors = self.anchor[index]
+        T_curr_ref = np.array([T_rect_odom @ self.keyframes[seq].T_odom_rect for seq in anchors.tolist()])
+        warps = affine_warps(self.views[index], self.slopes[index], T_curr_ref.reshape(-1, 4, 4), self._model)
+        for seq in np.unique(anchors).tolist():
+            at = np.flatnonzero(anchors == seq)
+            pixels = self.views[index[at], :2]
+            templates[at] = warped_templates(self.keyframes[seq].lower, pixels, warps[at], predicted[at])
         return align(templates, lower, predicted)
 
     def anchor_shares(self, index: Indices) -> dict[int, float]:

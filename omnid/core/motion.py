@@ -14,6 +14,9 @@ from omnid.core.triangulation import triangulate, view, view_jacobian
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+BATCH, MOST_BATCHES = 50, 10  # RANSAC hypotheses
+MISSED = 1e-6  # probability that none of them was free of outliers
+
 
 @dataclass(frozen=True, slots=True)
 class StereoModel:
@@ -40,23 +43,30 @@ def rigid_fit(a: Array, b: Array) -> Array:
     return se3.transform(R, (mean_b[..., 0, :, None] - R @ mean_a[..., 0, :, None])[..., 0])
 
 
-def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Generator, hypotheses: int = 200,
+def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Generator,
            threshold_px: float = 2.0) -> tuple[Array, Flags]:
     """The motion T_curr_ref that most landmarks (N, 3) agree with, and which do (N,).
 
     Three points of those seen in both cameras make a motion; consensus by the views' errors [px]. Dang et al. 2012,
-    section IV.B, with the distance measured in the pictures, where the noise is even.
+    section IV.B, with the distance measured in the pictures, where the noise is even. Hypotheses are drawn in batches
+    until three of the consensus have almost surely been among them.
     """
     seen = triangulate(views, model.cylinder, model.baseline_m)
     usable = np.flatnonzero(np.isfinite(seen).all(axis=1))
     if len(usable) < 3:
         return np.eye(4), np.zeros(len(landmarks), bool)
-    triples = usable[rng.random((hypotheses, len(usable))).argpartition(2, axis=1)[:, :3]]
-    motions = rigid_fit(landmarks[triples], seen[triples])
-    errors = model.residual(se3.apply(motions, landmarks), views)
-    agree = np.nanmax(np.abs(errors), axis=-1) < threshold_px
-    best = int(agree.sum(axis=1).argmax())
-    return motions[best], agree[best]
+    best, consensus = np.eye(4), np.zeros(len(landmarks), bool)
+    for batch in range(1, MOST_BATCHES + 1):
+        triples = usable[rng.random((BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
+        motions = rigid_fit(landmarks[triples], seen[triples])
+        errors = model.residual(se3.apply(motions, landmarks), views)
+        agree = np.nanmax(np.abs(errors), axis=-1) < threshold_px
+        first = int(agree.sum(axis=1).argmax())
+        if agree[first].sum() > consensus.sum():
+            best, consensus = motions[first], agree[first]
+        if (1 - consensus.mean() ** 3) ** (batch * BATCH) < MISSED:
+            break
+    return best, consensus
 
 
 def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel) -> Array:

@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 CELL_PX = 24  # holds the window, the largest shift and the gradient's border
-WINDOW_PX = 15
+WINDOW_PX = 13
 MOST_PX = 2.0  # a patch that has to move farther was predicted wrongly
 CELLS_A_ROW = 32
 HALF_PX = 4.0  # half the base over which the warp is taken
@@ -49,18 +49,17 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
 def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
     """Matrices (N, 2, 2): by how much a pixel moves in the current panorama per pixel in the keyframe's.
 
-    views (N, 3) and slopes (N, 2) in the keyframe. A warp that would more than halve or double is taken as none.
+    views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. A warp that would more than halve or double is taken as none.
     """
-    ends = []
-    for column, row in ((HALF_PX, 0.0), (-HALF_PX, 0.0), (0.0, HALF_PX), (0.0, -HALF_PX)):
-        moved = views + np.array([column, row, row])
-        moved[:, 2] += slopes @ (column, row)
-        points = triangulate(moved, model.cylinder, model.baseline_m)
-        ends.append(view(se3.apply(T_curr_ref, points), model.cylinder, model.baseline_m)[:, :2])
-    across, down = ends[0] - ends[1], ends[2] - ends[3]
-    for difference in (across, down):
-        difference[:, 0] = model.cylinder.wrap(difference[:, 0])
-    warps = np.stack([across, down], axis=2) / (2 * HALF_PX)
+    steps = HALF_PX * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])  # (column, row)
+    moved = views[:, None] + steps[:, [0, 1, 1]]
+    moved[..., 2] += slopes @ steps.T
+    points = triangulate(moved.reshape(-1, 3), model.cylinder, model.baseline_m).reshape(-1, 4, 3)
+    seen = view(se3.apply(T_curr_ref, points).reshape(-1, 3), model.cylinder, model.baseline_m)
+    ends = seen[:, :2].reshape(-1, 4, 2)
+    difference = ends[:, 0::2] - ends[:, 1::2]
+    difference[..., 0] = model.cylinder.wrap(difference[..., 0])
+    warps = np.swapaxes(difference, 1, 2) / (2 * HALF_PX)
     area = np.abs(np.linalg.det(warps))
     sane = (np.abs(warps) < 2).all(axis=(1, 2)) & (area > 0.25)  # false for NaN as well
     return np.where(sane[:, None, None], warps, np.eye(2))
@@ -81,8 +80,8 @@ def align(templates: Image, current: Wrapped, predicted: Array) -> tuple[Array, 
 
 def warped_templates(keyframe: Wrapped, pixels: Array, warps: Array, predicted: Array) -> Image:
     """Patches (N, CELL, CELL) uint8 of a keyframe about pixels (N, 2), as seen about predicted (N, 2) after warps."""
-    offsets = _cell_offsets() + (np.rint(predicted) - predicted)[:, None]
-    return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2))
+    offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
+    return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2).astype(np.float32))
 
 
 def _cut(image: Wrapped, centres: Array) -> Image:
@@ -90,16 +89,16 @@ def _cut(image: Wrapped, centres: Array) -> Image:
     return _sample(image, centres, _cell_offsets()[None])
 
 
-def _cell_offsets() -> Array:
+def _cell_offsets() -> Floats:
     """Positions (CELL * CELL, 2) of a cell's pixels relative to its centre."""
-    side = np.arange(CELL_PX) - CELL_PX // 2
-    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2).astype(float)
+    side = np.arange(CELL_PX, dtype=np.float32) - CELL_PX // 2
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def _sample(image: Wrapped, centres: Array, offsets: Array) -> Image:
+def _sample(image: Wrapped, centres: Array, offsets: Floats) -> Image:
     """Patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), across the seam if need be."""
-    columns = (centres[:, :1] % image.width + image.pad_px + offsets[..., 0]).astype(np.float32)
-    rows = (centres[:, 1:] + offsets[..., 1]).astype(np.float32)
+    columns = (centres[:, :1] % image.width + image.pad_px).astype(np.float32) + offsets[..., 0]
+    rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
     patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
 

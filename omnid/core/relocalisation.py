@@ -70,7 +70,7 @@ class Relocaliser:
         if len(a) < 12:
             return None
         points, views = there.points[a], here.views[b]
-        T_curr_ref, agree = ransac(points, views, self._model, np.random.default_rng(seed), 500, 3.0)
+        T_curr_ref, agree = ransac(points, views, self._model, np.random.default_rng(seed), 3.0)
         if agree.sum() < 12:
             return None
         spread = point_covariance(points[agree], self._model.cylinder, self._model.baseline_m, SIGMA_PX)
