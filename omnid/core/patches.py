@@ -60,7 +60,7 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     difference = ends[:, 0::2] - ends[:, 1::2]
     difference[..., 0] = model.cylinder.wrap(difference[..., 0])
     warps = np.swapaxes(difference, 1, 2) / (2 * HALF_PX)
-    area = np.abs(np.linalg.det(warps))
+    area = np.abs(warps[:, 0, 0] * warps[:, 1, 1] - warps[:, 0, 1] * warps[:, 1, 0])
     sane = (np.abs(warps) < 2).all(axis=(1, 2)) & (area > 0.25)  # false for NaN as well
     return np.where(sane[:, None, None], warps, np.eye(2))
 

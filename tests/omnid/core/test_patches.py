@@ -1,0 +1,109 @@
+"""Patches are bent as a wall really bends, and found again where they are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.klt import Wrapped
+from omnid.core.motion import StereoModel
+from omnid.core.patches import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.triangulation import view
+from tests.omnid.core.scenery import texture, wrapped
+
+Array = NDArray[np.float64]
+
+CYLINDER = Cylinder(1200, 360, 130.0)
+MODEL = StereoModel(CYLINDER, 0.2)
+NORMAL, DISTANCE_M = np.array([0.6, 0.8, 0.0]), 1.5  # an upright wall, askew
+MOVED = se3.exp([0.25, -0.1, 0.02, 0, 0.01, 0.3])  # T_curr_ref
+
+
+def on_the_wall(pixels: Array) -> Array:
+    """Where the rays of pixels (N, 2) meet the wall."""
+    rays = CYLINDER.rays(pixels)
+    return np.asarray(rays * (DISTANCE_M / (rays @ NORMAL))[:, None])
+
+
+def wall_views(pixels: Array) -> Array:
+    return view(on_the_wall(pixels), CYLINDER, MODEL.baseline_m)
+
+
+def moved(pixels: Array) -> Array:
+    """Where pixels of the wall (N, 2) are seen after the motion."""
+    return CYLINDER.pixels(se3.apply(MOVED, on_the_wall(pixels)))
+
+
+PIXELS = np.array([[420.3, 100.0], [380.0, 150.5], [460.0, 90.2], [400.0, 200.0]])
+
+
+def wall_slopes() -> Array:
+    def disparity(pixels: Array) -> Array:
+        views = wall_views(pixels)
+        return np.asarray(views[:, 2] - views[:, 1])
+
+    return np.column_stack([(disparity(PIXELS + step) - disparity(PIXELS - step)) / 2 for step in np.eye(2)])
+
+
+def test_the_warp_is_the_derivative_of_where_the_wall_is_seen() -> None:
+    across, down = (moved(PIXELS + step) - moved(PIXELS - step) for step in (np.array([0.5, 0]), np.array([0, 0.5])))
+    truth = np.stack([across, down], axis=2)
+    warps = affine_warps(wall_views(PIXELS), wall_slopes(), np.broadcast_to(MOVED, (len(PIXELS), 4, 4)), MODEL)
+    assert np.abs(truth - np.eye(2)).max() > 0.1  # it bends at all
+    np.testing.assert_allclose(warps, truth, atol=0.01)
+
+
+def test_an_impossible_warp_is_taken_as_none() -> None:
+    into_the_wall = se3.exp([*(1.4 * NORMAL), 0, 0, 0])
+    warps = affine_warps(wall_views(PIXELS), wall_slopes(), np.broadcast_to(se3.inverse(into_the_wall), (4, 4, 4)), MODEL)
+    beyond = affine_warps(np.full((1, 3), np.nan), np.zeros((1, 2)), MOVED[None], MODEL)
+    assert np.isfinite(warps).all() and np.abs(warps).max() <= 2
+    np.testing.assert_array_equal(beyond[0], np.eye(2))
+
+
+def test_slopes_of_a_plane_are_found_beside_a_step_and_with_gaps() -> None:
+    column, row = np.meshgrid(np.arange(200.0), np.arange(100.0))
+    plane = (20 + 0.05 * (column - 100) - 0.02 * (row - 50)).astype(np.float32)
+    plane[:, 104:] += 9  # something nearer stands beside it
+    plane[::3] = np.nan
+    slopes = disparity_slopes(plane, np.array([[98.0, 50.0], [5.0, 50.0]]), np.array([19.9, 15.25]))
+    np.testing.assert_allclose(slopes[0], [0.05, -0.02], atol=0.004)
+    np.testing.assert_allclose(disparity_slopes(plane * np.nan, np.array([[98.0, 50.0]]), np.array([20.0])), [[0, 0]])
+
+
+def bent(picture: Wrapped, warp: Array, center: Array) -> Wrapped:
+    """The picture as seen after a warp about a point: resampled by the inverse."""
+    inverse = np.linalg.inv(warp)
+    offset = center - inverse @ center
+    columns, rows = np.meshgrid(np.arange(picture.width, dtype=float), np.arange(picture.image.shape[0], dtype=float))
+    x = inverse[0, 0] * columns + inverse[0, 1] * rows + offset[0] + picture.pad_px
+    y = inverse[1, 0] * columns + inverse[1, 1] * rows + offset[1]
+    return wrapped(cv2.remap(picture.image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR))
+
+
+def test_a_bent_patch_is_found_to_hundredths_where_a_stiff_one_errs() -> None:
+    warp, center = np.array([[1.15, 0.08], [0.0, 0.92]]), np.array([240.0, 60.0])
+    before = wrapped(texture(3))
+    after = bent(before, warp, center)
+    pixels = center + np.array([[-20.0, -10], [0, 0], [14, 9], [-8, 16], [22, -12], [6, -20]])
+    truth = center + (pixels - center) @ warp.T
+    predicted = truth + np.array([0.6, -0.4])
+    errors = {}
+    for name, bend in (("bent", warp), ("stiff", np.eye(2))):
+        templates = warped_templates(before, pixels, np.broadcast_to(bend, (6, 2, 2)), predicted)
+        assert templates.shape == (6, CELL_PX, CELL_PX)
+        found, close = align(templates, after, predicted)
+        assert close.all()
+        errors[name] = np.abs(found - truth).max()
+    assert errors["bent"] < 0.06 and errors["stiff"] > 3 * errors["bent"]
+
+
+def test_patches_far_from_where_they_were_predicted_are_refused() -> None:
+    picture = wrapped(texture(3))
+    pixels = np.array([[100.0, 50.0], [200.0, 60.0]])
+    templates = warped_templates(picture, pixels, np.broadcast_to(np.eye(2), (2, 2, 2)), pixels + 5.0)
+    _, close = align(templates, picture, pixels + 5.0)
+    assert not close.any()
