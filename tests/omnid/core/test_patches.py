@@ -57,8 +57,8 @@ def test_the_warp_is_the_derivative_of_where_the_wall_is_seen() -> None:
 
 
 def test_an_impossible_warp_is_taken_as_none() -> None:
-    into_the_wall = se3.exp([*(1.4 * NORMAL), 0, 0, 0])
-    warps = affine_warps(wall_views(PIXELS), wall_slopes(), np.broadcast_to(se3.inverse(into_the_wall), (4, 4, 4)), MODEL)
+    onto_the_wall = np.broadcast_to(se3.exp([*(-1.4 * NORMAL), 0, 0, 0]), (4, 4, 4))
+    warps = affine_warps(wall_views(PIXELS), wall_slopes(), onto_the_wall, MODEL)
     beyond = affine_warps(np.full((1, 3), np.nan), np.zeros((1, 2)), MOVED[None], MODEL)
     assert np.isfinite(warps).all() and np.abs(warps).max() <= 2
     np.testing.assert_array_equal(beyond[0], np.eye(2))
