@@ -49,8 +49,8 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
 def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
     """Matrices (N, 2, 2): by how much a pixel moves in the current panorama per pixel in the keyframe's.
 
-    views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. A warp that would more than halve or
-    double is taken as none.
+    views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. A warp that would more than halve
+    or double is taken as none.
     """
     steps = HALF_PX * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])  # (column, row)
     moved = views[:, None] + steps[:, [0, 1, 1]]

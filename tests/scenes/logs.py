@@ -39,7 +39,8 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
     folder.mkdir(parents=True, exist_ok=True)
     stamps: Stamps = START_NS + PERIOD_NS * np.arange(len(poses), dtype=np.int64)
     (folder / "truth.txt").write_text(tum(stamps, poses))
-    (folder / "camchain.yaml").write_text(camchain(rig))
+    if isinstance(rig.lower.camera, UnifiedCamera):  # Kalibr has no file for others
+        (folder / "camchain.yaml").write_text(camchain(rig))
     write_rig(folder / "rig.toml", rig)
     rng = np.random.default_rng([seed, 6])
     skews: Stamps = rng.integers(-SKEW_NS, SKEW_NS + 1, len(poses), dtype=np.int64)
