@@ -10,6 +10,7 @@ import binascii
 import os
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -136,16 +137,24 @@ def write_rig(path: Path, rig: Rig) -> None:
 
 def write_file(path: Path, data: bytes) -> None:
     """Write a file whole or not at all; a pipe or a device is written as it is."""
-    target = path.resolve()
+    target = Path(os.path.realpath(path))
+    try:
+        _write_whole(target, data)
+    except OSError as error:
+        raise CalibError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _write_whole(target: Path, data: bytes) -> None:
     whole = target.is_file() or not target.exists()
     temporary = target.with_name(f".{target.name}.{os.getpid()}") if whole else target
     try:
         temporary.write_bytes(data)
         temporary.replace(target)
-    except OSError as error:
+    except OSError:
         if whole:
-            temporary.unlink(missing_ok=True)
-        raise CalibError(f"{path}: cannot be written: {error.strerror or error}") from error
+            with suppress(OSError):
+                temporary.unlink()
+        raise
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

@@ -77,11 +77,11 @@ class LogFile:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = _file_in(Path(path))
         try:
+            self.path = _file_in(Path(path))
             self._file = self.path.open("rb", buffering=0)
         except OSError as error:
-            raise DriverError(f"cannot read the log {str(self.path)!r}: {error.strerror}") from error
+            raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
         self.size = os.fstat(self._file.fileno()).st_size
         try:
             self._refuse_foreign()

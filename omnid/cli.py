@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
@@ -49,7 +50,8 @@ def _guarded(args: argparse.Namespace) -> int:
 
     try:
         code = int(args.run(args))
-        sys.stdout.flush()
+        if sys.stdout is not None:  # it is None for whoever starts us with a closed one
+            sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:
         print(f"omnid: {' '.join(str(error).split())}", file=sys.stderr)
@@ -57,5 +59,17 @@ def _guarded(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _hush()
         return 141
+    except OSError as error:  # what no command has foreseen: a disk that is full, a name that is too long
+        print(f"omnid: {error.filename or 'cannot write'}: {error.strerror or error}", file=sys.stderr)
+        _hush()
+        return WRONG
+
+
+def _hush() -> None:
+    """What is still to be written to the standard output goes nowhere."""
+    if sys.stdout is None:
+        return
+    with suppress(OSError):  # it may be no file at all
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

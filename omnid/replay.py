@@ -55,6 +55,7 @@ class Options:
     inline: bool = False
     realtime: bool = False
     quiet: bool = False
+    settings: Path | None = None  # where the configuration was read, so that nothing is written over it
 
     @property
     def files(self) -> list[tuple[str, Path]]:
@@ -76,7 +77,7 @@ class Replay:
 
     def run(self, rig: Path | None, topics: Topics) -> int:
         """The exit code; prints warnings and the summary."""
-        check_outputs(self._options.files, self._log)
+        check_outputs(self._options.files, self._inputs(rig))
         cv2.setNumThreads(self._config.graph.opencv_threads)
         with ExitStack() as closing:
             reader = self._reader(rig, topics)
@@ -91,6 +92,13 @@ class Replay:
                 self._graph.run()
             self._conclude(reader, pair)
         return 128 + self._signal if self._signal else 0
+
+    def _inputs(self, rig: Path | None) -> list[tuple[str, Path]]:
+        """The files that are read, each with its name for errors."""
+        named = (("the log that is read", self._log), ("the rig that is read", rig),
+                 ("the configuration that is read", self._options.settings))
+        in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]
+        return [(what, path) for what, path in named if path is not None] + in_folder
 
     def _reader(self, rig: Path | None, topics: Topics) -> LogReader:
         """The log, with the topics that the rig names where their own names do not tell."""

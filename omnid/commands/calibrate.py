@@ -17,6 +17,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 from omnid.errors import OmnidError
+from omnid.outputs.files import check_outputs
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.output}: {describe(rig)}")
     else:
         rig = read_rig(args.rig)
+        check_outputs([("--output", args.output)] * (args.format == "kalibr"), [("the rig that is read", args.rig)])
         written = _export_kalibr(rig, args.output) if args.format == "kalibr" else _export_ocam(rig, args.output)
         print(f"{', '.join(map(str, written))}: {describe(rig)}{_left_out(rig)}")
     return 0
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _must_be_writable(path: Path) -> None:
     existing = path if path.exists() else path.parent
-    if not existing.exists():
+    if not path.parent.is_dir():
         raise OmnidError(f"--output {path}: there is no folder {path.parent}; make it first")
     if not os.access(existing, os.W_OK):
         raise OmnidError(f"--output {path}: {existing} is not writable")
@@ -75,7 +77,7 @@ def _kalibr(args: argparse.Namespace) -> Rig:
     if args.transform or args.baseline is not None or args.view:
         raise OmnidError(f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
                          "holds its transforms")
-    _must_be_file(args.output)
+    check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
     return import_kalibr(args.camchain, args.lower, args.upper)
 
 
@@ -86,18 +88,13 @@ def _ocam(args: argparse.Namespace) -> Rig:
     if args.transform is None and args.baseline is None:
         raise OmnidError("calibrate import: OCamCalib files do not say where the cameras are: give --transform FILE or "
                          "--baseline METRES")
-    _must_be_file(args.output)
+    read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
+    check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
     T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
     return import_ocam(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror")
 
 
-def _must_be_file(path: Path) -> None:
-    if path.is_dir():
-        raise OmnidError(f"--output {path}: expected a file to write, found a folder")
-
-
 def _export_kalibr(rig: Rig, path: Path) -> list[Path]:
-    _must_be_file(path)
     write_file(path, export_kalibr(rig).encode())
     return [path]
 

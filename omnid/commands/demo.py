@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     _make(args.output)
     tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
     options = Options(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
-                      bus_optional=True, realtime=True, quiet=args.quiet)
+                      bus_optional=True, realtime=True, quiet=args.quiet, settings=args.config)
     config = load(Config, args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.settings import load
 
     options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
-                      inline=args.inline, realtime=args.realtime, quiet=args.quiet)
+                      inline=args.inline, realtime=args.realtime, quiet=args.quiet, settings=args.config)
     config = load(Config, args.config, [*args.overrides, *_shortcuts(args)])
     return Replay(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
 

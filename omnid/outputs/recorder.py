@@ -15,10 +15,14 @@ Report: TypeAlias = Callable[[Tally], dict[str, str]]
 
 
 class Recorder:
-    """Writes every message under `/<robot>/`, and the report of the run at the end; `attachments` come first."""
+    """Writes every message under `/<robot>/`, and the report of the run at the end; `attachments` come first.
+
+    The file is opened for the first message: a run that has none leaves what was there.
+    """
 
     def __init__(self, path: Path, attachments: Mapping[str, bytes], robot: str, encode: Encoder) -> None:
-        self._writer = LogWriter(path, attachments)
+        self._path, self._attachments = path, attachments
+        self._writer: LogWriter | None = None
         self._robot, self._encode, self._states = robot, encode, StateReports()
         self._newest_ns = 0
         self._tally = Tally()  # its own: the end of the run may reach others later
@@ -34,14 +38,19 @@ class Recorder:
 
     def finish(self) -> None:
         """Makes the file whole."""
+        if self._writer is None:
+            return
         self._write([summary_report(self._newest_ns, self.report(self._tally))], self._newest_ns)
         self.close()
 
     def close(self) -> None:
         """Ends the file as it is; a second call does nothing."""
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
 
     def _write(self, messages: Iterable[Encoded], stamp_ns: int) -> None:
+        if self._writer is None:
+            self._writer = LogWriter(self._path, self._attachments)
         for topic, schema, payload in messages:
             name = topic if topic.startswith("/") else f"/{self._robot}/{topic}"
             self._writer.write(name, schema, payload, stamp_ns)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +130,52 @@ def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tm
     assert "the log that is read" in omnid.refused("replay", log, "--record", scene / ".." / scene.name / "log.mcap")
     assert "--tum" in omnid.refused("replay", log, "--tum", tmp_path / "x", "--map", tmp_path / "x")
     assert log.read_bytes() == before
+
+
+def test_nothing_that_is_read_is_written_over(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    bag, rig, settings = tmp_path / "bag", tmp_path / "rig.toml", tmp_path / "omnid.toml"
+    bag.mkdir()
+    shutil.copy(scene / "log.mcap", bag / "bag_0.mcap")
+    os.link(bag / "bag_0.mcap", tmp_path / "link.mcap")
+    shutil.copy(scene / "rig.toml", rig)
+    settings.write_text(omnid("config").out)
+    before = {path: path.read_bytes() for path in (bag / "bag_0.mcap", rig, settings)}
+    for path, what in ((bag / "bag_0.mcap", "log"), (tmp_path / "link.mcap", "log"), (rig, "rig"),
+                       (settings, "configuration")):
+        error = omnid.refused("replay", bag, "--rig", rig, "--config", settings, "--quiet", "--record", path)
+        assert f"the {what} that is read" in error
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_run_without_a_pair_leaves_what_was_there(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """Refused when the first picture comes, or ended without one: yesterday's results stay."""
+    rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
+    (tmp_path / "other.toml").write_text(rig)
+    kept = {option: tmp_path / option for option in ("--tum", "--map", "--plan", "--record")}
+    for path in kept.values():
+        path.write_text("yesterday's work")
+    files = [word for option, path in kept.items() for word in (option, path)]
+    omnid.refused("replay", scene / "log.mcap", "--quiet", "--rig", tmp_path / "other.toml", *files)
+    save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in pictures(scene / "log.mcap")])
+    omnid.replay(tmp_path / "log.mcap", *files, rig=scene / "rig.toml")
+    assert [path.read_text() for path in kept.values()] == ["yesterday's work"] * 4
+
+
+def test_paths_that_no_file_can_have(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for path in (tmp_path / "loop", tmp_path / ("x" * 300), scene / "rig.toml" / "x", Path("-")):
+        omnid.refused("replay", path, "--rig", scene / "rig.toml", "--tum", tmp_path / "x")
+        omnid.refused("replay", scene / "log.mcap", "--rig", path, "--tum", tmp_path / "x")
+        omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--tum", path)
+        omnid.refused("calibrate", "import", scene / "camchain.yaml", "--output", path)
+        omnid.refused("eval", path, scene / "truth.txt")
+    assert not (tmp_path / "x").exists() and not Path("-").exists()
+
+
+def test_an_output_through_a_link_leaves_the_link(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert omnid.replay(scene / "log.mcap", "--tum", tmp_path / "link", rig=scene / "rig.toml").code == 0
+    assert (tmp_path / "link").is_symlink() and len(rows(tmp_path / "real")) == PAIRS
 
 
 def test_a_device_is_not_replaced_by_a_map(omnid: Command, scene: Path) -> None:

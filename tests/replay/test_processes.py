@@ -163,6 +163,25 @@ def test_progress_bar_on_a_terminal(scene: Path) -> None:
     assert drawn.endswith(" \r"), "the line is left empty"
 
 
+@pytest.mark.parametrize("where", ["/dev/full", "&-"])
+def test_no_traceback_where_nothing_can_be_printed(where: str) -> None:
+    shell = f"{sys.executable} -m omnid config >{where}"
+    with started(["sh", "-c", shell]) as process:
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert "Traceback" not in err
+    assert (process.returncode, err.count("\n")) == ((2, 1) if where == "/dev/full" else (0, 0))
+
+
+def test_a_disk_that_fills_cuts_no_row_in_two(tmp_path: Path, scene: Path) -> None:
+    """A limit on the size of files stands for the disk: python ignores its signal and gets the error."""
+    tum = tmp_path / "est.txt"
+    limited = ["prlimit", "--fsize=1000", *replaying(scene, "--quiet", "--tum", tum)]
+    with started(limited) as process:
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2 and err.startswith("omnid: ") and err.count("\n") == 1 and str(tum) in err
+    assert 0 < len(rows(tum)) < PAIRS
+
+
 def test_a_reader_that_leaves_early_gets_no_traceback(scene: Path) -> None:
     shell = " ".join(replaying(scene, "--quiet")) + " | head -1"
     with started(["sh", "-c", shell]) as process:
