@@ -47,8 +47,11 @@ class SadVolume:
         size = self.planes[0].size
         return np.where(inside, self.planes.reshape(-1)[np.where(inside, wanted, 0) * size + pixels], NEVER)
 
-    def seen_from_upper(self, pixels: Indices, disparity: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The disparity (N,) that the upper panorama's pixel would choose, for lower pixels and their disparities."""
+    def seen_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
+        """The disparity that the upper panorama's pixel would choose and its cost, (N,) each.
+
+        For lower pixels and their disparities.
+        """
         width = self.planes.shape[2]
         upper = pixels + disparity * width
         best = np.full(len(pixels), NEVER, np.uint16)
@@ -57,7 +60,7 @@ class SadVolume:
             cost = np.take(plane.reshape(-1), np.maximum(upper - d * width, 0), mode="clip")
             better = (cost < best) & (upper >= d * width)
             best[better], choice[better] = cost[better], d
-        return choice
+        return choice, best
 
 
 def local_minima(costs: Costs, limit: Costs | int) -> NDArray[np.bool_]:

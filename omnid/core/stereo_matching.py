@@ -1,17 +1,19 @@
 """Vertical matching of two panoramas, for the edges of the lower one: three ways to choose among candidates.
 
 `sad` takes the lowest SAD along the column (Dang et al. 2012, eq. (1)); `enhanced` settles several candidates by the
-lines to an anchor (section III.B); `semiglobal` searches only about a semi-global prior, and is the default.
+lines to anchors (section III.B); `semiglobal` searches only about a semi-global prior, and is the default.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.disambiguation import line_difference, nearest_anchor
+from omnid.core.disambiguation import Candidates, Settlement
 from omnid.core.edges import edge_pixels, smooth
 from omnid.core.sad import NEVER, Costs, Indices, SadVolume, local_minima, subpixel
 from omnid.core.semiglobal import SemiGlobalPrior
@@ -19,9 +21,9 @@ from omnid.core.semiglobal import SemiGlobalPrior
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Floats = NDArray[np.float32]
+Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
-METHODS = ("semiglobal", "enhanced", "sad")
 REACH_PX = 3  # the prior comes from half the resolution and is rounded
 
 
@@ -33,11 +35,20 @@ class Matching:
     window_px: int = 9
     disparities: int = 64
     max_difference: float = 12.0  # mean grey level difference in the window that is still a match
-    rival: float = 1.25  # a candidate is one whose SAD is at most this times the best one's, plus one grey level
+    rival: float = 2.0  # a candidate's SAD is at most this times the best one's,
+    rival_difference: float = 4.0  # plus so many grey levels
     edge_threshold: int = 40
     max_points: int = 30_000
     sigma_px: float = 0.8
-    max_candidates: int = 4
+    max_candidates: int = 8
+
+
+class Search(Protocol):
+    """A way of choosing among candidates."""
+
+    def search(self, lower: Image, upper: Image, pixels: Indices) -> Matches:
+        """The matches of some pixels of the lower panorama (H, W) in the upper one."""
+        ...
 
 
 class Matcher:
@@ -45,8 +56,7 @@ class Matcher:
 
     def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
         self._matching = matching
-        search = SemiGlobalSearch if matching.method == "semiglobal" else ColumnSearch
-        self._search: SemiGlobalSearch | ColumnSearch = search(shape, matching)
+        self._search: Search = SEARCHES[matching.method](shape, matching)
 
     def match(self, lower: Image, upper: Image, valid: Flags) -> Matches:
         """The matched pixels of panoramas (H, W) uint8 whose seam the caller has padded, where valid (H, W)."""
@@ -80,60 +90,80 @@ class SemiGlobalSearch:
 
 
 class ColumnSearch:
-    """SAD along the whole column, with the left-right check; enhanced by anchors or as it stands."""
+    """The original: the lowest SAD along the whole column, with the left-right check (Dang et al. 2012, eq. (1))."""
+
+    def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
+        self._volume = SadVolume(shape, matching.disparities, matching.window_px)
+        self._most = matching.max_difference * matching.window_px**2
+
+    def search(self, lower: Image, upper: Image, pixels: Indices) -> Matches:
+        """The pixels whose lowest SAD is below the threshold, and is the lowest from the upper panorama as well."""
+        self._volume.fill(lower, upper)
+        costs = self._volume.at(pixels)
+        disparity = costs.argmin(axis=0)
+        choice, _ = self._volume.seen_from_upper(pixels, disparity)
+        kept = _at(local_minima(costs, int(self._most)), disparity) & (np.abs(choice - disparity) <= 1)
+        return pixels[kept], subpixel(costs, disparity)[kept]
+
+
+class EnhancedSearch:
+    """SAD along the whole column; points with several candidates are settled by anchors (section III.B)."""
 
     def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
         self._matching = matching
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
 
     def search(self, lower: Image, upper: Image, pixels: Indices) -> Matches:
-        """The pixels with a candidate that the upper panorama would choose as well."""
+        """The pixels with a match that the upper panorama agrees with.
+
+        Where the lines decided clearly it need only be one of the candidates there: bricks mislead either side.
+        """
         self._volume.fill(lower, upper)
         costs = self._volume.at(pixels)
-        minima = local_minima(costs, self._limit(costs))
-        disparity = np.where(minima, costs, NEVER).argmin(axis=0)
-        if self._matching.method == "enhanced":
-            self._settle(lower, upper, pixels, (costs, minima, disparity))
-        kept = minima.any(axis=0) & (np.abs(self._volume.seen_from_upper(pixels, disparity) - disparity) <= 1)
-        return pixels[kept], subpixel(costs[:, kept], disparity[kept])
+        disparity, minima = costs.argmin(axis=0), local_minima(costs, self._limit(costs.min(axis=0)))
+        count = np.count_nonzero(minima, axis=0)
+        kept, several = (count == 1) & _at(minima, disparity), count > 1
+        kept[kept] = self._liked(pixels[kept], disparity[kept], best=True)
+        settlement = Settlement((lower, upper), pixels, disparity)
+        clear = settlement.settle(kept, self._candidates(costs, minima, count))
+        disparity = settlement.disparity
+        for which, best in ((clear, False), (several & ~clear & _at(minima, disparity), True)):
+            kept[which] = self._liked(pixels[which], disparity[which], best)
+        return pixels[kept], subpixel(costs, disparity)[kept]
 
-    def _limit(self, costs: Costs) -> Costs:
-        """The largest SAD (N,) that makes a candidate: near the best one, and never above the threshold."""
-        area = self._matching.window_px**2
-        near = costs.min(axis=0) * self._matching.rival + area
-        return np.asarray(np.minimum(near, self._matching.max_difference * area), np.uint16)
+    def _limit(self, lowest: Costs) -> Costs:
+        """The largest SAD (N,) that makes a candidate: near the lowest one, and never above the threshold."""
+        m, area = self._matching, self._matching.window_px**2
+        near = lowest * m.rival + m.rival_difference * area
+        return np.asarray(np.minimum(near, m.max_difference * area), np.uint16)
 
-    def _settle(self, lower: Image, upper: Image, pixels: Indices, found: tuple[Costs, Flags, Indices]) -> None:
-        """Overwrites the disparities of the points with several candidates, by the lines to their nearest anchors."""
-        costs, minima, disparity = found
-        candidates = minima.sum(axis=0)
-        several, anchors = np.flatnonzero(candidates > 1), np.flatnonzero(candidates == 1)
-        if not len(several) or not len(anchors):
-            return
-        rank, cost = _lowest(costs[:, several], minima[:, several], self._matching.max_candidates)
-        anchor = anchors[nearest_anchor(lower.shape, pixels[anchors], pixels[several])]
-        k, point = np.nonzero(cost < NEVER)
-        start = _positions(pixels[several[point]], lower.shape[1])
-        end = _positions(pixels[anchor[point]], lower.shape[1])
-        shifted = (_below(start, rank[k, point]), _below(end, disparity[anchor[point]]))
-        total = np.full(cost.shape, np.inf, np.float32)
-        total[k, point] = cost[k, point] / self._matching.window_px**2
-        total[k, point] += line_difference(lower, upper, (start, end, *shifted))
-        disparity[several] = np.take_along_axis(rank, total.argmin(axis=0)[None], axis=0)[0]
+    def _liked(self, pixels: Indices, disparity: Indices, best: bool) -> Flags:
+        """Whether a match is a candidate of the upper panorama's pixel as well, or even its best, to a pixel."""
+        choice, lowest = self._volume.seen_from_upper(pixels, disparity)
+        if best:
+            return np.asarray(np.abs(choice - disparity) <= 1)
+        cost = self._volume.around(pixels, disparity, 0)[0]
+        return np.asarray(cost <= self._limit(lowest))
 
-
-def _lowest(costs: Costs, minima: Flags, most: int) -> tuple[Indices, Costs]:
-    """The disparities (K, N) of the K lowest minima of costs (D, N) and their costs; NEVER where there are fewer."""
-    masked = np.where(minima, costs, NEVER)
-    rank = np.argsort(masked, axis=0)[:most]
-    return rank, np.take_along_axis(masked, rank, axis=0)
-
-
-def _positions(pixels: Indices, width: int) -> Floats:
-    """(column, row) (N, 2) of flat indices."""
-    return np.stack([pixels % width, pixels // width], axis=1).astype(np.float32)
+    def _candidates(self, costs: Costs, minima: Flags, count: Indices) -> Candidates:
+        """The minima of the points with more than one (overwritten): of too many the lowest."""
+        most = self._matching.max_candidates
+        if (many := np.flatnonzero(count > most)).size:
+            masked = np.where(minima[:, many], costs[:, many], NEVER)
+            minima[:, many] &= masked <= np.partition(masked, most - 1, axis=0)[most - 1]
+        disparity, point = np.divmod(np.flatnonzero(minima), len(count))
+        rows = np.flatnonzero(count[point] > 1)
+        disparity, point = disparity[rows], point[rows]
+        difference = costs[disparity, point] / np.float32(self._matching.window_px**2)
+        return Candidates(point, disparity, difference.astype(np.float32))
 
 
-def _below(positions: Floats, disparity: Indices) -> Floats:
-    """Positions (N, 2) moved down by the disparity."""
-    return positions + np.stack([np.zeros_like(disparity), disparity], axis=1).astype(np.float32)
+SEARCHES: dict[str, Callable[[tuple[int, int], Matching], Search]] = {
+    "semiglobal": SemiGlobalSearch, "enhanced": EnhancedSearch, "sad": ColumnSearch,
+}
+METHODS = tuple(SEARCHES)
+
+
+def _at(values: NDArray[Scalar], disparity: Indices) -> NDArray[Scalar]:
+    """The values (D, N) at disparities (N,)."""
+    return values[disparity, np.arange(len(disparity))]

@@ -75,10 +75,10 @@ def test_the_upper_pixel_chooses_among_all_that_could_be_it(volume: SadVolume) -
     pixels = (rows * WIDTH + columns).ravel()
     disparity = np.random.default_rng(3).integers(0, DISPARITIES, len(pixels))
     chosen = volume.seen_from_upper(pixels, disparity)
-    for pixel, d, choice in zip(pixels, disparity, chosen, strict=True):
+    for pixel, d, choice, cost in zip(pixels, disparity, *chosen, strict=True):
         row, column = divmod(pixel + d * WIDTH, WIDTH)
         costs = [volume.planes[k, row - k, column] if row >= k else NEVER for k in range(DISPARITIES)]
-        assert choice == int(np.argmin(costs))
+        assert choice == int(np.argmin(costs)) and cost == min(costs)
 
 
 def test_minima_lie_inside_the_range_and_below_the_limit() -> None:

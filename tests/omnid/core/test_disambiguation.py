@@ -1,0 +1,102 @@
+"""Settling several candidates by lines to anchors: the lines, the spreading of anchors, and what stays undecided."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.disambiguation import CELL_PX, CHUNK, Candidates, Settlement, line_difference
+from tests.omnid.core.scenery import texture
+
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+SHAPE, SHIFT_PX, COURSE_PX = (160, 640), 20, 12
+
+
+def lines(*ends: tuple[float, float, float]) -> NDArray[np.float32]:
+    return np.array(ends, np.float32).T
+
+
+def test_the_difference_along_lines_is_that_of_the_pixels_on_them() -> None:
+    lower, upper = texture(13, SHAPE), texture(14, SHAPE)
+    start, end = lines((10, 20, 10)), lines((42, 84, 22))
+    along = (np.arange(32) + 0.5) / 32
+    picked = []
+    for picture, first, last in ((lower, (10, 20), (42, 84)), (upper, (10, 30), (42, 106))):
+        column, row = (np.array(first) + along[:, None] * (np.array(last) - first)).T
+        c, r = column.astype(int), row.astype(int)
+        u, v = column - c, row - r
+        picked.append((picture[r, c] * (1 - u) + picture[r, c + 1] * u) * (1 - v)
+                      + (picture[r + 1, c] * (1 - u) + picture[r + 1, c + 1] * u) * v)
+    expected = np.abs(picked[0] - picked[1]).mean()
+    assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
+
+
+def test_many_lines_give_what_each_of_them_gives() -> None:
+    picture = texture(15, SHAPE)
+    start, end = np.repeat(lines((10, 20, 0)), CHUNK + 7, axis=1), np.repeat(lines((40, 80, 0)), CHUNK + 7, axis=1)
+    start[2, -1] = 40
+    difference = line_difference((picture, picture), start, end, 4)
+    assert (difference[:-1] == 0).all() and difference[-1] > 5
+
+
+def test_the_lowest_total_and_how_clear_it_is() -> None:
+    point = np.array([3, 0, 3, 0, 3, 4])
+    rows = Candidates(point, np.arange(6), np.zeros(6, np.float32))
+    best, margin = rows.best(np.array([5, 2, 4, 7, 9, 1], np.float32), 5)
+    np.testing.assert_array_equal(best[[0, 3, 4]], [1, 2, 5])
+    np.testing.assert_array_equal(margin, [5, 0, 0, 1, np.inf])
+    _, margin = rows.best(np.array([5, 2, 5, 7, 9, 1], np.float32), 5)
+    assert margin[3] == 0  # two alike are not clear
+    np.testing.assert_array_equal(rows.of(np.arange(5) == 3).disparity, [0, 2, 4])
+
+
+def courses() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A wall of courses that look alike, and the same SHIFT_PX lower."""
+    course = texture(1, (COURSE_PX * 3, SHAPE[1]), 2.0)[COURSE_PX : 2 * COURSE_PX]
+    wall = np.tile(course, (SHAPE[0] // COURSE_PX + 3, 1))
+    return wall[SHIFT_PX : SHIFT_PX + SHAPE[0]], wall[: SHAPE[0]]
+
+
+def everywhere() -> Indices:
+    rows, columns = np.meshgrid(np.arange(30, 110, 5), np.arange(6, SHAPE[1] - 6, 5), indexing="ij")
+    return np.asarray((rows * SHAPE[1] + columns).ravel())
+
+
+def settled(sure: Flags, pixels: Indices) -> tuple[Indices, Flags]:
+    """All but the sure points have equally good candidates one course apart, and start with a wrong one."""
+    true = np.array([SHIFT_PX + k * COURSE_PX for k in (-1, 0, 1, 2)])
+    several = np.flatnonzero(~sure)
+    point, disparity = np.repeat(several, 4), np.tile(true, len(several))
+    settlement = Settlement(courses(), pixels, np.where(sure, SHIFT_PX, true[0]))
+    clear = settlement.settle(sure, Candidates(point, disparity, np.ones(len(point), np.float32)))
+    return settlement.disparity, clear
+
+
+def test_from_a_few_anchors_at_one_end_the_whole_wall_is_settled() -> None:
+    pixels = everywhere()
+    sure = pixels % SHAPE[1] < 12
+    disparity, clear = settled(sure, pixels)
+    assert clear[~sure].mean() > 0.9
+    assert np.mean(disparity[clear] == SHIFT_PX) > 0.98
+
+
+def test_anchors_do_not_spread_across_a_gap() -> None:
+    pixels = everywhere()
+    columns = pixels % SHAPE[1]
+    pixels = pixels[(columns < 5 * CELL_PX) | (columns >= 7 * CELL_PX)]
+    columns = pixels % SHAPE[1]
+    disparity, clear = settled(columns < 12, pixels)
+    assert clear[(columns > 12) & (columns < 150)].mean() > 0.9
+    assert not clear[columns >= 7 * CELL_PX].any()
+    assert (disparity[columns >= 7 * CELL_PX] == SHIFT_PX - COURSE_PX).all()  # as they came
+
+
+def test_without_anchors_or_without_questions_nothing_changes() -> None:
+    pixels = everywhere()
+    for sure in (np.zeros(len(pixels), bool), np.ones(len(pixels), bool)):
+        disparity, clear = settled(sure, pixels)
+        assert not clear.any()
+        np.testing.assert_array_equal(disparity, np.where(sure, SHIFT_PX, SHIFT_PX - COURSE_PX))
