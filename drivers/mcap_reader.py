@@ -22,7 +22,7 @@ _SCAN_MESSAGES = 2000
 _WARNINGS = {
     "late": "dropped {} frames older than others given before: record with less delay or widen the window",
     "duplicate": "dropped {} frames whose camera had given one with the same stamp",
-    "broken": "skipped {} messages of the cameras' topics that hold no picture",
+    "broken": "skipped {} messages of the cameras' topics that hold no picture; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
@@ -94,6 +94,7 @@ class LogReader:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = []
         self.truncated = False
+        self._fault = ""  # of the first message that held no picture
 
     def _known_channels(self) -> Catalog:
         """From the summary; a cut log has none, so there the start of the file is looked through."""
@@ -108,8 +109,9 @@ class LogReader:
             return None
         try:
             image = parse_image(topic.type, message.data())
-        except (BrokenFrame, RecordError):
+        except (BrokenFrame, RecordError) as error:
             self.counts["broken"] += 1
+            self._fault = self._fault or str(error)
             return None
         self.counts["unstamped"] += not image.stamp_ns
         stamp_ns = image.stamp_ns or message.log_time_ns
@@ -123,4 +125,5 @@ class LogReader:
                 f"the log {str(self._file.path)!r} is cut or corrupt after byte {section.at} of {self._file.size}: "
                 "used what is whole before that"
             )
-        self.warnings += [text.format(self.counts[name]) for name, text in _WARNINGS.items() if self.counts[name]]
+        found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
+        self.warnings += [text.format(self.counts[name], fault=self._fault) for name, text in found.items()]

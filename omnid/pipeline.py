@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
@@ -41,13 +42,20 @@ class Frames:
     wake: Callable[[], None] = nothing
 
 
-def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends: Ends) -> PairSync:
-    """Joins the stages; gives the first of them for its counters."""
-    pair = PairSync(geometry.rig, config.pair)
+class Watched(NamedTuple):
+    """The stages that know what the input is worth."""
+
+    pair: PairSync
+    stereo: Stereo
+
+
+def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends: Ends) -> Watched:
+    """Joins the stages; gives those that are asked at the end."""
+    pair, stereo = PairSync(geometry.rig, config.pair), Stereo(geometry, config.stereo)
     frames = graph.source("read", source.open, wake=source.wake)
     pairs = graph.stage("pair", pair, frames)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
-    depths = graph.stage("stereo", Stereo(geometry, config.stereo), panoramas)
+    depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
     spoken: list[Stream[Outgoing]] = [odometry, commands]
@@ -64,7 +72,7 @@ def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends:
         graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
     if ends.motor:
         _drive(graph, ends.motor, commands, 1.0 / config.motor.rate_hz)
-    return pair
+    return Watched(pair, stereo)
 
 
 def _drive(graph: Graph, motor: MotorTick, commands: Stream[VelocityCommand], period_s: float) -> None:

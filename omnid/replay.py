@@ -29,14 +29,14 @@ from omnid.outputs.progress import Progress
 from omnid.outputs.recorder import Recorder
 from omnid.outputs.summary import counters, summary
 from omnid.outputs.tally import Tally
-from omnid.pipeline import Ends, Frames, wire
+from omnid.outputs.verdict import doubts, found_nothing
+from omnid.pipeline import Ends, Frames, Watched, wire
 from omnid.realtime import Pace
 from omnid.settings import dump
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus
 
-NO_PAIR = "not one pair of pictures: see the drops below; pair.tolerance_ms says how near their stamps must be"
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor")  # what they drop are deadlines, not messages
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
@@ -74,9 +74,10 @@ class Replay:
         self._tally = Tally()
         self._twin: SimulatedMotor | None = None
         self._signal = 0
+        self._warnings: list[str] = []
 
     def run(self, rig: Path | None, topics: Topics) -> int:
-        """The exit code; prints warnings and the summary."""
+        """The exit code, 1 where not one pose was found; prints warnings and the summary."""
         check_outputs(self._options.files, self._inputs(rig))
         cv2.setNumThreads(self._config.graph.opencv_threads)
         with ExitStack() as closing:
@@ -84,14 +85,19 @@ class Replay:
             closing.callback(reader.close)
             place = self._geometry(reader, rig)
             ends = self._ends(place, closing)
-            pair = wire(self._graph, self._frames(reader), place, self._config, ends)
+            watched = wire(self._graph, self._frames(reader), place, self._config, ends)
             if isinstance(ends.recorder, Recorder):
-                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
+                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, watched.pair))
             self._show_progress(reader)
-            with self._stopped_by_signals():
-                self._graph.run()
-            self._conclude(reader, pair)
-        return 128 + self._signal if self._signal else 0
+            try:
+                with self._stopped_by_signals():
+                    self._graph.run()
+            except (OmnidError, DriverError):
+                if self._tally.poses:  # what there was until then is whole
+                    self._conclude(reader, watched)
+                raise
+            self._conclude(reader, watched)
+        return 128 + self._signal if self._signal else int(found_nothing(self._tally))
 
     def _inputs(self, rig: Path | None) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
@@ -101,20 +107,22 @@ class Replay:
         return [(what, path) for what, path in named if path is not None] + in_folder
 
     def _reader(self, rig: Path | None, topics: Topics) -> LogReader:
-        """The log, with the topics that the rig names where their own names do not tell."""
+        """The log; which camera is which say the options, else the rig's topics, else the topics' own names."""
         window = self._config.log.reorder_frames
-        try:
-            return LogReader(self._log, *topics, window=window)
-        except DriverError as error:
-            named = read_rig(rig).topics if rig else ("", "")
-            with suppress(DriverError):
-                if all(named) and not all(topics):
-                    return LogReader(self._log, topics[0] or named[0], topics[1] or named[1], window=window)
-            raise error
+        named = read_rig(rig).topics if rig and not all(topics) else ("", "")
+        if all(named):
+            with suppress(DriverError):  # the log's topics may have other names than when the rig was calibrated
+                return LogReader(self._log, topics[0] or named[0], topics[1] or named[1], window=window)
+        return LogReader(self._log, *topics, window=window)
 
     def _geometry(self, reader: LogReader, path: Path | None) -> Geometry:
         rig = read_rig(path) if path else self._attached_rig(reader)
-        return geometry(with_rims(rig, reader.frames()), self._config.panorama)
+        rimmed = with_rims(rig, reader.frames())
+        for name, camera in (("lower", rimmed.lower), ("upper", rimmed.upper)):
+            if camera.mask is None:
+                self._warnings.append(f"no rim was found in the first pictures of the {name} camera, so all of each "
+                                      f"picture is used: the rig may say otherwise in [{name}.mask]")
+        return geometry(rimmed, self._config.panorama)
 
     def _attached_rig(self, reader: LogReader) -> Rig:
         attached = reader.attachments().get("rig.toml")
@@ -168,9 +176,10 @@ class Replay:
             progress = Progress(self._tally, reader.pair_estimate())
             self._graph.ticker("progress", progress.period_s, progress)
 
-    def _conclude(self, reader: LogReader, pair: PairSync) -> None:
-        nothing = [] if pair.counts["pairs"] or self._signal else [NO_PAIR]
-        for warning in [*reader.warnings, *nothing]:
+    def _conclude(self, reader: LogReader, watched: Watched) -> None:
+        pair, found = watched.pair, self._tally.poses or not self._signal
+        doubtful = doubts(watched, self._tally, self._config.pair) if found else ()
+        for warning in [*self._warnings, *reader.warnings, *doubtful]:
             print(f"omnid: warning: {warning}", file=sys.stderr)
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
         if self._twin is not None:

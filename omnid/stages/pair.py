@@ -19,19 +19,23 @@ Image = NDArray[np.uint8]
 
 
 class Decoder:
-    """Grey pictures of the size the rig was calibrated for; `broken` counts the frames that gave none."""
+    """Grey pictures of the size the rig was calibrated for; `broken` counts the frames that gave none.
+
+    `fault` says why the first of these did not.
+    """
 
     def __init__(self, rig: Rig) -> None:
         self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
         self._fitted: set[Camera] = set()
         self.broken = 0
+        self.fault = ""
 
     def __call__(self, frame: Frame) -> Image | None:
         """The picture (H, W), or None; OmnidError where a camera's first one has another size than the rig's."""
         try:
             picture = gray(frame)
-        except BrokenFrame:
-            self.broken += 1
+        except BrokenFrame as error:
+            self._skip(str(error))
             return None
         found, expected = picture.shape[::-1], self._sizes[frame.camera]
         if found == expected:
@@ -42,8 +46,12 @@ class Decoder:
                 f"the {frame.camera} camera's pictures are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
                 f"{expected[1]} px: give the rig of these cameras with --rig"
             )
-        self.broken += 1
+        self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
         return None
+
+    def _skip(self, fault: str) -> None:
+        self.broken += 1
+        self.fault = self.fault or fault
 
 
 class _Waiting(NamedTuple):
@@ -64,6 +72,17 @@ class PairSync:
         self._waiting: _Waiting | None = None
         self._unpaired: Counter[Camera] = Counter()
         self._pairs = 0
+        self._nearest_ns: int | None = None
+
+    @property
+    def fault(self) -> str:
+        """Why the first of the broken pictures could not be decoded; empty where there is none."""
+        return self._decode.fault
+
+    @property
+    def nearest_ms(self) -> float | None:
+        """How near in time two pictures came of which no pair was made; None where there were no such two."""
+        return None if self._nearest_ns is None else self._nearest_ns * 1e-6
 
     @property
     def counts(self) -> dict[str, int]:
@@ -79,10 +98,13 @@ class PairSync:
         late, self._waiting = self._waiting, _Waiting(frame.camera, frame.stamp_ns, picture)
         if late is None:
             return None
-        if late.camera == frame.camera or frame.stamp_ns - late.stamp_ns > self._tolerance_ns:
-            self._unpaired[late.camera] += 1
-            return None
-        return self._joined(late, self._waiting)
+        gap_ns = frame.stamp_ns - late.stamp_ns
+        if late.camera != frame.camera and gap_ns <= self._tolerance_ns:
+            return self._joined(late, self._waiting)
+        self._unpaired[late.camera] += 1
+        if late.camera != frame.camera:
+            self._nearest_ns = gap_ns if self._nearest_ns is None else min(gap_ns, self._nearest_ns)
+        return None
 
     def finish(self) -> tuple[()]:
         """Counts the frame that still waits."""

@@ -17,6 +17,7 @@ from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
 
+PAIRS_COMPARED, POINTS_TO_COMPARE, CLEARLY_MORE = 2, 200, 1.1
 STEP_PX, SPARE_ROWS = 32, 16  # the semi-global prior searches in such steps, and wants rows to spare
 
 
@@ -27,10 +28,22 @@ class Stereo:
         self._geometry, self._config = geometry, config
         self._T_rig_rect = geometry.T_rig_rect
         self._matcher: Matcher | None = None
+        self._compared = self._points = self._exchanged_points = 0
+
+    @property
+    def exchanged(self) -> bool:
+        """Whether more points of the first pairs match when the upper picture is taken for the lower one.
+
+        With a disparity of the wrong sign there is no true match, but walls that repeat themselves give false ones.
+        """
+        enough = self._exchanged_points >= POINTS_TO_COMPARE
+        return enough and self._exchanged_points > CLEARLY_MORE * self._points
 
     def process(self, panoramas: Panoramas) -> Depth:
         """The disparities, and their points in the rig frame."""
         columns, rows, found = self._match(panoramas)
+        if self._compared < PAIRS_COMPARED:
+            self._compare(panoramas, len(found))
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = found
         views = np.column_stack([columns, rows, rows + found]).astype(float)
@@ -50,6 +63,11 @@ class Stereo:
         pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
+
+    def _compare(self, panoramas: Panoramas, points: int) -> None:
+        self._compared += 1
+        self._points += points
+        self._exchanged_points += len(self._match(replace(panoramas, lower=panoramas.upper, upper=panoramas.lower))[0])
 
     def _variance_m2(self, points: Array) -> Array:
         """Variances (N,) along the rays to points (N, 3) in the rectified frame: depth goes with 1 / disparity."""

@@ -67,7 +67,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(omni_rig: Rig, o
         (("import", tmp_path / "k.yaml", "-o", tmp_path), "expected a file to write, found a folder"),
         (("import", tmp_path / "none.yaml", "-o", tmp_path / "rig.toml"), "cannot be read"),
         (("import", tmp_path / "k.yaml", "-o", tmp_path / "k.yaml"), "that is read as well"),
-        (("export", tmp_path / "omni.toml", "--format", "kalibr", "-o", tmp_path / "omni.toml"), "that is read as well"),
+        (("export", tmp_path / "omni.toml", "--format", "kalibr", "-o", tmp_path / "omni.toml"), "that is read"),
         (("import", tmp_path / "k.yaml", "-o", tmp_path / "k.yaml" / "rig.toml"), "there is no folder"),
         (("import", tmp_path / "k.yaml", "--baseline", 0.2, "-o", tmp_path / "rig.toml"), "go with OCamCalib files"),
         (("import", "-o", tmp_path / "rig.toml"), "expected a Kalibr camchain.yaml, or two OCamCalib files"),

@@ -247,6 +247,6 @@ def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> 
             poses.append(message)
 
     graph = Graph(threaded=threaded)
-    pair = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
+    pair, _ = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

@@ -132,8 +132,9 @@ def test_motor_that_vanishes_ends_the_run(tmp_path: Path, scene: Path) -> None:
     with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         motor.close()
-        _, err = process.communicate(timeout=PATIENCE_S)
+        out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and err.startswith("omnid: motor on") and err.count("\n") == 1
+    assert out.startswith("pairs "), "what there was until then is summed up"
     assert len(rows(tum)) >= 3
 
 

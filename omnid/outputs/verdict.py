@@ -1,0 +1,36 @@
+"""What a run shows to be amiss with its input, in the words of whoever can put it right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from omnid.config import PairConfig
+from omnid.outputs.tally import Tally
+from omnid.pipeline import Watched
+
+
+def found_nothing(tally: Tally) -> bool:
+    """Whether there is not one pose that was measured."""
+    return tally.poses == tally.states["lost"]
+
+
+def doubts(watched: Watched, tally: Tally, config: PairConfig) -> Iterator[str]:
+    """One line for each thing that is amiss."""
+    pair, stereo = watched
+    if pair.fault:
+        yield f"{pair.counts['broken']} pictures could not be decoded; the first: {pair.fault}"
+    if not pair.counts["pairs"]:
+        yield _no_pair(pair.nearest_ms, config.tolerance_ms)
+    if stereo.exchanged:
+        yield ("the pictures match better the other way round: is --lower the lower camera, and is the rig that of "
+               "these cameras?")
+    if tally.states["lost"] > tally.poses / 2:
+        yield (f"the pose was lost in {tally.states['lost']} of {tally.poses} pairs: is the rig that of these cameras, "
+               "is --lower the lower one, are the pictures bright and sharp?")
+
+
+def _no_pair(nearest_ms: float | None, tolerance_ms: float) -> str:
+    if nearest_ms is None:
+        return "not one pair of pictures: one camera or both gave none, see the drops below"
+    return (f"not one pair of pictures: the stamps of the two cameras are {nearest_ms:.3f} ms apart at best, "
+            f"pair.tolerance_ms is {tolerance_ms:g}: set it higher, or the cameras' clocks right")

@@ -1,0 +1,64 @@
+"""What a run says of input that is readable and yet wrong: cameras exchanged, clocks apart, darkness."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig_file import read_rig, write_rig
+from omnid.core.trajectory import read_tum
+from tests.conftest import PAIRS
+from tests.drivers.mcap_logs import IMAGE, LOWER, UPPER, Entry, image, write_log
+from tests.replay.command import Command
+from tests.replay.edited import dark, pictures, save
+
+
+def test_exchanged_cameras_are_noticed(omnid: Command, scene: Path) -> None:
+    right = omnid.replay(scene / "log.mcap", rig=scene / "rig.toml")
+    wrong = omnid.replay(scene / "log.mcap", "--lower", UPPER, "--upper", LOWER, rig=scene / "rig.toml")
+    assert right.code == 0 and right.err == ""
+    assert "the other way round" in wrong.err and "--lower" in wrong.err
+
+
+def test_a_rig_upside_down_knows_its_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """The rig's lower camera writes to a topic called upper: the rig is believed, and the motion is the same."""
+    rig = read_rig(scene / "rig.toml")
+    write_rig(tmp_path / "rig.toml", replace(rig, lower=rig.upper, upper=rig.lower, topics=(UPPER, LOWER)))
+    for name, file in (("a", scene / "rig.toml"), ("b", tmp_path / "rig.toml")):
+        assert omnid.replay(scene / "log.mcap", "--tum", tmp_path / name, rig=file).code == 0
+    a, b = (read_tum(tmp_path / name).T for name in "ab")
+    np.testing.assert_allclose(a[:, :3, 3], b[:, :3, 3], atol=0.02)
+
+
+@pytest.mark.parametrize(("apart_ns", "said"), [(12_000_000, "ms apart at best"), (3600 * 10**9, "clocks")])
+def test_stamps_apart(omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, said: str) -> None:
+    taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in pictures(scene / "log.mcap")]
+    result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
+    assert result.code == 1 and said in result.err and "pair.tolerance_ms" in result.err
+    assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
+
+
+def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log = save(tmp_path / "log.mcap", map(dark, pictures(scene / "log.mcap")))
+    result = omnid.replay(log, rig=scene / "rig.toml")
+    assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
+
+
+def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    plain = np.zeros((256, 256, 2), np.uint8)
+    topics = {"lower": "/lower/image_raw", "upper": "/upper/image_raw"}
+    log = write_log(tmp_path / "log.mcap", [Entry(topics[p.camera], IMAGE, image(p.stamp_ns, "yuv422", plain), 1)
+                                            for p in pictures(scene / "log.mcap")])
+    result = omnid.replay(log, rig=scene / "rig.toml")
+    assert result.code == 1 and "'yuv422'" in result.err and "rgb8" in result.err
+
+
+def test_a_rim_that_is_not_found_is_said(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    rig = read_rig(scene / "rig.toml")
+    write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, mask=None)))
+    log = save(tmp_path / "log.mcap", map(dark, pictures(scene / "log.mcap")))
+    result = omnid.replay(log, rig=tmp_path / "rig.toml")
+    assert "no rim" in result.err and "[upper.mask]" in result.err and "[lower.mask]" not in result.err
