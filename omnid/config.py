@@ -138,7 +138,7 @@ MATCHING: Mapping[str, Knob] = {
     "edge_threshold": _knob("Sobel response that makes an edge, 8 per grey level and pixel", 0, 1020),
     "max_points": _knob("edge pixels matched in a pair", 100, 1_000_000),
     "sigma_px": _knob("deviation of the Gaussian before the edges, px", 0, 10),
-    "max_candidates": _knob("candidates compared for one pixel", 1, 64),
+    "max_candidates": _knob("candidates compared for one pixel", 2, 64),
 }
 KLT: Mapping[str, Knob] = {
     "window_px": _knob("side of the tracking window, px", 5, 61),

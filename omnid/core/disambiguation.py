@@ -72,8 +72,8 @@ class Settlement:
     def settle(self, sure: Flags, candidates: Candidates) -> Flags:
         """Sets the disparities of points with candidates from those that are sure; which (N,) clearly beat the others.
 
-        sure: (N,) flags of what may be an anchor; their disparities must be right. Points without an anchor around
-        keep their disparities.
+        sure: (N,) flags of what may be an anchor; their disparities must be right. A point takes its lowest total even
+        where that is not clear; one without an anchor around keeps its disparity.
         """
         self._anchor = self._central(np.flatnonzero(sure))
         several = np.zeros(len(sure), bool)
