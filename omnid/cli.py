@@ -27,9 +27,16 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The exit code: 0 all is well, 1 found wanting, 2 the input is wrong, 130 stopped by Ctrl-C."""
+    _open_what_is_closed()
     words = list(sys.argv[1:] if argv is None else argv)
     args = _parser(words).parse_args(words)
     return _guarded(args)
+
+
+def _open_what_is_closed() -> None:
+    """Whoever starts us may have closed stdout or stderr: the next file would take its number, and what is said."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - as long as the program
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - as long as the program
 
 
 def _parser(words: Sequence[str]) -> Parser:
@@ -50,8 +57,7 @@ def _guarded(args: argparse.Namespace) -> int:
 
     try:
         code = int(args.run(args))
-        if sys.stdout is not None:  # it is None for whoever starts us with a closed one
-            sys.stdout.flush()
+        sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:
         print(f"omnid: {' '.join(str(error).split())}", file=sys.stderr)
@@ -69,7 +75,5 @@ def _guarded(args: argparse.Namespace) -> int:
 
 def _hush() -> None:
     """What is still to be written to the standard output goes nowhere."""
-    if sys.stdout is None:
-        return
     with suppress(OSError):  # it may be no file at all
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -23,7 +23,7 @@ from omnid.errors import OmnidError
 from omnid.graph import LOSSLESS, NEWEST, Graph
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder
-from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs
+from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.outputs.motor import open_motor
 from omnid.outputs.progress import Progress
 from omnid.outputs.recorder import Recorder
@@ -184,7 +184,8 @@ class Replay:
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
         if self._twin is not None:
             values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
-        print(summary(values, self._graph.telemetry.summary()))
+        spoken = sys.stderr if on_stdout(self._options.files) else sys.stdout
+        print(summary(values, self._graph.telemetry.summary()), file=spoken)
 
     def _dropped(self, reader: LogReader, pair: PairSync) -> dict[str, int]:
         """Everything that was lost on the way, by reason; zeros too."""

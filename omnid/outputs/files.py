@@ -30,6 +30,15 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
 
 
+def on_stdout(outputs: Named) -> bool:
+    """Whether one of the outputs is the standard output, so that nothing else may be said there."""
+    try:
+        found = os.fstat(1)
+    except OSError:
+        return False
+    return any(path.exists() and os.path.samestat(path.stat(), found) for _, path in outputs)
+
+
 def _identity(path: Path) -> tuple[int, int] | str:
     """The same for all names of a file, links of either kind among them."""
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from typing import TextIO
@@ -11,6 +12,7 @@ from omnid.outputs.tally import Tally
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0
 BAR = 24
+COLUMNS = 80  # of a terminal that does not say
 
 
 class Progress:
@@ -53,10 +55,17 @@ class Progress:
 
     def _show(self, line: str) -> None:
         if self._terminal:
+            line = line[: self._columns() - 1]  # a line that wraps could not be drawn over
             self._write("\r" + line.ljust(self._drawn))
             self._drawn = len(line)
         else:
             self._write(f"omnid: {line}\n")
+
+    def _columns(self) -> int:
+        try:
+            return os.get_terminal_size(self._stream.fileno()).columns or COLUMNS
+        except OSError:
+            return COLUMNS
 
     def _write(self, text: str) -> None:
         try:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -173,6 +174,22 @@ def test_no_traceback_where_nothing_can_be_printed(where: str) -> None:
     assert (process.returncode, err.count("\n")) == ((2, 1) if where == "/dev/full" else (0, 0))
 
 
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_a_closed_stream_is_no_reason_to_fail(tmp_path: Path, scene: Path, closed: str) -> None:
+    tum = tmp_path / "est.txt"
+    shell = " ".join(replaying(scene, "--tum", tum)) + f" {closed}>&-"
+    with started(["sh", "-c", shell]) as process:
+        process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0 and len(rows(tum)) == PAIRS
+
+
+def test_a_trajectory_on_stdout_stands_alone(scene: Path) -> None:
+    with started(replaying(scene, "--quiet", "--tum", "/dev/stdout")) as process:
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0 and err.startswith("pairs ")
+    assert [len(line.split()) for line in out.splitlines()] == [8] * PAIRS
+
+
 def test_a_disk_that_fills_cuts_no_row_in_two(tmp_path: Path, scene: Path) -> None:
     """A limit on the size of files stands for the disk: python ignores its signal and gets the error."""
     tum = tmp_path / "est.txt"
@@ -181,6 +198,17 @@ def test_a_disk_that_fills_cuts_no_row_in_two(tmp_path: Path, scene: Path) -> No
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and err.startswith("omnid: ") and err.count("\n") == 1 and str(tum) in err
     assert 0 < len(rows(tum)) < PAIRS
+
+
+def test_progress_fits_a_narrow_terminal(scene: Path) -> None:
+    screen, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (24, 30))
+    with subprocess.Popen(replaying(scene, "--realtime"), stdout=subprocess.PIPE, stderr=terminal, cwd=ROOT) as process:
+        process.communicate(timeout=PATIENCE_S)
+    os.close(terminal)
+    drawn = os.read(screen, 1 << 16).decode()
+    os.close(screen)
+    assert "[##" in drawn and max(map(len, drawn.split("\r"))) < 30
 
 
 def test_a_reader_that_leaves_early_gets_no_traceback(scene: Path) -> None:
