@@ -37,7 +37,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
 
 def _add_manner(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how")
-    group.add_argument("--method", choices=("default", "paper"), help="the paper's own algorithm, to compare")
+    group.add_argument("--method", choices=("default", "paper"), help="paper: the paper's odometry on its "
+                       "enhanced SAD, to compare")
     group.add_argument("--tracker", choices=("improved", "klt"), help="feature tracker of the paper's method")
     group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same numbers")
     group.add_argument("--realtime", action="store_true", help="at the pace of the log; what comes too late is dropped")
@@ -52,8 +53,13 @@ def run(args: argparse.Namespace) -> int:
 
     options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
                       inline=args.inline, realtime=args.realtime, quiet=args.quiet, settings=args.config)
-    config = load(Config, args.config, [*args.overrides, *_shortcuts(args)])
+    config = load(Config, args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
     return Replay(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
+
+
+def _presets(args: argparse.Namespace) -> list[str]:
+    """Settings that go with an option as long as nobody says otherwise with --set."""
+    return ["stereo.matching.method=enhanced"] if args.method == "paper" else []
 
 
 def _shortcuts(args: argparse.Namespace) -> list[str]:

@@ -39,7 +39,7 @@ class Encoder:
                 yield from self._poses(message)
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
                 payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
-                yield Encoded("cmd", codec.TWIST_SCHEMA, payload)
+                yield Encoded("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
                 points, confidence = _surest(message.points, self._cloud_points)
                 in_odom = se3.apply(self._T_base_rig, points.astype(float))

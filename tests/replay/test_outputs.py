@@ -101,7 +101,7 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
-    assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/cmd": PAIRS,
+    assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
                       "/rover/cloud": 1, "/rover/status": 2}
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
@@ -182,3 +182,15 @@ def test_every_knob_says_what_it_is(omnid: Command) -> None:
     for i in knobs:
         name = lines[i].split(" = ")[0]
         assert lines[i - 2].startswith("# ") and lines[i - 2] != "# " + name.replace("_", " "), name
+
+
+def test_papers_method_brings_its_own_stereo_unless_told_otherwise(
+    omnid: Command, tmp_path: Path, scene: Path
+) -> None:
+    for words, expected in (((), "enhanced"), (("--set", "stereo.matching.method=sad"), "sad")):
+        recorded = tmp_path / f"{expected}.mcap"
+        method = ("--method", "paper", *words)
+        assert omnid.replay(scene / "log.mcap", *method, "--record", recorded, rig=scene / "rig.toml").code == 0
+        with recorded.open("rb") as file:
+            attachments = {a.name: a.data for a in make_reader(file).iter_attachments()}
+        assert parse(Config, attachments["omnid.toml"], origin="attached").stereo.matching.method == expected
