@@ -19,8 +19,12 @@ def doubts(watched: Watched, tally: Tally, config: PairConfig) -> Iterator[str]:
     pair, stereo = watched
     if pair.fault:
         yield f"{pair.counts['broken']} pictures could not be decoded; the first: {pair.fault}"
-    if not pair.counts["pairs"]:
+    counts = pair.counts
+    if not counts["pairs"]:
         yield _no_pair(pair.nearest_ms, config.tolerance_ms)
+    elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
+        yield (f"most pictures of both cameras found no partner within pair.tolerance_ms, {config.tolerance_ms:g}: set "
+               "it higher, or synchronise the cameras")
     if stereo.exchanged:
         yield ("the pictures match better the other way round: is --lower the lower camera, and is the rig that of "
                "these cameras?")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
 
-PAIRS_COMPARED, POINTS_TO_COMPARE, CLEARLY_MORE = 2, 200, 1.1
+PAIRS_COMPARED, POINTS_TO_COMPARE = 2, 200
 STEP_PX, SPARE_ROWS = 32, 16  # the semi-global prior searches in such steps, and wants rows to spare
 
 
@@ -34,10 +35,10 @@ class Stereo:
     def exchanged(self) -> bool:
         """Whether more points of the first pairs match when the upper picture is taken for the lower one.
 
-        With a disparity of the wrong sign there is no true match, but walls that repeat themselves give false ones.
+        With a disparity of the wrong sign there is no true match, but walls that repeat themselves give false ones:
+        on rendered rooms 0.1 to 0.8 times as many the right way round, 1.1 to 3.6 times as many the wrong way.
         """
-        enough = self._exchanged_points >= POINTS_TO_COMPARE
-        return enough and self._exchanged_points > CLEARLY_MORE * self._points
+        return self._exchanged_points > max(POINTS_TO_COMPARE, self._points)
 
     def process(self, panoramas: Panoramas) -> Depth:
         """The disparities, and their points in the rig frame."""
@@ -57,8 +58,7 @@ class Stereo:
         """Columns (N,), rows (N,) and disparities (N,) [px] of the located pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
         if self._matcher is None:
-            height, width = lower.image.shape
-            self._matcher = Matcher((height, width), _fitting(self._config.matching, height))
+            self._matcher = Matcher(lower.image.shape[:2], self._fitting(lower.image.shape[0]))
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
         pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
@@ -76,7 +76,15 @@ class Stereo:
         return np.asarray((1 + z2 / r2) * (per_px * self._config.noise_px) ** 2)
 
 
-def _fitting(matching: Matching, height: int) -> Matching:
+    def _fitting(self, height: int) -> Matching:
+        """The matching whose disparities reach the nearest points wanted, in panoramas of so many rows."""
+        nearest_px = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m / self._config.min_range_m
+        wanted = math.ceil(nearest_px / STEP_PX) * STEP_PX
+        matching = self._config.matching
+        return _limited(replace(matching, disparities=min(matching.disparities, wanted)), height)
+
+
+def _limited(matching: Matching, height: int) -> Matching:
     """The matching for panoramas of so many rows: a larger disparity than they are high cannot be."""
     most = (height - SPARE_ROWS) // STEP_PX * STEP_PX
     if most < STEP_PX:

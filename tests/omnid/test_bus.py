@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -113,6 +114,21 @@ def test_default_is_this_machine_only() -> None:
 def test_missing_router_does_not_matter() -> None:
     with contextlib.closing(Bus(BusConfig(listen=(free_endpoint(),), connect=(free_endpoint(),)))) as bus:
         bus.publish("odom", odometry(1), realtime=True)
+
+
+@pytest.mark.slow
+def test_a_listener_that_hangs_does_not_fail_the_end() -> None:
+    """Its process is stopped and its socket's buffer full: zenoh waits 10 s for it, then gives up."""
+    endpoint = free_endpoint()
+    bus = Bus(BusConfig(listen=(endpoint,)))
+    with subscriber(endpoint, "omnid/**", 1_000_000) as process:
+        process.send_signal(signal.SIGSTOP)
+        for _ in range(200):
+            bus.publish("cloud", bytes(1 << 20))
+        started_s = time.monotonic()
+        bus.close()
+        bus.close()
+        assert 5 < time.monotonic() - started_s < 18, "it did not hang, or was waited for twice"
 
 
 def test_second_instance_is_told_which_knob() -> None:

@@ -41,6 +41,13 @@ def test_stamps_apart(omnid: Command, tmp_path: Path, scene: Path, apart_ns: int
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
+def test_most_pictures_without_a_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = [replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
+             for p in pictures(scene / "log.mcap")]
+    result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
+
+
 def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", map(dark, pictures(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
