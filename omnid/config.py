@@ -43,6 +43,7 @@ class PanoramaConfig:
 class StereoConfig:
     """Depth by matching along the columns."""
 
+    min_range_m: float = knob(0.65, "the nearest points wanted, m from the rig's axis", low=0.01, high=100)
     noise_px: float = knob(0.5, "deviation of a disparity, px: how far the map trusts a point", low=0.01, high=10)
     matching: Matching = field(default_factory=Matching)
 
@@ -131,7 +132,7 @@ def _knob(doc: str, low: float | None = None, high: float | None = None, choices
 MATCHING: Mapping[str, Knob] = {
     "method": _knob("how one of several candidates is chosen", choices=METHODS),
     "window_px": _knob("side of the matching window, px; odd", 3, 15),
-    "disparities": _knob("largest disparity, px", 8, 512),
+    "disparities": _knob("largest disparity searched, px, however near the points wanted", 8, 512),
     "max_difference": _knob("mean difference of grey levels in the window that is still a match", 0, 255),
     "rival": _knob("enhanced: a candidate's SAD is at most this times the best one's,", 1, 10),
     "rival_difference": _knob("plus so many grey levels; what has one candidate only is an anchor", 0, 255),

@@ -33,7 +33,7 @@ class Matching:
 
     method: str = "semiglobal"
     window_px: int = 9
-    disparities: int = 64
+    disparities: int = 128
     max_difference: float = 12.0  # mean grey level difference in the window that is still a match
     rival: float = 2.0  # a candidate's SAD is at most this times the best one's,
     rival_difference: float = 4.0  # plus so many grey levels

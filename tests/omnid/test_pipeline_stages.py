@@ -19,7 +19,7 @@ from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
 from omnid.core.trajectory import read_tum
 from omnid.graph import Graph
-from omnid.messages import Depth, FramePair, Odometry
+from omnid.messages import Depth, FramePair, Odometry, Panoramas
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, Frames, wire
 from omnid.realtime import Pace
@@ -32,7 +32,8 @@ from omnid.stages.odometry import in_axes, of_base
 from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 from tests.conftest import PAIRS
-from tests.scenes import build, render_grey
+from tests.omnid.core.scenery import texture, wrapped
+from tests.scenes import build, make_rig, render_grey
 
 CONFIG = Config()
 MS = 1_000_000
@@ -118,6 +119,21 @@ def test_points_are_seen_where_they_were_found() -> None:
         expected = np.column_stack([cv2.remap(t, column.astype(np.float32), rows.astype(np.float32),
                                               cv2.INTER_LINEAR).ravel() for t in tables])
         assert np.abs(seen - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
+def test_the_search_reaches_the_nearest_points_wanted(min_range_m: float, found: bool) -> None:
+    """A wall whose disparity is 60 px stands 0.6 m away."""
+    place = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
+    shape = (place.cylinder.height, place.cylinder.width)
+    lower = texture(1, shape, sigma_px=3)
+    upper = np.roll(lower, 60, axis=0)
+    inner = np.zeros(shape, bool)
+    inner[10:-80] = True
+    depth = Stereo(place, replace(CONFIG.stereo, min_range_m=min_range_m)).process(
+        Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
+    right = np.abs(depth.disparity - 60) < 1
+    assert (right.sum() > 5000) == found
 
 
 def test_what_is_visible_keeps_a_margin(place: Geometry, frames: list[Frame]) -> None:
