@@ -142,8 +142,9 @@ def _camera(table: Table) -> UnifiedCamera:
     xi, fu, fv, pu, pv = table.numbers("intrinsics", 5)
     model = table.choice("distortion_model", ("radtan", "none"))
     k1, k2, p1, p2 = table.numbers("distortion_coeffs", 4) if model == "radtan" else (0.0, 0.0, 0.0, 0.0)
+    size = table.size("resolution")
     try:
-        return UnifiedCamera(xi, (fu, fv), (pu, pv), table.size("resolution"), (k1, k2, p1, p2))
+        return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
     except CalibError as error:
         raise CalibError(f"{table.file}: {table.path}: {error}") from error
 

@@ -70,8 +70,9 @@ def _omni(table: Table) -> UnifiedCamera:
     values.only(OMNI_KEYS)
     xi, fu, fv, pu, pv = (values.number(key) for key in OMNI_KEYS[:5])
     k1, k2, p1, p2 = (values.number(key) for key in OMNI_KEYS[5:])
+    size = table.size("size")
     try:
-        return UnifiedCamera(xi, (fu, fv), (pu, pv), table.size("size"), (k1, k2, p1, p2))
+        return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
@@ -81,8 +82,9 @@ def _ocam(table: Table) -> OcamCamera:
     values.only(OCAM_KEYS)
     row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
     view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
+    polynomial, size = values.numbers("polynomial"), table.size("size")
     try:
-        return OcamCamera(values.numbers("polynomial"), (row, column), (c, d, e), table.size("size"), view)
+        return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 

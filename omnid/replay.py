@@ -39,6 +39,7 @@ from omnid.transport.bus import Bus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor")  # what they drop are deadlines, not messages
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
 
@@ -197,8 +198,9 @@ class Replay:
 
     @contextmanager
     def _stopped_by_signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM end the run whole; a second one ends it at once."""
-        before = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        """Ctrl-C, SIGTERM and a terminal that is closed end the run whole; a second one ends it at once."""
+        heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup has it
+        before = {number: signal.signal(number, self._on_signal) for number in heeded}
         try:
             yield
         finally:
