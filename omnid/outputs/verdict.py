@@ -23,8 +23,8 @@ def doubts(watched: Watched, tally: Tally, config: PairConfig) -> Iterator[str]:
     if not counts["pairs"]:
         yield _no_pair(pair.nearest_ms, config.tolerance_ms)
     elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
-        yield (f"most pictures of both cameras found no partner within pair.tolerance_ms, {config.tolerance_ms:g}: set "
-               "it higher, or synchronise the cameras")
+        yield (f"most pictures of both cameras found no partner: the next ones are {pair.nearest_ms or 0.0:.3f} ms "
+               f"apart, pair.tolerance_ms is {config.tolerance_ms:g}; where none are missing, synchronise the cameras")
     if stereo.exchanged:
         yield ("the pictures match better the other way round: is --lower the lower camera, and is the rig that of "
                "these cameras?")
