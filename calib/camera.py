@@ -63,6 +63,18 @@ def inscribed_mask(camera: OmniCamera) -> Mask:
     return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
 
 
+def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
+    """Smallest and largest angle [rad] from the camera's axis of the rays inside its mask; NaN where there are none."""
+    width, height = camera.size
+    (u, v), radius = camera.center, np.arange(0.0, np.hypot(width, height))
+    azimuth = np.deg2rad(np.arange(0, 360, 5))[:, None]
+    pixels = np.stack([u + radius * np.cos(azimuth), v + radius * np.sin(azimuth)], axis=-1).reshape(-1, 2)
+    pixels = pixels[inside_image(camera, pixels) & mask.contains(pixels)]
+    angles = np.arccos(np.clip(camera.lift(pixels)[:, 2], -1, 1))
+    seen = angles[np.isfinite(angles)]
+    return (float(seen.min()), float(seen.max())) if len(seen) else (np.nan, np.nan)
+
+
 def inside_image(camera: OmniCamera, pixels: Array) -> NDArray[np.bool_]:
     """Whether pixels (N, 2) lie on the camera's image; NaN does not."""
     width, height = camera.size

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera import OmniCamera
+from calib.camera import field_of_view
 from calib.kalibr import export_kalibr, import_kalibr
 from calib.ocam import VIEWS, OcamCamera
 from calib.ocam_file import export_ocam, import_ocam
-from calib.rig import Rig
+from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 from omnid.errors import OmnidError
@@ -116,14 +116,17 @@ def _left_out(rig: Rig) -> str:
 
 
 def describe(rig: Rig) -> str:
-    """One line about a rig: models, sizes, baseline, the turn between the cameras, topics."""
+    """One line about a rig: models, sizes, fields of view, baseline, the turn between the cameras, topics."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     turn = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
-    lower, upper = (_describe(mounted.camera, topic)
+    lower, upper = (_describe(mounted, topic)
                     for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True))
     return f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper turned by {turn:.2f} deg"
 
 
-def _describe(camera: OmniCamera, topic: str) -> str:
+def _describe(mounted: MountedCamera, topic: str) -> str:
+    camera = mounted.camera
     model = f"ocam {camera.view}" if isinstance(camera, OcamCamera) else "omni"
-    return f"{model} {camera.size[0]}x{camera.size[1]}" + (f" ({topic})" if topic else "")
+    nearest, farthest = np.rad2deg(field_of_view(camera, mounted.visible))
+    seen = f"{model} {camera.size[0]}x{camera.size[1]}, {nearest:.0f} to {farthest:.0f} deg from its axis"
+    return seen + (f" ({topic})" if topic else "")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera import Array, Mask, OmniCamera, inscribed_mask
+from calib.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 from calib.errors import CalibError
 from calib.ocam import OcamCamera
 from calib.unified import UnifiedCamera
@@ -137,3 +137,12 @@ def test_a_mask_is_a_ring_without_what_its_picture_blanks_out() -> None:
     assert mask.contains(pixels).tolist() == [False, True, True, False, False, False]
     assert mask.contains(pixels, 2.0).tolist() == [False] * 6
     assert inscribed_mask(CAMERAS["omni xi 1.0"]).outer_px == pytest.approx(379.0)
+
+
+def test_field_of_view_of_a_parabolic_mirror_by_hand() -> None:
+    """A ring of radius rho on a parabola of focal length f is seen at 2 atan(rho / f) from its axis."""
+    camera = UnifiedCamera(1.0, (-200.0, 200.0), (400.0, 380.0), (800, 760))
+    nearest, farthest = field_of_view(camera, Mask((400.0, 380.0), 60.0, 340.0))
+    assert nearest == pytest.approx(2 * math.atan(60 / 200), abs=1e-9)
+    assert farthest == pytest.approx(2 * math.atan(340 / 200), abs=1e-9)
+    assert all(map(math.isnan, field_of_view(camera, Mask((400.0, 380.0), 5000.0, 6000.0))))
