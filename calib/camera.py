@@ -64,13 +64,14 @@ def inscribed_mask(camera: OmniCamera) -> Mask:
 
 
 def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
-    """Smallest and largest angle [rad] from the camera's axis of the rays inside its mask; NaN where there are none."""
+    """Smallest and largest angle [rad] from the ray of the camera's centre inside its mask; NaN where there is none."""
     width, height = camera.size
     (u, v), radius = camera.center, np.arange(0.0, np.hypot(width, height))
     azimuth = np.deg2rad(np.arange(0, 360, 5))[:, None]
     pixels = np.stack([u + radius * np.cos(azimuth), v + radius * np.sin(azimuth)], axis=-1).reshape(-1, 2)
     pixels = pixels[inside_image(camera, pixels) & mask.contains(pixels)]
-    angles = np.arccos(np.clip(camera.lift(pixels)[:, 2], -1, 1))
+    axis = camera.lift(np.array([[u, v]]))[0]
+    angles = np.arccos(np.clip(camera.lift(pixels) @ axis, -1, 1))
     seen = angles[np.isfinite(angles)]
     return (float(seen.min()), float(seen.max())) if len(seen) else (np.nan, np.nan)
 

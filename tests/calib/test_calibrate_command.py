@@ -31,7 +31,7 @@ def test_kalibr_in_and_out(omni_rig: Rig, tmp_path: Path, capsys: pytest.Capture
     assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert f"baseline {omni_rig.baseline_m * 1e3:.1f} mm" in line and "upper turned by 14.4" in line
-    assert "lower omni 768x770 (/front/lower/image_raw), upper omni 780x768" in line
+    assert "lower omni 768x770, 0 to 117 deg from its axis (/front/lower/image_raw), upper omni 780x768, 0 to " in line
     assert omnid("export", tmp_path / "rig.toml", "--format", "kalibr", "-o", tmp_path / "again.yaml") == 0
     assert omnid("import", tmp_path / "again.yaml", "-o", tmp_path / "again.toml") == 0
     assert (tmp_path / "again.toml").read_text() == (tmp_path / "rig.toml").read_text()
@@ -50,7 +50,7 @@ def test_ocam_in_and_out(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFi
     np.testing.assert_allclose(again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
                                ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig), atol=1e-11)
     assert omnid("import", *files, "--baseline", 0.2, "--view", "direct", "-o", tmp_path / "up.toml") == 0
-    assert "lower ocam direct 1024x768, upper ocam direct 1000x780, baseline 200.0 mm, upper turned by 0.00 deg" in \
+    assert "upper ocam direct 1000x780, 0 to 118 deg from its axis, baseline 200.0 mm, upper turned by 0.00 deg" in \
         capsys.readouterr().out
     (tmp_path / "folder").mkdir()
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
