@@ -7,8 +7,6 @@ from pathlib import Path
 
 from omnid.commands.config import add_settings
 
-RIG_ATTACHMENT = "rig.toml"
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `replay` to the command line."""
