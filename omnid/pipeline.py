@@ -43,10 +43,11 @@ class Frames:
 
 
 class Watched(NamedTuple):
-    """The stages that know what the input is worth."""
+    """The stages that know what the input is worth and what was left out."""
 
     pair: PairSync
     stereo: Stereo
+    mapping: Mapping | None
 
 
 def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends: Ends) -> Watched:
@@ -59,8 +60,9 @@ def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends:
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
     spoken: list[Stream[Outgoing]] = [odometry, commands]
-    if ends.maps or ends.recorder or ends.bus:
-        maps: Stream[MapUpdate] = graph.stage("mapping", Mapping(config.mapping), odometry)
+    mapping = Mapping(config.mapping) if ends.maps or ends.recorder or ends.bus else None
+    if mapping:
+        maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
         spoken.append(maps)
         for name, file in ends.maps.items():
             graph.sink(name, file, maps)
@@ -72,7 +74,7 @@ def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends:
         graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
     if ends.motor:
         _drive(graph, ends.motor, commands, 1.0 / config.motor.rate_hz)
-    return Watched(pair, stereo)
+    return Watched(pair, stereo, mapping)
 
 
 def _drive(graph: Graph, motor: MotorTick, commands: Stream[VelocityCommand], period_s: float) -> None:

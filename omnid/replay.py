@@ -183,6 +183,8 @@ class Replay:
         for warning in [*self._warnings, *reader.warnings, *doubtful]:
             print(f"omnid: warning: {warning}", file=sys.stderr)
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
+        if watched.mapping is not None:
+            values["map"] = ", ".join(f"{name} {count}" for name, count in watched.mapping.counts.items())
         if self._twin is not None:
             values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
         spoken = sys.stderr if on_stdout(self._options.files) else sys.stdout

@@ -16,7 +16,7 @@ def found_nothing(tally: Tally) -> bool:
 
 def doubts(watched: Watched, tally: Tally, config: PairConfig) -> Iterator[str]:
     """One line for each thing that is amiss."""
-    pair, stereo = watched
+    pair, stereo, _ = watched
     if pair.fault:
         yield f"{pair.counts['broken']} pictures could not be decoded; the first: {pair.fault}"
     counts = pair.counts

@@ -48,6 +48,11 @@ class Mapping:
         self._path = Path(config.path_poses)
         self._newest: tuple[int, int] | None = None
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Voxels held, voxels given up for want of room, points that were no use."""
+        return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
+
     def process(self, odometry: Odometry) -> None:
         """Takes the points of a pair."""
         self._newest = odometry.seq, odometry.stamp_ns

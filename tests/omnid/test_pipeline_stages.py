@@ -201,6 +201,16 @@ def test_map_takes_only_what_is_sure(place: Geometry, frames: list[Frame]) -> No
     assert Mapping(MappingConfig()).finish() == []
 
 
+def test_a_map_too_small_for_the_world_says_what_it_gave_up(place: Geometry, frames: list[Frame]) -> None:
+    depth = depth_of(place, frames)
+    for log2_voxels, gives_up in ((18, False), (10, True)):
+        mapping = Mapping(MappingConfig(voxel_m=0.01, log2_voxels=log2_voxels, max_sigma_m=10.0))
+        for seq in range(3):
+            mapping.process(odometry(np.eye(4), depth=depth, seq=seq))
+        assert (mapping.counts["evicted"] > 0) == gives_up
+        assert 0 < mapping.counts["voxels"] <= 0.7 * 2**log2_voxels + len(depth.points)
+
+
 def test_path_is_thinned_but_keeps_its_ends() -> None:
     way = Way(100)
     for k in range(10_000):
@@ -263,6 +273,6 @@ def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> 
             poses.append(message)
 
     graph = Graph(threaded=threaded)
-    pair, _ = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
+    pair, *_ = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS
