@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 BATCH, MOST_BATCHES = 50, 10  # RANSAC hypotheses
+KERNEL_WIDTH = 2.5  # deviations, beyond which an error loses its say
 MISSED = 1e-6  # probability that none of them was free of outliers
 
 
@@ -97,9 +98,8 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
                  steps: int = 6) -> Estimate:
     """The motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
-    Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Geman-McClure-like Cauchy kernel,
-    S the covariance of corner and landmark. Stands where Dang et al. 2012 has eq. (9), which measures in 3-D and is
-    biased short.
+    Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
+    corner and landmark. Stands where Dang et al. 2012 has eq. (9), which measures in 3-D and is biased short.
     """
     W = whitening(landmarks, covariance, views, T, model)
     clean = np.where(np.isnan(views), 0.0, views)
@@ -124,7 +124,3 @@ def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model:
     J = J.reshape(-1, 6)
     weighted = J * np.repeat(weight, 3)[:, None]
     return weighted.T @ J + 1e-9 * np.eye(6), weighted.T @ error.ravel(), squared
-
-
-# Errors beyond this many deviations lose their say (Cauchy).
-KERNEL_WIDTH = 2.5

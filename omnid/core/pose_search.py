@@ -23,9 +23,9 @@ Indices = NDArray[np.intp]
 LEAST = 6  # landmarks, below which six unknowns are no estimate
 OUTLIER = 16.0  # squared deviations
 SAMPLE = 150  # landmarks that decide between turns
-COARSE_SIGMA_PX = 0.3  # of a track before its patch is bent to the new viewpoint
-ALIKE = 4.0  # landmarks that err alike, as neighbours do: squared errors are 1.2 to 11 times what independence gives
 ENOUGH = 0.5  # share of them, tracked, that ends the search
+COARSE_SIGMA_PX = 0.3  # of a track before its patch is bent to the new viewpoint
+ALIKE = 4.0  # landmarks that count as one: texture, depth and keyframe make neighbours err alike
 
 
 class PoseSearch:
@@ -52,7 +52,11 @@ class PoseSearch:
         disparity = np.full(len(self._map), np.nan)
         disparity[agreeing[0][kept]] = (agreeing[1][:, 2] - agreeing[1][:, 1])[kept]
         fine = self._polish(sight, coarse.T, disparity)
-        return fine and replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=int(kept.sum()))
+        if fine is None:
+            return None
+        # Both must speak for the pose: the tracks from the last sight, and the patches of the keyframes.
+        agreeing_both = min(int(kept.sum()), len(fine.landmarks))
+        return replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=agreeing_both)
 
     def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
         """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.
