@@ -54,6 +54,7 @@ class OdometryConfig:
 
     method: str = knob("default", "how the motion is found", choices=("default", "paper"))
     tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
+    reference: str = knob("previous", "what the paper's method measures against", choices=("previous", "keyframe"))
     noise_px: float = knob(0.1, "deviation of a tracked corner, px", low=0.01, high=10)
     klt: Klt = field(default_factory=Klt)
     limits: Limits = field(default_factory=Limits)
@@ -151,7 +152,7 @@ LIMITS: Mapping[str, Knob] = {
     "features": _knob("landmarks wanted in a keyframe", 20, 10_000),
     "refresh": _knob("a keyframe is added when this share of the last one's landmarks is left", 0, 1),
     "sparse_every": _knob("sights after which a keyframe is added where the features wanted are not reached", 1, 1000),
-    "keyframes": _knob("keyframes in the local map", 1, 50),
+    "keyframes": _knob("keyframes in the local map; 1: frame to frame", 1, 50),
     "min_inliers": _knob("landmarks that must agree with a pose", 4, 10_000),
     "min_share": _knob("share of the found landmarks that must agree", 0, 1),
     "sure_inliers": _knob("below so many the pose is degraded", 4, 10_000),

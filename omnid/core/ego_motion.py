@@ -178,6 +178,8 @@ class EgoMotion:
         """Forgets landmarks that stay away, and adds a keyframe where too few are left."""
         self._map.saw(sight.lower, fit.landmarks, fit.pixels)
         agreeing, limits = len(fit.landmarks), self._limits
+        if limits.keyframes == 1:  # frame to frame: all landmarks are new, for those of before go with their keyframe
+            return self._add_keyframe(sight, usable, np.zeros((0, 2)))
         self._most_agreeing = max(self._most_agreeing, agreeing)
         self._since_keyframe += 1
         sparse = agreeing < limits.refresh * limits.features and self._since_keyframe >= limits.sparse_every

@@ -6,6 +6,8 @@ sides, and what one pair of frames gets wrong stays wrong.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,43 +27,70 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 TRACKERS = ("improved", "klt")
+REFERENCES = ("previous", "keyframe")
 FEATURES = 500
 ENOUGH = 0.5  # share of the features that must be found for a turn to be the right one ("N is more than needed")
 EPSILON_PX = 3  # eq. (8): how far a located point may be from a feature that it locates
 THRESHOLD_M = 0.05  # section IV.B: how far a point of the consensus may be from where the motion puts it
 LEAST = 6  # points of the consensus, below which the motion is refused
+WORN = 0.5  # share of a keyframe's best consensus, below which the present sight takes its place
 # For the motion filter: the turns of section IV.F change the yaw rate by radians per second within a tenth of one, and
 # a filter that calls this impossible would bend the turn and swing after it.
 JERK_PSD = (10.0, 4000.0)
 BLIND_SPEED = 0.5  # what may have happened where it is [m/s and rad/s], one deviation
 
 
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The sight that motions are measured against, with its pose and covariance."""
+
+    sight: Sight
+    T_odom_rect: Array
+    covariance: Array
+
+
 class PaperMotion:
     """Follows the rectified frame from each sight to the next; odom is that frame at the first one.
 
-    tracker: 'improved' turns the picture until enough features are found (section IV.F), 'klt' does not.
+    tracker: 'improved' turns the picture until enough features are found (section IV.F), 'klt' does not. reference:
+    'previous' measures against the sight before, as the paper does; 'keyframe' against one that is kept as long as
+    half of its points agree, to tell what keyframes alone are worth.
     """
 
-    def __init__(self, model: StereoModel, klt: Klt, tracker: str = "improved") -> None:
-        if tracker not in TRACKERS:
-            raise OmnidError(f"tracker: expected one of {', '.join(TRACKERS)}, found {tracker!r}")
+    def __init__(self, model: StereoModel, klt: Klt, tracker: str = "improved", reference: str = "previous") -> None:
+        for name, found, known in (("tracker", tracker, TRACKERS), ("reference", reference, REFERENCES)):
+            if found not in known:
+                raise OmnidError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
         self._model, self._klt, self._tracker = model, klt, tracker
+        self._keeps = reference == "keyframe"
         self._filter = MotionFilter(JERK_PSD)
         self._T, self._covariance = np.eye(4), np.zeros((6, 6))
-        self._previous: Sight | None = None
+        self._reference: Reference | None = None
+        self._most_agreeing = 0
 
     def process(self, sight: Sight, dt_s: float) -> Ego:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
-        previous, self._previous = self._previous, sight
-        if previous is None:
+        reference = self._reference
+        if reference is None:
+            self._refer_to(sight)
             return self._ego(TRACKING, 0, 0)
-        Ma, Mb = self._located(previous, sight)
+        Ma, Mb = self._located(reference.sight, sight)
         M, agree = consensus(Ma, Mb, np.random.default_rng(sight.seq), THRESHOLD_M)
         agreeing = int(agree.sum())
         if agreeing < LEAST:
-            return self._refuse(dt_s, len(Ma), agreeing)
-        self._move(register(Ma[agree], Mb[agree], M), dt_s)
+            ego = self._refuse(dt_s, len(Ma), agreeing)
+            self._refer_to(sight)
+            return ego
+        self._move(reference, register(Ma[agree], Mb[agree], M), dt_s)
+        self._most_agreeing = max(self._most_agreeing, agreeing)
+        if not self._keeps or agreeing < WORN * self._most_agreeing:
+            self._refer_to(sight)
         return self._ego(TRACKING, len(Ma), agreeing)
+
+    def _refer_to(self, sight: Sight) -> None:
+        """From now on measures against a sight whose pose is the present one."""
+        self._reference = Reference(sight, self._T, self._covariance)
+        self._most_agreeing = 0
 
     def _located(self, previous: Sight, sight: Sight) -> tuple[Array, Array]:
         """Ma, Mb (N, 3): the same features before and now, those that SAD has located in both sights (section IV.A)."""
@@ -85,33 +114,35 @@ class PaperMotion:
         views = np.column_stack([features, features[:, 1] + disparity])
         return triangulate(views, self._model.cylinder, self._model.baseline_m)
 
-    def _move(self, found: Registration, dt_s: float) -> None:
+    def _move(self, reference: Reference, found: Registration, dt_s: float) -> None:
         """Filters the motion (section IV.D) and composes the inverse of what the points did: eq. (12).
 
         The filter hears the fit's own covariance. It takes the twist where eq. (11) has Euler angles: the same for
         small motions, and for large ones the only thing that is proportional to time.
         """
-        T_prev_curr = se3.inverse(found.M)
+        T_ref_curr = se3.inverse(found.M)
+        T_prev_curr = se3.inverse(self._T) @ reference.T_odom_rect @ T_ref_curr
         if dt_s > 0:
             self._filter.predict(dt_s)
             T_prev_curr = self._filter.update(T_prev_curr, found.covariance, dt_s)
         self._T = self._T @ T_prev_curr
-        self._accumulate(T_prev_curr, found.covariance)
+        self._covariance = _carried(reference.covariance, T_ref_curr) + found.covariance
 
     def _refuse(self, dt_s: float, located: int, agreeing: int) -> Ego:
         """Stays where it was: the paper has nothing for this."""
         self._filter.reset()
-        self._accumulate(np.eye(4), (BLIND_SPEED * dt_s) ** 2 * np.eye(6))
+        self._covariance = self._covariance + (BLIND_SPEED * dt_s) ** 2 * np.eye(6)
         return self._ego(LOST, located, agreeing)
-
-    def _accumulate(self, T_prev_curr: Array, covariance: Array) -> None:
-        """Carries the pose's covariance over into the new frame and adds that of the motion."""
-        A = se3.adjoint(se3.inverse(T_prev_curr))
-        self._covariance = A @ self._covariance @ A.T + covariance
 
     def _ego(self, state: str, tracked: int, agreeing: int) -> Ego:
         return Ego(self._T, self._covariance, self._filter.velocity, self._filter.velocity_covariance, state, 0,
                    tracked, agreeing)
+
+
+def _carried(covariance: Array, T_a_b: Array) -> Array:
+    """Covariance (6, 6) of a pose, given in its own axes a, in the axes of b that is rigidly joined to it."""
+    A = se3.adjoint(se3.inverse(T_a_b))
+    return np.asarray(A @ covariance @ A.T)
 
 
 def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt) -> tuple[Array, Flags]:

@@ -75,4 +75,4 @@ def _follower(geometry: Geometry, config: OdometryConfig) -> Follower:
         return EgoMotion(model, config.klt, config.limits)
     from omnid.core.paper_motion import PaperMotion  # only whoever asks for it pays for it
 
-    return PaperMotion(model, config.klt, "klt" if config.tracker == "klt" else "improved")
+    return PaperMotion(model, config.klt, config.tracker, config.reference)

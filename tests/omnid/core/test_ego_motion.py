@@ -51,6 +51,17 @@ def test_the_path_is_followed_through_a_right_angle(motion: EgoMotion, sights: l
         assert ego.tracked >= ego.agreeing >= 50
 
 
+def test_with_one_keyframe_every_sight_is_measured_against_the_one_before(eyes: Eyes, sights: list[Sight]) -> None:
+    traces = {}
+    for keyframes in (1, 8):
+        egos = follow(EgoMotion(eyes.model, Klt(), Limits(keyframes=keyframes)), sights)
+        assert motion_errors(egos[-1].T_odom_rect, truth(len(sights) - 1))[0] < 6e-3
+        assert min(ego.agreeing for ego in egos) >= 50
+        traces[keyframes] = np.array([np.trace(ego.covariance[:3, :3]) for ego in egos])
+    assert (np.diff(traces[1]) > 0).all()
+    assert traces[1][3] > 2 * traces[8][3]  # what is added with every sight is never taken away
+
+
 def test_the_covariance_tells_how_wrong_it_may_be(motion: EgoMotion, sights: list[Sight]) -> None:
     for k, ego in enumerate(follow(motion, sights)[1:], 1):
         np.testing.assert_allclose(ego.covariance, ego.covariance.T, atol=1e-12)
@@ -102,7 +113,7 @@ def test_a_long_darkness_is_lost_and_the_place_known_again(motion: EgoMotion, si
 
 def test_a_robot_carried_back_in_the_dark_knows_a_place_that_the_local_map_has_forgotten(eyes: Eyes) -> None:
     path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
-    motion = EgoMotion(eyes.model, Klt(), Limits(keyframes=1))
+    motion = EgoMotion(eyes.model, Klt(), Limits(keyframes=2))
     follow(motion, [eyes.sight(k, T) for k, T in enumerate(path)])
     follow(motion, [eyes.darkness(100 + k) for k in range(6)], first=False)
     (T_world_rig,) = planar_poses(np.array([[0.1, -0.1]]), np.array([2.0]))

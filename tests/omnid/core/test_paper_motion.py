@@ -125,6 +125,18 @@ def test_the_covariance_accumulates_frame_by_frame(eyes: Eyes, sights: list[Sigh
     assert traces[0] == 0 and (np.diff(traces) > 0).all()
 
 
+def test_a_keyframe_is_kept_as_long_as_its_points_agree(eyes: Eyes, sights: list[Sight]) -> None:
+    """So the covariance does not grow from sight to sight, as it does from frame to frame."""
+    motion = PaperMotion(eyes.model, Klt(), reference="keyframe")
+    egos = [motion.process(sight, 0.1 if k else 0.0) for k, sight in enumerate(sights)]
+    for k, ego in enumerate(egos):
+        distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
+        assert distance < 0.025 and angle < 0.01, k
+    previous = PaperMotion(eyes.model, Klt())
+    kept, carried = egos[3], [previous.process(sight, 0.1) for sight in sights[:4]][3]
+    assert np.trace(kept.covariance[:3, :3]) < 0.8 * np.trace(carried.covariance[:3, :3])
+
+
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
 def test_darkness_is_lost_and_stays_where_it_was(eyes: Eyes, sights: list[Sight], tracker: str) -> None:
     motion = PaperMotion(eyes.model, Klt(), tracker)
@@ -141,6 +153,8 @@ def test_darkness_is_lost_and_stays_where_it_was(eyes: Eyes, sights: list[Sight]
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
 
 
-def test_an_unknown_tracker_is_refused(eyes: Eyes) -> None:
+def test_an_unknown_tracker_or_reference_is_refused(eyes: Eyes) -> None:
     with pytest.raises(OmnidError, match="improved, klt, found 'sift'"):
         PaperMotion(eyes.model, Klt(), "sift")
+    with pytest.raises(OmnidError, match="previous, keyframe, found 'first'"):
+        PaperMotion(eyes.model, Klt(), reference="first")
