@@ -19,7 +19,8 @@ _MAX_JPEG_SEGMENTS = 1000
 _PADDING_BYTES = 4096
 _OPENING = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
 _CLOSING = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
-_CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}
+_CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
+_LUMA = {"yuyv": 0, "uyvy": 1}  # the channel, of two bytes a pixel
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
     "rgb8": cv2.COLOR_RGB2GRAY,
@@ -35,7 +36,7 @@ class Frame:
     seq: int  # counts the frames of this camera from 0
     stamp_ns: int  # capture time
     camera: Camera
-    encoding: str  # jpeg | png | mono8 | mono16 | bgr8 | rgb8 | bgra8 | rgba8
+    encoding: str  # jpeg | png | mono8 | mono16 | bgr8 | rgb8 | bgra8 | rgba8 | yuyv | uyvy | nv12
     data: memoryview | bytes | NDArray[Any]  # C-contiguous
     width: int = 0  # px
     height: int = 0  # px
@@ -56,8 +57,9 @@ class FrameSource(Protocol):
 def gray(frame: Frame) -> NDArray[np.uint8]:
     """The picture as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
 
-    Colours are weighed as OpenCV does, mono16 keeps its upper byte, and an EXIF orientation is ignored, since the
-    calibration belongs to the sensor's own axes. Raises BrokenFrame for anything cut, malformed or unknown.
+    Colours are weighed as OpenCV does, mono16 keeps its upper byte, yuyv, uyvy and nv12 their luma as it is, and an
+    EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises BrokenFrame for
+    anything cut, malformed or unknown.
     """
     try:
         picture = _decompress(frame) if frame.encoding in _OPENING else _unpack(frame)
@@ -124,7 +126,9 @@ def _refuse_size(frame: Frame, width: int, height: int) -> None:
 
 def _unpack(frame: Frame) -> NDArray[np.uint8]:
     pixels = _pixels(frame)
-    if frame.encoding == "mono8":
+    if frame.encoding in _LUMA:
+        return np.array(pixels[..., _LUMA[frame.encoding]], np.uint8, order="C")
+    if _CHANNELS[frame.encoding] == 1 and pixels.dtype == np.uint8:
         return np.array(pixels, np.uint8, order="C") if pixels.flags.writeable else np.ascontiguousarray(pixels)
     if frame.encoding == "mono16":
         return (pixels >> 8).astype(np.uint8)
@@ -132,7 +136,8 @@ def _unpack(frame: Frame) -> NDArray[np.uint8]:
 
 
 def _pixels(frame: Frame) -> NDArray[Any]:
-    """A view of the raw pixels, (H, W) or (H, W, channels), that leaves out the padding of the rows."""
+    """A view of the raw pixels, (H, W) or (H, W, channels), that leaves out the padding of the rows and the planes
+    after the first."""
     channels = _CHANNELS.get(frame.encoding)
     if channels is None:
         raise _broken(frame, f"known encodings are {', '.join([*_OPENING, *_CHANNELS])}")

@@ -53,6 +53,38 @@ def test_mono8_is_taken_as_it_is(padding: int) -> None:
     np.testing.assert_array_equal(gray(frame("mono8", memoryview(data), step=step)), COLOURS[..., 0])
 
 
+@pytest.mark.parametrize(("encoding", "luma"), [("yuyv", 0), ("uyvy", 1)])
+@pytest.mark.parametrize("padding", [0, 6])
+def test_luma_of_packed_colours_is_every_second_byte(encoding: str, luma: int, padding: int) -> None:
+    data, step = padded_rows(np.ascontiguousarray(COLOURS[..., :2]), padding)
+    np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), COLOURS[..., luma])
+
+
+def test_packed_colours_agree_with_opencvs_reading() -> None:
+    even = np.ascontiguousarray(COLOURS[:, :36, :2])
+    for encoding, code in (("yuyv", cv2.COLOR_YUV2GRAY_YUYV), ("uyvy", cv2.COLOR_YUV2GRAY_UYVY)):
+        np.testing.assert_array_equal(gray(frame(encoding, even.tobytes(), width=36)), cv2.cvtColor(even, code))
+
+
+@pytest.mark.parametrize("padding", [0, 3])
+def test_luma_of_nv12_is_its_first_plane(padding: int) -> None:
+    data, step = padded_rows(COLOURS[..., 0], padding)
+    chroma = bytes(step * (HEIGHT + 1) // 2)
+    np.testing.assert_array_equal(gray(frame("nv12", data + chroma, step=step)), COLOURS[..., 0])
+
+
+def test_a_jpeg_of_a_camera_that_sends_no_huffman_tables_decodes() -> None:
+    """Motion JPEG leaves the standard tables out (USB Video Class 1.5, payload of MJPEG, 3.1)."""
+    data, bare, at = encoded(".jpg"), b"\xff\xd8", 2
+    while data[at + 1] != 0xDA:
+        size = 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        bare += b"" if data[at + 1] == 0xC4 else data[at : at + size]
+        at += size
+    bare += data[at:]
+    assert b"\xff\xc4" not in bare[: len(bare) - len(data) + at] and len(bare) < len(data)
+    np.testing.assert_array_equal(gray(frame("jpeg", bare)), gray(frame("jpeg", data)))
+
+
 @pytest.mark.parametrize(("order", "bigendian"), [("<u2", False), (">u2", True)])
 @pytest.mark.parametrize("padding", [0, 3])
 def test_mono16_keeps_its_upper_byte(order: str, bigendian: bool, padding: int) -> None:
@@ -84,7 +116,7 @@ def test_an_orientation_in_exif_does_not_turn_the_picture() -> None:
     np.testing.assert_array_equal(gray(frame("jpeg", turned)), gray(frame("jpeg", data)))
 
 
-@pytest.mark.parametrize("encoding", ["jpeg", "mono8", "mono16", "bgr8", "rgba8"])
+@pytest.mark.parametrize("encoding", ["jpeg", "mono8", "mono16", "bgr8", "rgba8", "yuyv", "uyvy", "nv12"])
 def test_the_picture_is_read_only_and_nobody_can_change_it_later(encoding: str) -> None:
     buffer = np.frombuffer(encoded(".jpg") if encoding == "jpeg" else COLOURS.tobytes(), np.uint8).copy()
     picture = gray(frame(encoding, buffer))
@@ -112,6 +144,8 @@ def test_the_padding_does_not_hide_a_cut() -> None:
     [
         (frame("mono8", bytes(WIDTH * HEIGHT - 1)), "bytes"),
         (frame("bgr8", bytes(WIDTH * HEIGHT)), "bytes"),
+        (frame("yuyv", bytes(WIDTH * HEIGHT * 2 - 1)), "bytes"),
+        (frame("nv12", bytes(WIDTH * HEIGHT - 1)), "bytes"),
         (frame("mono16", bytes(WIDTH * HEIGHT * 2), step=WIDTH), "step"),
         (frame("mono8", bytes(100), width=0), "size"),
         (frame("mono8", bytes(100), width=-3), "size"),

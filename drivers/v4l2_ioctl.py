@@ -1,0 +1,182 @@
+"""The part of the kernel's V4L2 interface that a camera needs: its structures, its request numbers and the call.
+
+Source: linux/videodev2.h of Linux 6.1 and its documentation (userspace-api/media/v4l). The structures follow the C
+library's own long, so that they are right on 64 bits and on 32; there the kernel's old requests with a 32-bit timeval
+are used, which a monotonic clock does not outgrow.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+from typing import Final
+
+CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+MMAP: Final = 1  # V4L2_MEMORY_MMAP
+PROGRESSIVE: Final = 1  # V4L2_FIELD_NONE
+DISCRETE: Final = 1  # V4L2_FRMSIZE_TYPE_DISCRETE and V4L2_FRMIVAL_TYPE_DISCRETE
+
+CAP_VIDEO_CAPTURE: Final = 0x00000001
+CAP_STREAMING: Final = 0x04000000
+CAP_DEVICE_CAPS: Final = 0x80000000
+CAP_TIMEPERFRAME: Final = 0x1000
+
+BUFFER_ERROR: Final = 0x40
+TIMESTAMP_MASK: Final = 0xE000
+TIMESTAMP_MONOTONIC: Final = 0x2000
+
+NEXT_CONTROL: Final = 0x80000000
+CONTROL_DISABLED: Final = 0x01
+CONTROL_READ_ONLY: Final = 0x04
+CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER_MENU = 1, 2, 3, 9
+
+Number = ctypes.c_int32
+_u8, _u32, _i32 = ctypes.c_uint8, ctypes.c_uint32, ctypes.c_int32
+
+
+class Capability(ctypes.Structure):
+    """struct v4l2_capability."""
+
+    _fields_ = (("driver", ctypes.c_char * 16), ("card", ctypes.c_char * 32), ("bus_info", ctypes.c_char * 32),
+                ("version", _u32), ("capabilities", _u32), ("device_caps", _u32), ("reserved", _u32 * 3))
+
+
+class FormatDescription(ctypes.Structure):
+    """struct v4l2_fmtdesc."""
+
+    _fields_ = (("index", _u32), ("type", _u32), ("flags", _u32), ("description", ctypes.c_char * 32),
+                ("pixelformat", _u32), ("mbus_code", _u32), ("reserved", _u32 * 3))
+
+
+class FrameSize(ctypes.Structure):
+    """struct v4l2_frmsizeenum; size: width, height, or min, max, step of the width and then of the height."""
+
+    _fields_ = (("index", _u32), ("pixel_format", _u32), ("type", _u32), ("size", _u32 * 6), ("reserved", _u32 * 2))
+
+
+class Fraction(ctypes.Structure):
+    """struct v4l2_fract."""
+
+    _fields_ = (("numerator", _u32), ("denominator", _u32))
+
+
+class FrameInterval(ctypes.Structure):
+    """struct v4l2_frmivalenum; interval [s]: the only one, or the shortest, the longest and the step."""
+
+    _fields_ = (("index", _u32), ("pixel_format", _u32), ("width", _u32), ("height", _u32), ("type", _u32),
+                ("interval", Fraction * 3), ("reserved", _u32 * 2))
+
+
+class PixelFormat(ctypes.Structure):
+    """struct v4l2_pix_format."""
+
+    _fields_ = (("width", _u32), ("height", _u32), ("pixelformat", _u32), ("field", _u32), ("bytesperline", _u32),
+                ("sizeimage", _u32), ("colorspace", _u32), ("priv", _u32), ("flags", _u32), ("ycbcr_enc", _u32),
+                ("quantization", _u32), ("xfer_func", _u32))
+
+
+class _AnyFormat(ctypes.Union):
+    _fields_ = (("pix", PixelFormat), ("raw_data", _u8 * 200), ("aligned_as_pointers_are", ctypes.c_long))
+
+
+class Format(ctypes.Structure):
+    """struct v4l2_format."""
+
+    _fields_ = (("type", _u32), ("fmt", _AnyFormat))
+
+
+class StreamParameters(ctypes.Structure):
+    """struct v4l2_streamparm with the capture branch of its union, struct v4l2_captureparm."""
+
+    _fields_ = (("type", _u32), ("capability", _u32), ("capturemode", _u32), ("timeperframe", Fraction),
+                ("extendedmode", _u32), ("readbuffers", _u32), ("reserved", _u8 * (200 - 6 * 4)))
+
+
+class BufferRequest(ctypes.Structure):
+    """struct v4l2_requestbuffers."""
+
+    _fields_ = (("count", _u32), ("type", _u32), ("memory", _u32), ("capabilities", _u32), ("flags", _u32))
+
+
+class _Timeval(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_usec", ctypes.c_long))
+
+
+class _Place(ctypes.Union):
+    _fields_ = (("offset", _u32), ("userptr", ctypes.c_long))
+
+
+class Buffer(ctypes.Structure):
+    """struct v4l2_buffer."""
+
+    _fields_ = (("index", _u32), ("type", _u32), ("bytesused", _u32), ("flags", _u32), ("field", _u32),
+                ("timestamp", _Timeval), ("timecode", _u32 * 4), ("sequence", _u32), ("memory", _u32), ("m", _Place),
+                ("length", _u32), ("reserved2", _u32), ("request_fd", _u32))
+
+    @property
+    def stamp_ns(self) -> int:
+        """The kernel's stamp; of which clock, the flags say."""
+        return int(self.timestamp.tv_sec) * 10**9 + int(self.timestamp.tv_usec) * 1000
+
+
+class QueryControl(ctypes.Structure):
+    """struct v4l2_queryctrl."""
+
+    _fields_ = (("id", _u32), ("type", _u32), ("name", ctypes.c_char * 32), ("minimum", _i32), ("maximum", _i32),
+                ("step", _i32), ("default_value", _i32), ("flags", _u32), ("reserved", _u32 * 2))
+
+
+class QueryMenu(ctypes.Structure):
+    """struct v4l2_querymenu, which is packed; name may be a 64-bit number instead."""
+
+    _pack_ = 1
+    _fields_ = (("id", _u32), ("index", _u32), ("name", ctypes.c_char * 32), ("reserved", _u32))
+
+
+class Control(ctypes.Structure):
+    """struct v4l2_control."""
+
+    _fields_ = (("id", _u32), ("value", _i32))
+
+
+_WRITE, _READ = 1, 2
+
+
+def _request(direction: int, number: int, argument: type[ctypes.Structure] | type[Number]) -> int:
+    """_IOC of asm-generic/ioctl.h for the type 'V'."""
+    return direction << 30 | ctypes.sizeof(argument) << 16 | ord("V") << 8 | number
+
+
+QUERYCAP: Final = _request(_READ, 0, Capability)
+ENUM_FMT: Final = _request(_READ | _WRITE, 2, FormatDescription)
+G_FMT: Final = _request(_READ | _WRITE, 4, Format)
+S_FMT: Final = _request(_READ | _WRITE, 5, Format)
+REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
+QUERYBUF: Final = _request(_READ | _WRITE, 9, Buffer)
+QBUF: Final = _request(_READ | _WRITE, 15, Buffer)
+DQBUF: Final = _request(_READ | _WRITE, 17, Buffer)
+STREAMON: Final = _request(_WRITE, 18, Number)
+STREAMOFF: Final = _request(_WRITE, 19, Number)
+G_PARM: Final = _request(_READ | _WRITE, 21, StreamParameters)
+S_PARM: Final = _request(_READ | _WRITE, 22, StreamParameters)
+G_CTRL: Final = _request(_READ | _WRITE, 27, Control)
+S_CTRL: Final = _request(_READ | _WRITE, 28, Control)
+QUERYCTRL: Final = _request(_READ | _WRITE, 36, QueryControl)
+QUERYMENU: Final = _request(_READ | _WRITE, 37, QueryMenu)
+ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FrameSize)
+ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, FrameInterval)
+
+
+def call(fd: int, request: int, argument: ctypes.Structure | Number) -> None:
+    """Hands the argument to the driver, which fills in its answer; OSError with the driver's errno."""
+    fcntl.ioctl(fd, request, argument, True)
+
+
+def fourcc(code: int) -> str:
+    """The four letters of a pixel format, such as 'YUYV'."""
+    return code.to_bytes(4, "little").decode("latin-1").rstrip()
+
+
+def fourcc_code(letters: str) -> int:
+    """The number of a pixel format's four letters."""
+    return int.from_bytes(letters.ljust(4).encode("latin-1"), "little")

@@ -1,0 +1,123 @@
+"""Cameras found in trees of the same make as /sys and /dev, and opened where there is none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.v4l2_camera import V4l2Camera
+from drivers.v4l2_devices import CaptureDevice, capture_devices, described, udev_rules
+from drivers.v4l2_modes import Mode, Sizes
+from drivers.v4l2_settings import V4l2Settings
+from omnid.cli import main
+from omnid.commands import cameras
+
+PORT = "pci-0000:00:14.0-usb-0:1:1.0"
+
+
+def plug(root: Path, node: str, *, name: str, port: str, index: int = 0) -> None:
+    """A camera as the kernel shows it; what answers to it is an ordinary file."""
+    device = root / "sys/devices" / port
+    device.mkdir(parents=True, exist_ok=True)
+    (root / "sys/bus/usb/drivers/uvcvideo").mkdir(parents=True, exist_ok=True)
+    if not (device / "driver").is_symlink():
+        (device / "driver").symlink_to(root / "sys/bus/usb/drivers/uvcvideo")
+    entry = root / "sys/class/video4linux" / node
+    entry.mkdir(parents=True)
+    (entry / "name").write_text(f"{name}\n")
+    (entry / "index").write_text(f"{index}\n")
+    (entry / "device").symlink_to(device)
+    (root / "dev").mkdir(exist_ok=True)
+    (root / "dev" / node).touch()
+
+
+def link(root: Path, folder: str, name: str, node: str) -> None:
+    (root / "dev/v4l" / folder).mkdir(parents=True, exist_ok=True)
+    (root / "dev/v4l" / folder / name).symlink_to(f"../../{node}")
+
+
+@pytest.fixture
+def two_webcams(tmp_path: Path) -> Path:
+    """Two cameras of a kind, each with a node for metadata, and a newer udev that names a port twice."""
+    for number, port in ((2, PORT), (10, PORT.replace("0:1:", "0:2:"))):
+        plug(tmp_path, f"video{number}", name="HD Webcam", port=port)
+        plug(tmp_path, f"video{number + 1}", name="HD Webcam", port=port, index=1)
+        link(tmp_path, "by-path", f"{port.replace('-usb-', '-usbv2-')}-video-index0", f"video{number}")
+        link(tmp_path, "by-path", f"{port}-video-index0", f"video{number}")
+        link(tmp_path, "by-path", f"{port}-video-index1", f"video{number + 1}")
+    link(tmp_path, "by-id", "usb-Maker_HD_Webcam-video-index0", "video10")
+    return tmp_path
+
+
+def test_cameras_are_found_by_number_without_their_metadata_nodes(two_webcams: Path) -> None:
+    found = capture_devices(two_webcams)
+    assert [(device.node, device.name, device.driver) for device in found] == [
+        ("/dev/video2", "HD Webcam", "uvcvideo"), ("/dev/video10", "HD Webcam", "uvcvideo"),
+    ]  # fmt: skip
+    assert found[0].by_path == f"/dev/v4l/by-path/{PORT}-video-index0" and found[0].by_id == ""
+    assert found[1].by_id == "/dev/v4l/by-id/usb-Maker_HD_Webcam-video-index0"
+
+
+def test_what_cannot_be_asked_says_why(two_webcams: Path) -> None:
+    (two_webcams / "dev/video10").unlink()
+    first, second = capture_devices(two_webcams)
+    assert "is not a video device" in first.problem and "is not there" in second.problem
+
+
+def test_the_rules_name_the_ports(two_webcams: Path) -> None:
+    rules = list(udev_rules(capture_devices(two_webcams)))
+    expected = f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{PORT}", SYMLINK+="omnid/lower"'
+    assert rules[0] == expected
+    assert 'usb-0:2:1.0", SYMLINK+="omnid/upper"' in rules[1] and len(rules) == 2
+
+
+def test_cameras_on_one_port_are_told_apart_by_name(tmp_path: Path) -> None:
+    for number in (0, 1):
+        plug(tmp_path, f"video{number}", name=f"vivid-00{number}-vid-cap", port="platform-vivid.0")
+    link(tmp_path, "by-path", "platform-vivid.0-video-index0", "video1")
+    first, second = capture_devices(tmp_path)
+    assert (first.by_path, second.by_path) == ("", "/dev/v4l/by-path/platform-vivid.0-video-index0")
+    rules = list(udev_rules((first, second)))
+    assert 'ENV{ID_PATH}=="platform-vivid.0", ATTR{name}=="vivid-000-vid-cap", SYMLINK+="omnid/lower"' in rules[0]
+    assert 'ATTR{name}=="vivid-001-vid-cap"' in rules[1]
+
+
+def test_the_modes_are_a_line_for_each_format() -> None:
+    one, any_of = Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0, 14.985)), Sizes(16, 64)
+    offered = (one, one, Mode("GREY", any_of, any_of))
+    device = CaptureDevice("/dev/video0", "HD Webcam", "uvcvideo", "usb-0", "/by/path", "", "p", offered)
+    assert list(described(device)) == [
+        "/dev/video0  HD Webcam  (uvcvideo, usb-0)", "  /by/path",
+        "  YUYV 640x480 at 30, 14.98 Hz; 640x480 at 30, 14.98 Hz", "  GREY 16..64x16..64",
+    ]  # fmt: skip
+
+
+def test_the_command_lists_them(
+    two_webcams: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cameras, "ROOT", two_webcams)
+    assert main(["cameras"]) == 0
+    printed = capsys.readouterr().out
+    assert "/dev/video2  HD Webcam" in printed and "/etc/udev/rules.d/" in printed and "omnid/upper" in printed
+
+
+def test_no_camera_is_one_line_and_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cameras, "ROOT", tmp_path)
+    assert main(["cameras"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith("omnid: no cameras") and printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("name", "said"), [("missing", "is not there"), ("file", "is not a video device")])
+def test_a_device_that_cannot_be_opened_is_refused_in_one_line(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / "file").touch()
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(DriverError, match=said) as caught:
+        V4l2Camera(V4l2Settings(str(tmp_path / name)), "lower")
+    assert "\n" not in str(caught.value) and str(tmp_path / name) in str(caught.value)
+    assert len(os.listdir("/proc/self/fd")) <= before

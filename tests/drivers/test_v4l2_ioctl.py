@@ -1,0 +1,67 @@
+"""Sizes, offsets and numbers against what gcc 12 says of linux/videodev2.h (linux-libc-dev 6.1), with -m64 and -m32."""
+
+from __future__ import annotations
+
+import ctypes
+import runpy
+from typing import Any
+
+import pytest
+
+from drivers import v4l2_ioctl
+
+SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
+    "Capability": (104, 104), "FormatDescription": (64, 64), "FrameSize": (44, 44), "FrameInterval": (52, 52),
+    "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204), "BufferRequest": (20, 20),
+    "Buffer": (88, 68), "QueryControl": (68, 68), "QueryMenu": (44, 44), "Control": (8, 8),
+}  # fmt: skip
+OFFSETS = {
+    ("Buffer", "flags"): (12, 12), ("Buffer", "timestamp"): (24, 20), ("Buffer", "sequence"): (56, 44),
+    ("Buffer", "m"): (64, 52), ("Buffer", "length"): (72, 56), ("Format", "fmt"): (8, 4),
+    ("StreamParameters", "capability"): (4, 4), ("StreamParameters", "timeperframe"): (12, 12),
+    ("FrameInterval", "interval"): (20, 20),
+}  # fmt: skip
+REQUESTS = {
+    "QUERYCAP": (0x80685600, 0x80685600), "ENUM_FMT": (0xC0405602, 0xC0405602), "G_FMT": (0xC0D05604, 0xC0CC5604),
+    "S_FMT": (0xC0D05605, 0xC0CC5605), "REQBUFS": (0xC0145608, 0xC0145608), "QUERYBUF": (0xC0585609, 0xC0445609),
+    "QBUF": (0xC058560F, 0xC044560F), "DQBUF": (0xC0585611, 0xC0445611), "STREAMON": (0x40045612, 0x40045612),
+    "STREAMOFF": (0x40045613, 0x40045613), "G_PARM": (0xC0CC5615, 0xC0CC5615), "S_PARM": (0xC0CC5616, 0xC0CC5616),
+    "G_CTRL": (0xC008561B, 0xC008561B), "S_CTRL": (0xC008561C, 0xC008561C), "QUERYCTRL": (0xC0445624, 0xC0445624),
+    "QUERYMENU": (0xC02C5625, 0xC02C5625), "ENUM_FRAMESIZES": (0xC02C564A, 0xC02C564A),
+    "ENUM_FRAMEINTERVALS": (0xC034564B, 0xC034564B),
+}  # fmt: skip
+
+
+@pytest.fixture(params=[0, 1], ids=["64 bits", "32 bits"])
+def abi(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any], int]:
+    """The module's names as they are where a long has 64 bits, or 32; and which of them."""
+    monkeypatch.setattr(ctypes, "c_long", (ctypes.c_int64, ctypes.c_int32)[request.param])
+    return runpy.run_path(v4l2_ioctl.__file__), request.param
+
+
+def test_the_structures_have_the_kernels_sizes(abi: tuple[dict[str, Any], int]) -> None:
+    names, bits = abi
+    assert {name: ctypes.sizeof(names[name]) for name in SIZES} == {name: sizes[bits] for name, sizes in SIZES.items()}
+
+
+def test_their_members_lie_where_the_kernel_has_them(abi: tuple[dict[str, Any], int]) -> None:
+    names, bits = abi
+    found = {(struct, member): getattr(names[struct], member).offset for struct, member in OFFSETS}
+    assert found == {member: offsets[bits] for member, offsets in OFFSETS.items()}
+
+
+def test_the_requests_have_the_kernels_numbers(abi: tuple[dict[str, Any], int]) -> None:
+    names, bits = abi
+    assert {name: hex(names[name]) for name in REQUESTS} == {
+        name: hex(numbers[bits]) for name, numbers in REQUESTS.items()
+    }
+
+
+def test_formats_are_four_letters() -> None:
+    assert v4l2_ioctl.fourcc_code("YUYV") == 0x56595559 and v4l2_ioctl.fourcc_code("Y16") == 0x20363159
+    assert v4l2_ioctl.fourcc(0x47504A4D) == "MJPG" and v4l2_ioctl.fourcc(0x20363159) == "Y16"
+
+
+def test_a_file_that_is_no_camera_answers_with_an_error(tmp_path: Any) -> None:
+    with open(tmp_path / "file", "w") as file, pytest.raises(OSError, match="ioctl"):
+        v4l2_ioctl.call(file.fileno(), v4l2_ioctl.QUERYCAP, v4l2_ioctl.Capability())

@@ -1,0 +1,147 @@
+"""What is asked of a camera: settings, the choice of the format, the plan of the controls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.v4l2_controls import (
+    AUTO_EXPOSURE,
+    AUTO_GAIN,
+    EXPOSURE,
+    EXPOSURE_MAY_SLOW,
+    GAIN,
+    POWER_LINE_FREQUENCY,
+    Control,
+    planned,
+)
+from drivers.v4l2_modes import Mode, Sizes, choose
+from drivers.v4l2_settings import V4l2Settings
+
+WEBCAM = [
+    Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0, 15.0)),
+    Mode("YUYV", Sizes(1280, 1280), Sizes(960, 960), (7.5, 5.0)),
+    Mode("MJPG", Sizes(1280, 1280), Sizes(960, 960), (30.0, 15.0)),
+    Mode("H264", Sizes(1280, 1280), Sizes(960, 960), (60.0,)),
+]
+MENU = {0: "Disabled", 1: "50 Hz", 2: "60 Hz"}
+OFFERED = {
+    control.id: control
+    for control in (
+        Control(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={1: "Manual Mode", 3: "Aperture Priority Mode"}),
+        Control(EXPOSURE, "exposure_time_absolute", 1, 3, 2047),
+        Control(EXPOSURE_MAY_SLOW, "exposure_dynamic_framerate", 2, 0, 1),
+        Control(GAIN, "gain", 1, 0, 100, 5),
+        Control(AUTO_GAIN, "gain_automatic", 2, 0, 1),
+        Control(POWER_LINE_FREQUENCY, "power_line_frequency", 3, 0, 2, menu=MENU),
+        Control(0x980901, "contrast", 1, -64, 64),
+    )
+}
+
+
+def settings(**fields: Any) -> V4l2Settings:
+    return V4l2Settings("/dev/omnid/lower", **fields)
+
+
+@pytest.mark.parametrize(
+    ("size", "rate_hz", "chosen"),
+    [((640, 480), 30, "YUYV"), ((1280, 960), 30, "MJPG"), ((1280, 960), 5, "YUYV"), ((1280, 960), 0, "YUYV"),
+     ((1280, 960), 30.1, "MJPG")],
+)  # fmt: skip
+def test_auto_takes_what_needs_no_decoding_if_it_comes_fast_enough(
+    size: tuple[int, int], rate_hz: float, chosen: str
+) -> None:
+    assert choose(WEBCAM, "auto", size, rate_hz) == chosen
+
+
+def test_grey_comes_first_and_unknown_rates_are_trusted() -> None:
+    any_size = Sizes(16, 4096, 16)
+    offered = [Mode(name, any_size, any_size) for name in ("MJPG", "UYVY", "YUYV", "NV12", "GREY")]
+    chosen = [choose(offered[:count], "auto", (640, 480), 90) for count in range(1, 6)]
+    assert chosen == ["MJPG", "UYVY", "YUYV", "NV12", "GREY"]
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "rate_hz"),
+    [("GREY", (640, 480), 30), ("YUYV", (640, 481), 30), ("YUYV", (640, 480), 31), ("auto", (1280, 960), 60)],
+)
+def test_what_is_not_offered_is_refused_with_what_is(name: str, size: tuple[int, int], rate_hz: float) -> None:
+    with pytest.raises(DriverError, match=r"not offered; choose from: YUYV 640x480 at 30, 15 Hz; .*MJPG") as caught:
+        choose(WEBCAM, name, size, rate_hz)
+    assert "H264" not in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_sizes_come_in_steps() -> None:
+    assert 48 in Sizes(16, 64, 16) and 50 not in Sizes(16, 64, 16) and 80 not in Sizes(16, 64, 16)
+    assert 50 in Sizes(16, 64, 0)
+
+
+def test_by_default_no_control_is_touched() -> None:
+    assert planned(settings(), OFFERED) == [] and planned(settings(), {}) == []
+
+
+def plan(**fields: Any) -> list[tuple[str, int]]:
+    return [(control.name, value) for control, value in planned(settings(**fields), OFFERED)]
+
+
+def test_a_fixed_value_has_its_automatic_switched_off_before() -> None:
+    assert plan(exposure_us=10_040, gain=15) == [
+        ("auto_exposure", 1), ("exposure_dynamic_framerate", 0), ("gain_automatic", 0),
+        ("exposure_time_absolute", 100), ("gain", 15),
+    ]  # fmt: skip
+
+
+def test_automatic_exposure_is_the_one_the_camera_has_and_must_not_slow_it() -> None:
+    assert plan(auto_exposure="on") == [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]
+    full = {AUTO_EXPOSURE: Control(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})}
+    assert planned(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
+
+
+def test_a_fixed_gain_needs_no_automatic_but_a_switched_one_does() -> None:
+    only_gain = {GAIN: OFFERED[GAIN]}
+    assert planned(settings(gain=15), only_gain) == [(OFFERED[GAIN], 15)]
+    with pytest.raises(DriverError, match="no control of its automatic gain"):
+        planned(settings(auto_gain="off"), only_gain)
+
+
+def test_other_controls_are_set_by_name() -> None:
+    assert plan(power_line="50", controls=("contrast=-3",)) == [("power_line_frequency", 1), ("contrast", -3)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"gain": 101}, "gain: 101 was asked, it takes 0 to 100 in steps of 5"),
+        ({"gain": 13}, "steps of 5"),
+        ({"exposure_us": 40}, "exposure_time_absolute: 0 was asked, it takes 3 to 2047"),
+        ({"power_line": "auto"}, r"0 \(Disabled\), 1 \(50 Hz\), 2 \(60 Hz\)"),
+        ({"focus": 3}, "no control of its focus.*It has: auto_exposure, exposure"),
+        ({"auto_white_balance": "on"}, "automatic white balance"),
+        ({"controls": ("contrast=65",)}, "-64 to 64"),
+        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: auto_exposure"),
+    ],
+)
+def test_a_control_that_the_camera_does_not_take_is_refused(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(DriverError, match=said) as caught:
+        planned(settings(**fields), OFFERED)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"width_px": 0}, {"height_px": 10**6}, {"rate_hz": float("nan")}, {"rate_hz": -1.0}, {"pixel_format": "grey"},
+     {"power_line": "55"}, {"auto_exposure": "auto"}, {"buffers": 1}, {"timeout_s": 0.0}, {"retry_s": float("inf")},
+     {"gain": -2}, {"controls": ("gain",)}, {"controls": ("gain=high",)}, {"controls": ("=3",)},
+     {"auto_gain": "on", "gain": 3}, {"auto_exposure": "on", "exposure_us": 100}, {"auto_focus": "on", "focus": 0}],
+)  # fmt: skip
+def test_settings_that_no_camera_takes_are_refused_in_one_line(fields: dict[str, Any]) -> None:
+    with pytest.raises(DriverError, match=r"^camera /dev/omnid/lower: (.*) is .*; give ") as caught:
+        settings(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_device_is_a_path() -> None:
+    with pytest.raises(DriverError, match="omnid cameras"):
+        V4l2Settings("0")

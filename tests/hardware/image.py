@@ -1,0 +1,233 @@
+"""The disk, kernel and initramfs of the guest that hardware tests run in: built once, then cached.
+
+A stock Debian kernel with the virtual cameras vivid and v4l2loopback, and a minimal Debian with systemd, udev and the
+daemon's own dependencies in the versions that are installed here. Build it by `python -m tests.hardware.image` (root,
+network, a few minutes); whoever finds it in the cache needs neither.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import lzma
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+ROOTFS = Path(__file__).with_name("rootfs")
+RECIPE = 1  # to be raised when the functions below make another image of the same constants
+SUITE = "bookworm"
+PACKAGES = ("systemd", "systemd-sysv", "udev", "dbus", "libnss-systemd", "python3", "v4l-utils", "kmod", "procps",
+            "busybox-static")
+GUEST_MODULES = ("v4l2loopback", "vivid", "uvcvideo", "vhci-hcd", "softdog", "9p", "9pnet_virtio", "autofs4")
+BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic", "9pnet_virtio", "9p")
+# what a guest without a screen, a clock server or a second boot only waits for
+MASKED = ("systemd-timesyncd.service", "systemd-logind.service", "systemd-random-seed.service",
+          "systemd-update-utmp.service", "systemd-update-utmp-runlevel.service", "systemd-remount-fs.service",
+          "systemd-pcrphase.service", "systemd-pcrphase-sysinit.service", "apt-daily.timer", "apt-daily-upgrade.timer",
+          "dpkg-db-backup.timer", "e2scrub_all.timer", "e2scrub_reap.service", "fstrim.timer", "getty.target",
+          "getty@tty1.service", "serial-getty@ttyS0.service")
+TOOLS = {"qemu-system-x86_64": "qemu-system-x86"}
+BUILD_TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "depmod": "kmod", "cpio": "cpio", "make": "make",
+               "busybox": "busybox-static", "gcc-12": "gcc-12", "xz": "xz-utils"}
+
+
+class NoImage(Exception):  # noqa: N818 - it is told of the image, not of the program
+    """The image is not there and cannot be built; the message says what to install or to run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """The three files that QEMU starts."""
+
+    folder: Path
+
+    @property
+    def kernel(self) -> Path:
+        """Unpacked, since the emulator would take seconds to unpack it."""
+        return self.folder / "vmlinux"
+
+    @property
+    def initramfs(self) -> Path:
+        """Finds the disk and hands over."""
+        return self.folder / "initramfs.cpio"
+
+    @property
+    def disk(self) -> Path:
+        """An ext4 file system; guests write to a snapshot of it."""
+        return self.folder / "root.ext4"
+
+
+def image() -> Image:
+    """The image for this kernel, these dependencies and this recipe, cached or built now; NoImage if neither."""
+    _require(TOOLS)
+    pins, kernel = pinned(), kernel_package()
+    folder = cache_folder() / f"{kernel.removeprefix('linux-image-')}-{_digest(pins)}"
+    if not (folder / "root.ext4").exists():
+        _require_build()
+        _build(folder, kernel, pins)
+    return Image(folder)
+
+
+def cache_folder() -> Path:
+    """$OMNID_VM_CACHE, else omnid-vm where the user's caches are."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get("OMNID_VM_CACHE") or caches / "omnid-vm")
+
+
+def pinned() -> list[str]:
+    """The daemon's dependencies, and pytest, as they are installed here."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    names = [re.split(r"[^\w.-]", entry)[0] for entry in project["dependencies"]] + ["pytest"]
+    return sorted(f"{name}=={version(name)}" for name in names)
+
+
+def kernel_package() -> str:
+    """The package that linux-image-amd64 stands for today, or the one that is cached where apt cannot say."""
+    found = subprocess.run(["apt-cache", "depends", "linux-image-amd64"], capture_output=True, text=True, check=False)
+    names = re.findall(r"Depends: (linux-image-[\w.-]+)", found.stdout)
+    names += sorted(f"linux-image-{path.parent.name[:-9]}" for path in cache_folder().glob("*/root.ext4"))
+    if not names:
+        raise NoImage("apt knows no linux-image-amd64: run `apt-get update` on a Debian machine")
+    return names[0]
+
+
+def _digest(pins: Iterable[str]) -> str:
+    """Eight letters that change with what the image holds."""
+    digest = hashlib.sha256(repr((RECIPE, *pins, PACKAGES, GUEST_MODULES, BOOT_MODULES, MASKED)).encode())
+    for path in sorted(path for path in ROOTFS.rglob("*") if path.is_file()):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+def _require(tools: dict[str, str]) -> None:
+    missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
+    if missing:
+        raise NoImage(f"missing tools: apt-get install {' '.join(missing)}")
+
+
+def _require_build() -> None:
+    _require(BUILD_TOOLS)
+    if os.geteuid() != 0:
+        raise NoImage(f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`")
+
+
+def _build(folder: Path, kernel: str, pins: list[str]) -> None:
+    """Everything in a folder beside the final one, so that a build that was cut short leaves nothing to be found."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="build-", dir=folder.parent) as name:
+        work = Path(name)
+        work.chmod(0o755)
+        release = kernel.removeprefix("linux-image-")
+        tree = _kernel_tree(work, kernel, release)
+        _write_root(work / "root", tree, release, pins)
+        (work / "image").mkdir()
+        _write_initramfs(work, tree, release)
+        _run("mke2fs", "-q", "-t", "ext4", "-O", "^has_journal", "-d", work / "root", work / "image/root.ext4", "3G")
+        (work / "image/vmlinux").write_bytes(_unpacked((tree / f"boot/vmlinuz-{release}").read_bytes()))
+        (work / "image").rename(folder)
+
+
+def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
+    """The kernel's packages unpacked, with v4l2loopback built against its headers."""
+    debs, tree = work / "debs", work / "kernel"
+    debs.mkdir()
+    common = release.rsplit("-", 1)[0]
+    major_minor = ".".join(release.split(".")[:2])
+    _run("apt-get", "-q", "download", kernel, f"linux-headers-{release}", f"linux-headers-{common}-common",
+         f"linux-kbuild-{major_minor}", "linux-compiler-gcc-12-x86", "v4l2loopback-dkms", cwd=debs)
+    for deb in debs.iterdir():
+        _run("dpkg", "-x", deb, tree)
+    headers = tree / f"usr/src/linux-headers-{release}"
+    makefile = headers / "Makefile"  # includes the common headers by where they would be installed
+    makefile.write_text(makefile.read_text("utf-8").replace("/usr/src/", f"{tree}/usr/src/"), "utf-8")
+    source = next((tree / "usr/src").glob("v4l2loopback-*"))
+    _run("make", "-s", "-C", headers, f"M={source}", "modules")
+    extra = tree / f"lib/modules/{release}/extra"
+    extra.mkdir()
+    shutil.copy(source / "v4l2loopback.ko", extra)
+    _run("strip", "-g", extra / "v4l2loopback.ko")
+    _run("depmod", "-b", tree, release)
+    return tree
+
+
+def _write_root(root: Path, tree: Path, release: str, pins: list[str]) -> None:
+    _run("mmdebstrap", "-q", "--variant=minbase", f"--include={','.join(PACKAGES)}", SUITE, root, _apt_sources())
+    packages = root / "usr/local/lib/python3.11/dist-packages"
+    _run(sys.executable, "-m", "pip", "install", "-q", "--only-binary=:all:", "--python-version", "3.11",
+         "--no-compile", "--root-user-action=ignore", "--target", packages, *pins)
+    _run("chroot", root, "python3", "-m", "compileall", "-q", packages.relative_to(root), check=False)
+    for module in _with_needed(tree, release, GUEST_MODULES):
+        target = root / module.relative_to(tree)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(module, target)
+    for listing in (tree / f"lib/modules/{release}").glob("modules.[ob]*"):
+        shutil.copy(listing, root / f"lib/modules/{release}")
+    _run("depmod", "-b", root, release)
+    shutil.copytree(ROOTFS, root, dirs_exist_ok=True, ignore=shutil.ignore_patterns("init"))
+    for name in MASKED:
+        (root / "etc/systemd/system" / name).symlink_to("/dev/null")
+    for mount in ("job", "share"):
+        (root / "mnt" / mount).mkdir()
+    (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", "ascii")
+
+
+def _write_initramfs(work: Path, tree: Path, release: str) -> None:
+    """busybox, the drivers of the disk in the order they need each other, and `init`."""
+    initramfs = work / "initramfs"
+    for name in ("bin", "proc", "sys", "dev", "mnt", "modules"):
+        (initramfs / name).mkdir(parents=True)
+    shutil.copy(shutil.which("busybox") or "/bin/busybox", initramfs / "bin/busybox")
+    shutil.copy(ROOTFS / "init", initramfs / "init")
+    (initramfs / "init").chmod(0o755)
+    modules = list(_with_needed(tree, release, BOOT_MODULES))
+    for module in modules:
+        shutil.copy(module, initramfs / "modules")
+    (initramfs / "modules/order").write_text("".join(f"{module.name}\n" for module in modules), "ascii")
+    names = "\n".join(str(path.relative_to(initramfs)) for path in [initramfs, *sorted(initramfs.rglob("*"))])
+    with open(work / "image/initramfs.cpio", "wb") as archive:
+        subprocess.run(["cpio", "-o", "-H", "newc", "--quiet"], cwd=initramfs, input=names.encode(), stdout=archive,
+                       check=True)
+
+
+def _with_needed(tree: Path, release: str, names: Iterable[str]) -> Iterator[Path]:
+    """The files of the modules, each after those it depends on, none twice."""
+    seen: dict[Path, None] = {}
+    for name in names:
+        lines = _run("modprobe", "-d", tree, "-S", release, "--show-depends", name).splitlines()
+        seen |= {Path(line.split()[1]): None for line in lines if line.startswith("insmod")}
+    return iter(seen)
+
+
+def _apt_sources() -> str:
+    """This machine's own apt sources, so that a mirror that is configured here is used."""
+    places = [Path("/etc/apt/sources.list"), *sorted(Path("/etc/apt/sources.list.d").glob("*.sources"))]
+    return next((str(path) for path in places if path.is_file() and path.stat().st_size), "")
+
+
+def _unpacked(kernel: bytes) -> bytes:
+    """The ELF file within a bzImage, which QEMU starts by its PVH entry."""
+    elf = lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(kernel[kernel.index(b"\xfd7zXZ\0") :])
+    if not elf.startswith(b"\x7fELF"):
+        raise NoImage("the kernel is not packed by xz as Debian's is")
+    return elf
+
+
+def _run(*command: object, cwd: Path | None = None, check: bool = True) -> str:
+    words = [str(word) for word in command]
+    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
+    if check and done.returncode:
+        raise NoImage(f"{' '.join(words)[:200]} ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+    return done.stdout
+
+
+if __name__ == "__main__":
+    print(image().folder)
