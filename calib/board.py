@@ -1,0 +1,47 @@
+"""A checkerboard and how one picture shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.camera import Array
+from calib.errors import CalibError
+
+MIN_SIDE, MAX_SIDE = 3, 60
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A flat checkerboard of columns x rows inner corners, one square_m apart."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        if not all(MIN_SIDE <= side <= MAX_SIDE for side in (self.columns, self.rows)):
+            raise CalibError(f"board: expected {MIN_SIDE} to {MAX_SIDE} inner corners a side, found "
+                             f"{self.columns}x{self.rows}; count where four squares meet, not the squares")
+        if not 1e-4 <= self.square_m <= 10:
+            raise CalibError(f"board: expected squares of 0.1 mm to 10 m, found {self.square_m * 1e3:g} mm")
+
+    @property
+    def points(self) -> Array:
+        """The corners (N, 3) [m] in the board's frame: column by column along x, then row by row along y, z = 0."""
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_m, float)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """The corners of a board in one picture: pixels (N, 2) in the order of Board.points.
+
+    confidence 0 to 1: how much the worst corners look like ones. x, y of the board turn clockwise in the picture, and
+    the first square is dark where the board's sides (one even, one odd) can tell.
+    """
+
+    name: str
+    pixels: Array
+    confidence: float = 1.0

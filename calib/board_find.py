@@ -1,0 +1,152 @@
+"""Finds a checkerboard in a mirror's picture: by its own linked corners first, then by OpenCV's detectors.
+
+Both look at the picture as it is, with its local contrast raised, enlarged, and unrolled about its middle: on a
+log-polar strip, which keeps small squares square, boards near the hub grow and lose their fan shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.board import Board, BoardView
+from calib.board_corners import find_corners, look_at, smoothed
+from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
+from calib.board_order import as_grid, in_order, largest_board, place, unevenness
+from calib.board_refine import refine
+from calib.camera import Array
+
+Image = NDArray[np.uint8]
+BLUR_PX = 0.7
+# Of a picture's grids so many are grown and tried.
+TRIED_GRIDS = 4
+# What a corner may lie off its neighbours, in parts of a square, and how many have to look like corners.
+MAX_UNEVEN = 0.35
+MIN_LIKELY = 0.8
+# Pictures larger than this are not enlarged.
+MAX_ENLARGED_PIXELS = 1_600_000
+MAX_STRIP_PX = 2400
+# A grid smaller than this hints at no board.
+MIN_HINT_CORNERS = 12
+MIN_HINT_SIDE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What came of a picture: the board, or what grid (columns, rows) was seen in its stead, (0, 0) for none."""
+
+    view: BoardView | None
+    seen: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """A picture made from another, and where (N, 2) in that one its pixels (N, 2) come from."""
+
+    image: Image
+    origin: Callable[[Array], Array]
+
+
+def find_board(image: Image, board: Board, name: str = "") -> Search:
+    """The board in a picture (H, W) uint8, its corners to a fraction of a pixel."""
+    seen = (0, 0)
+    for look in _looks(image):
+        for grid in _grids(look):
+            view = _view(image, grid, board, name)
+            if view is not None:
+                return Search(view)
+            seen = max(seen, largest_board(grid), key=lambda sides: sides[0] * sides[1])
+        for grid in _by_opencv(look, board):
+            view = _view(image, grow(smoothed(image, BLUR_PX), grid), board, name)
+            if view is not None:
+                return Search(view)
+    hint = min(seen) >= MIN_HINT_SIDE and seen[0] * seen[1] >= MIN_HINT_CORNERS
+    return Search(None, seen if hint else (0, 0))
+
+
+def _looks(image: Image) -> Iterator[_Look]:
+    yield _Look(image, lambda pixels: pixels)
+    yield _Look(_contrasted(image), lambda pixels: pixels)
+    if image.size <= MAX_ENLARGED_PIXELS:
+        enlarged = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
+        yield _Look(enlarged, lambda pixels: (pixels + 0.5) / 2 - 0.5)
+    for start_rad in (0.0, np.pi):
+        yield _unrolled(image, start_rad)
+
+
+def _contrasted(image: Image) -> Image:
+    return cv2.createCLAHE(4.0, (8, 8)).apply(image).astype(np.uint8, copy=False)
+
+
+def _unrolled(image: Image, start_rad: float) -> _Look:
+    """The picture about its middle: azimuth from left to right, the logarithm of the radius upwards."""
+    height, width = image.shape
+    middle, inner, outer = np.array([(width - 1) / 2, (height - 1) / 2]), min(image.shape) / 16, max(image.shape) / 2
+    scale = min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)  # pixels per radian
+
+    def origin(pixels: Array) -> Array:
+        azimuth, radius = start_rad + pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
+        return np.asarray(middle + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
+
+    columns, rows = np.meshgrid(np.arange(int(2 * np.pi * scale)), np.arange(int(np.log(outer / inner) * scale)))
+    maps = origin(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)).astype(np.float32)
+    u, v = maps.T.reshape(2, *columns.shape)
+    strip = cv2.remap(image, np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.INTER_CUBIC)
+    return _Look(strip.astype(np.uint8, copy=False), origin)
+
+
+def _grids(look: _Look) -> Iterator[Grid]:
+    """Grids of linked corners, in the pixels of the first picture."""
+    blurred = smoothed(look.image, BLUR_PX)
+    for grid in find_grids(blurred, find_corners(look.image))[:TRIED_GRIDS]:
+        yield _back(grow(blurred, grid), look)
+
+
+def _by_opencv(look: _Look, board: Board) -> Iterator[Grid]:
+    """What OpenCV's two detectors find, in the pixels of the first picture."""
+    size = (board.columns, board.rows)
+    sector = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    for detect, flags in ((cv2.findChessboardCornersSB, sector),
+                          (cv2.findChessboardCorners, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)):
+        found, corners = detect(look.image, size, flags=flags)
+        if found and corners is not None and len(corners) == board.columns * board.rows:
+            grid = as_grid(np.asarray(corners, float).reshape(board.rows, board.columns, 2))
+            yield _back(grid, look)
+
+
+def _back(grid: Grid, look: _Look) -> Grid:
+    """The grid in the first picture, its rows and columns turning clockwise there."""
+    pixels = look.origin(np.array(list(grid.values())))
+    back = dict(zip(grid, pixels, strict=True))
+    return back if _clockwise(back) else {(row, column): pixel for (column, row), pixel in back.items()}
+
+
+def _clockwise(grid: Grid) -> bool:
+    turns = [np.linalg.det(np.stack([along - corner, down - corner])) for (i, j), corner in grid.items()
+             if (along := grid.get((i + 1, j))) is not None and (down := grid.get((i, j + 1))) is not None]
+    return bool(np.sum(np.sign(turns)) >= 0)
+
+
+def _view(image: Image, grid: Grid, board: Board, name: str) -> BoardView | None:
+    """The board in a grid, if it passes its own checks."""
+    placed = place(grid, board)
+    if placed is None:
+        return None
+    blurred = smoothed(image, BLUR_PX)
+    corners = refine(image, in_order(blurred, placed, board))
+    confidence = _likeliness(image, corners)
+    uneven = unevenness(corners)
+    if uneven > MAX_UNEVEN or confidence < MIN_LIKELY:
+        return None
+    return BoardView(name, corners.reshape(-1, 2), confidence * (1 - uneven))
+
+
+def _likeliness(image: Image, corners: Array) -> float:
+    """Part of the corners that look like ones."""
+    grid, blurred = as_grid(corners), smoothed(image, BLUR_PX)
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
+    return float(np.mean(look_at(blurred, np.array(list(grid.values())), rings).quality > 0))

@@ -1,0 +1,122 @@
+"""Checkerboards held before one mirror camera, with the exact pixel of every corner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.board import Board
+from calib.camera import Array, Mask, OmniCamera
+from calib.rig import MountedCamera
+from tests.scenes.caster import render_grey
+from tests.scenes.sensor import Exposure, Sensor
+from tests.scenes.surfaces import Rectangle, Scene
+from tests.scenes.textures import value_noise
+
+SQUARE_PX = 24  # of the board's texture
+MARGIN_SQUARES = 1.0  # white around the squares
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture (H, W) uint8 of a board, the truth about it: corners (N, 2) [px] and T_cam_board (4, 4)."""
+
+    picture: NDArray[np.uint8]
+    corners: Array
+    T_cam_board: Array
+
+
+def board_texture(board: Board, dark: float = 25.0, light: float = 225.0) -> NDArray[np.uint8]:
+    """The print: (columns + 1) x (rows + 1) squares with a light margin; the first square inside is dark."""
+    j, i = np.indices((board.rows + 1, board.columns + 1))
+    squares = np.where((i + j) % 2 == 0, dark, light)
+    margin = round(MARGIN_SQUARES * SQUARE_PX)
+    large = np.kron(squares, np.ones((SQUARE_PX, SQUARE_PX)))
+    return np.pad(large, margin, constant_values=light).astype(np.uint8)
+
+
+def board_rectangle(board: Board, T_cam_board: Array, texture: NDArray[np.uint8]) -> Rectangle:
+    """The print as a rectangle in the camera's frame; the board's origin is its first inner corner."""
+    edge = (1 + MARGIN_SQUARES) * board.square_m
+    width, height = ((side + 1 + 2 * MARGIN_SQUARES) * board.square_m for side in (board.columns, board.rows))
+    origin, right, below = se3.apply(T_cam_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0],
+                                                            [-edge, height - edge, 0]]))
+    return Rectangle(origin, right - origin, below - origin, texture, "board")
+
+
+def clutter(rng: np.random.Generator, radius_m: float = 3.0) -> list[Rectangle]:
+    """Six noisy walls around the camera."""
+    walls = []
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        side = np.roll(axis, 1) * 2 * radius_m
+        below = np.roll(axis, 2) * 2 * radius_m
+        grey = np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8)
+        walls.append(Rectangle(axis * radius_m - side / 2 - below / 2, side, below, grey))
+    return walls
+
+
+def board_pose(ray: Array, distance_m: float, tilt_rad: Array, board: Board) -> Array:
+    """T_cam_board (4, 4) of a board whose middle lies along a ray and whose face, tilted so (3,), is towards it."""
+    z = ray / np.linalg.norm(ray)
+    x = np.cross([0.3, 0.2, 1.0], z)
+    x /= np.linalg.norm(x)
+    R = np.column_stack([x, np.cross(z, x), z]) @ se3.rotation_exp(tilt_rad)
+    middle = np.array([(board.columns - 1) / 2, (board.rows - 1) / 2, 0]) * board.square_m
+    return se3.transform(R, z * distance_m - R @ middle)
+
+
+@dataclass(frozen=True)
+class Studio:
+    """A camera with its mask, and a board; the camera's rays are cast once for all its pictures."""
+
+    board: Board
+    mounted: MountedCamera
+
+    @staticmethod
+    def of(board: Board, camera: OmniCamera, mask: Mask) -> Studio:
+        """The studio of a camera that stands in the origin."""
+        return Studio(board, MountedCamera(camera, np.eye(4), mask))
+
+    def photograph(self, T_cam_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
+                   contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0) -> Shot:
+        """The picture taken of the board among noisy walls; shadow: what part of the board is darkened to."""
+        rng = np.random.default_rng(seed)
+        texture = board_texture(self.board, *contrast).astype(float)
+        texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
+        scene = Scene((board_rectangle(self.board, T_cam_board, texture.astype(np.uint8)), *clutter(rng)))
+        ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
+        exposure = Exposure.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
+        corners = self.mounted.camera.project(se3.apply(T_cam_board, self.board.points))
+        return Shot(exposure.expose(ideal, rng), corners, T_cam_board)
+
+
+def in_view(camera: OmniCamera, T_cam_board: Array, board: Board, mask: Mask) -> bool:
+    """Whether all the print but its margin lies inside the mask and faces the camera."""
+    outline = np.array([[x, y, 0] for x in np.linspace(-1.3, board.columns + 0.3, 12)
+                        for y in np.linspace(-1.3, board.rows + 0.3, 12)]) * board.square_m
+    pixels = camera.project(se3.apply(T_cam_board, outline))
+    return bool(np.isfinite(pixels).all() and mask.contains(pixels, 2.0).all())
+
+
+def around(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: int = 0,
+           distance_m: tuple[float, float] = (0.2, 0.5), tilt_deg: float = 30.0,
+           elevation_deg: Sequence[float] = (35.0, 100.0)) -> list[Array]:
+    """Poses T_cam_board of boards all around a camera, wholly in view; elevation from the ray of the centre."""
+    rng, poses = np.random.default_rng(seed), list[Array]()
+    for _ in range(200 * count):
+        azimuth = 2 * np.pi * (len(poses) / count + 0.1 * rng.uniform())
+        down = np.deg2rad(rng.uniform(*elevation_deg))
+        ray = np.array([np.cos(azimuth) * np.sin(down), np.sin(azimuth) * np.sin(down), np.cos(down)])
+        tilt = np.deg2rad(tilt_deg) * rng.uniform(-1, 1, 3) * (1, 1, 6)
+        T = board_pose(ray, rng.uniform(*distance_m), tilt, board)
+        if in_view(camera, T, board, mask):
+            poses.append(T)
+        if len(poses) == count:
+            return poses
+    raise AssertionError(f"only {len(poses)} of {count} boards fit into the view")
+
+
