@@ -35,10 +35,12 @@ from __future__ import annotations
 import binascii
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
+from drivers.motor_protocol import Script, heard, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64
@@ -208,3 +210,63 @@ class LineAssembler:
     def _discard(self) -> None:
         self.garbage += len(self._line)
         self._line.clear()
+
+    def reset(self) -> None:
+        """Forgets the piece of a line in hand."""
+        self._discard()
+
+
+class LineProtocol:
+    """The host's side of one connection.
+
+    A controller counts its heading from where its watchdog was set. That happens again after a cable was out, so the
+    heading it had last is added from then on; turns in between go unnoticed.
+    """
+
+    baud = 115_200
+
+    def __init__(self, drive: DifferentialDrive) -> None:
+        self.bad_frames = 0
+        self._drive = drive
+        self._seq = 0
+        self._zero_rad = self._heading_rad = 0.0  # what the controller calls 0, and what it said last
+
+    def framer(self) -> LineAssembler:
+        """Lines from '$' to line feed."""
+        return LineAssembler()
+
+    def connect(self, watchdog_ms: int) -> Script[float]:
+        """Sets the watchdog and hears what is in force."""
+        answer = yield from heard(encode(SetWatchdog(watchdog_ms)), self._watchdog)
+        require_watchdog(watchdog_ms, answer.watchdog_ms)
+        self._zero_rad = self._heading_rad
+        return float(watchdog_ms)
+
+    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+        """One velocity line; the status is the one with its seq."""
+        velocity_mps, yaw_rate_radps = self._drive.limited(command)
+        heading_rad = _wrapped(command.heading_rad - self._zero_rad)
+        seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
+        line = encode(Velocity(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
+        answer = yield from heard(line, lambda frame: self._status(frame, seq))
+        self._heading_rad = _wrapped(answer.status.heading_rad + self._zero_rad)
+        return replace(answer.status, heading_rad=self._heading_rad)
+
+    def _watchdog(self, frame: bytes) -> WatchdogSet | None:
+        message = self._message(frame)
+        return message if isinstance(message, WatchdogSet) else None
+
+    def _status(self, frame: bytes, seq: int) -> Status | None:
+        message = self._message(frame)
+        return message if isinstance(message, Status) and message.seq == seq else None
+
+    def _message(self, frame: bytes) -> Message | None:
+        try:
+            return decode(frame)
+        except ProtocolError:
+            self.bad_frames += 1
+            return None
+
+
+def _wrapped(angle_rad: float) -> float:
+    return math.remainder(angle_rad, math.tau)

@@ -1,144 +1,246 @@
-"""A motor controller behind a serial port, speaking the line protocol."""
+"""A motor controller behind a serial port, whatever its protocol."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
+import select
 import termios
 import time
-from collections.abc import Iterator
+from dataclasses import replace
 
 import serial  # type: ignore[import-untyped]
 
+from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
-from drivers.line_protocol import (
-    SEQ_COUNT,
-    LineAssembler,
-    Message,
-    ProtocolError,
-    SetWatchdog,
-    Status,
-    Velocity,
-    WatchdogSet,
-    decode,
-    encode,
-)
-from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.line_protocol import LineProtocol
+from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
+from drivers.motor_protocol import MotorProtocol, Script, T
 
-TRIES = 3
+TRIES = 2  # of a command within its time
+CONNECT_TRY_S = 0.3
 STOPS_AT_CLOSE = 3
 READ_LIMIT_BYTES = 4096
+STALE_SHARE = 0.8  # of the watchdog's time: later than that the controller may have stopped before a command arrives
+FIRST_WAIT_S = 0.2
+LONGEST_WAIT_S = 5.0
+_REASONS = {
+    errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
+    errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
+    errno.EBUSY: "it is in use by another program; see `fuser -v` with its name",
+    errno.EAGAIN: "it is in use by another program; see `fuser -v` with its name",
+}
+
+
+class Silence(DriverError):  # noqa: N818 - it is what was heard
+    """No answer within the time; the port is still there."""
 
 
 class SerialMotor:
-    """The base on `port`; one answer is waited for about timeout_s, and asked for at most TRIES times."""
+    """The base on `port`, for this program alone. No call blocks for longer than timeout_s, apart from opening.
+
+    A command is told at most TRIES times within timeout_s. After an error, a silence in which the controller's watchdog
+    may have expired, or a new connection, the first thing told is an explicit stop, whatever was asked: the status then
+    says watchdog_expired, and the next command drives. A port that is gone is opened again by a later `send`, with
+    growing waits in between, in which `send` fails at once.
+    """
 
     def __init__(
-        self, port: str, baud: int = 115200, timeout_s: float = 0.05, watchdog_ms: int = 500, *, connect_s: float = 3.0
+        self,
+        port: str,
+        protocol: MotorProtocol | None = None,
+        *,
+        baud: int = 0,
+        timeout_s: float = 0.1,
+        watchdog_ms: int = 500,
+        connect_s: float = 3.0,
     ) -> None:
         """Opens the port and has the controller stop by itself after watchdog_ms; DriverError where it does not.
 
+        protocol: the line protocol where none is given. baud: 0 is the protocol's own.
         connect_s: some boards restart when their port is opened and stay silent for seconds.
         """
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
-        setting = encode(SetWatchdog(watchdog_ms))
-        self.bad_lines = 0  # whole lines that were not of the protocol
-        self._name, self._timeout_s = port, timeout_s
-        self._assembler = LineAssembler()
-        self._seq = 0
-        self._port = _open(port, baud, timeout_s)
-        try:
-            self._verify(watchdog_ms, self._arm(setting, connect_s))
-        except BaseException:
-            self._port.close()
-            raise
+        self.errors = 0  # calls of `send` that failed
+        self.withheld = 0  # commands in place of which a stop was told
+        self.connections = 0
+        self._protocol = protocol or LineProtocol(DifferentialDrive())
+        self._framer = self._protocol.framer()
+        self._name, self._baud = port, baud or self._protocol.baud
+        self._timeout_s, self._watchdog_ms = timeout_s, watchdog_ms
+        self._port: serial.Serial | None = None
+        self._closed = self._armed = False
+        self._stop_first = True
+        self._heard_s = -math.inf  # when the last command that was answered had been begun
+        self._patience_s = 0.0  # silence in which the watchdog cannot have expired
+        self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
+        self._connect(connect_s)
 
     @property
     def garbage(self) -> int:
-        """Bytes received that belonged to no whole line."""
-        return self._assembler.garbage
+        """Bytes received that belonged to no whole frame."""
+        return self._framer.garbage
+
+    @property
+    def bad_frames(self) -> int:
+        """Frames received that made no sense."""
+        return self._protocol.bad_frames
 
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Hands the command over and gives the controller's answer; DriverError when it stays silent or is gone."""
-        for _ in range(TRIES):
-            status = self._try(command)
-            if status is not None:
-                return status
-        raise DriverError(
-            f"motor on {self._name} gave no answer to {TRIES} commands, {self._timeout_s} s each; check power and cable"
-        )
+        try:
+            return self._sent(command, time.monotonic() + self._timeout_s)
+        except DriverError:
+            self.errors += 1
+            self._stop_first = True
+            raise
 
     def close(self) -> None:
         """Stops the wheels as well as it can and releases the port; a second call does nothing."""
-        if not self._port.is_open:
-            return
+        self._closed = True
         with contextlib.suppress(DriverError):
             for _ in range(STOPS_AT_CLOSE):
-                self._try(stop_command(0))
-        with contextlib.suppress(OSError):
-            self._port.close()
+                if self._port is None or self._stopped():
+                    break
+        self._release()
 
-    def _try(self, command: VelocityCommand) -> MotorStatus | None:
-        """One line out and the status with its seq back; None when its time is over."""
-        line = encode(Velocity(self._seq, command))
-        seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
-        for answer in self._answers(line):
-            if isinstance(answer, Status) and answer.seq == seq:
-                return answer.status
-        return None
+    def _sent(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
+        if self._port is None:
+            self._open()
+        if not self._armed:
+            self._arm(deadline_s)
+        now_s = time.monotonic()
+        stopping = self._stop_first or now_s - self._heard_s > self._patience_s
+        told = stop_command(command.stamp_ns) if stopping else command
+        status = self._told(told, deadline_s)
+        self._heard_s = now_s
+        self._stop_first = status.watchdog_expired
+        if is_stop(command) or not stopping:
+            return status
+        self.withheld += 1
+        return replace(status, watchdog_expired=True)
 
-    def _arm(self, setting: bytes, connect_s: float) -> int:
-        """Sets the watchdog and gives the time the controller says is in force [ms]."""
-        deadline = time.monotonic() + connect_s
-        while time.monotonic() < deadline:
-            for answer in self._answers(setting):
-                if isinstance(answer, WatchdogSet):
-                    return answer.watchdog_ms
-        raise DriverError(
-            f"motor on {self._name} confirmed no watchdog within {connect_s} s; check power, cable and baud rate"
+    def _told(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
+        for left in range(TRIES, 1, -1):
+            now_s = time.monotonic()
+            with contextlib.suppress(Silence):
+                return self._run(self._protocol.drive(command, now_s), now_s + (deadline_s - now_s) / left)
+        return self._run(self._protocol.drive(command, time.monotonic()), deadline_s)
+
+    def _connect(self, connect_s: float) -> None:
+        """The first connection may take its time; nothing moves yet."""
+        deadline_s = time.monotonic() + connect_s
+        self._open()
+        try:
+            while not self._armed:
+                try_s = max(CONNECT_TRY_S, self._timeout_s)
+                self._try_to_arm(min(deadline_s, time.monotonic() + try_s), last=time.monotonic() + try_s >= deadline_s)
+            self._told(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+        except BaseException:
+            self._release()
+            raise
+        self._heard_s, self._stop_first = time.monotonic(), False
+
+    def _try_to_arm(self, deadline_s: float, *, last: bool) -> None:
+        try:
+            self._arm(deadline_s)
+        except Silence:
+            if last:
+                raise
+
+    def _arm(self, deadline_s: float) -> None:
+        self._stop_first = True
+        in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
+        self._patience_s = STALE_SHARE * in_force_ms / 1000
+        self._armed, self._wait_s = True, FIRST_WAIT_S
+        self.connections += 1
+
+    def _stopped(self) -> bool:
+        with contextlib.suppress(Silence):
+            self._run(self._protocol.drive(stop_command(0), time.monotonic()), time.monotonic() + self._timeout_s)
+            return True
+        return False
+
+    def _open(self) -> None:
+        """DriverError where it is not yet time to try again, or the port cannot be had."""
+        if self._closed:
+            raise DriverError(f"motor on {self._name} is closed; make a new one")
+        wait_s = self._next_open_s - time.monotonic()
+        if wait_s > 0:
+            raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
+        self._next_open_s = time.monotonic() + self._wait_s
+        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+        self._port = _opened(self._name, self._baud, self._timeout_s)
+
+    def _release(self) -> None:
+        port, self._port, self._armed = self._port, None, False
+        if port is not None:
+            with contextlib.suppress(OSError, termios.error):
+                port.close()
+
+    def _run(self, script: Script[T], deadline_s: float) -> T:
+        """What a script returns; Silence at the deadline."""
+        heard = self._framer.garbage + self._protocol.bad_frames
+        try:
+            self._forget_input()
+            self._write(next(script))
+            while True:
+                for frame in self._framer.feed(self._read(deadline_s)):
+                    self._write(script.send(frame))
+        except StopIteration as done:
+            result: T = done.value
+            return result
+        except Silence:
+            raise self._silence(self._framer.garbage + self._protocol.bad_frames - heard) from None
+        except DriverError as error:
+            raise DriverError(f"motor on {self._name}: {error}") from None
+        except (OSError, termios.error) as error:
+            self._release()
+            raise DriverError(f"motor on {self._name} is gone ({_line(error)}); plug it in again") from None
+
+    def _forget_input(self) -> None:
+        """Answers to earlier commands are nobody's."""
+        self._framer.reset()
+        if self._port is not None:
+            self._port.reset_input_buffer()
+
+    def _write(self, data: bytes) -> None:
+        if data and self._port is not None:
+            try:
+                self._port.write(data)
+            except serial.SerialTimeoutException:
+                raise Silence from None
+
+    def _read(self, deadline_s: float) -> bytes:
+        """What has arrived, or arrives until the deadline."""
+        if self._port is None or (wait_s := deadline_s - time.monotonic()) <= 0:
+            raise Silence
+        readable, _, _ = select.select([self._port.fileno()], [], [], wait_s)
+        return bytes(self._port.read(READ_LIMIT_BYTES)) if readable else b""
+
+    def _silence(self, nonsense: int) -> Silence:
+        if nonsense:
+            return Silence(
+                f"motor on {self._name} answers, but not in its protocol; check motor.protocol, the baud rate "
+                f"({self._baud}) and the cable"
+            )
+        return Silence(
+            f"motor on {self._name} gave no answer; check power, cable, the baud rate ({self._baud}) and motor.protocol"
         )
 
-    def _verify(self, asked_ms: int, in_force_ms: int) -> None:
-        if in_force_ms != asked_ms:
-            raise DriverError(
-                f"motor on {self._name}: watchdog of {asked_ms} ms asked, {in_force_ms} ms in force; ask for another"
-            )
 
-    def _answers(self, line: bytes) -> Iterator[Message]:
-        """Writes a line and yields what comes back until timeout_s is over."""
-        deadline = time.monotonic() + self._timeout_s
-        self._write(line)
-        while time.monotonic() < deadline:
-            for answer in self._assembler.feed(self._read()):
-                try:
-                    yield decode(answer)
-                except ProtocolError:
-                    self.bad_lines += 1
-
-    def _write(self, line: bytes) -> None:
-        try:
-            self._port.write(line)
-        except OSError as error:
-            raise self._lost(error) from error
-
-    def _read(self) -> bytes:
-        """What has arrived, or the first byte that arrives within timeout_s."""
-        try:
-            return bytes(self._port.read(max(1, min(self._port.in_waiting, READ_LIMIT_BYTES))))
-        except OSError as error:
-            raise self._lost(error) from error
-
-    def _lost(self, error: OSError) -> DriverError:
-        return DriverError(f"motor on {self._name} is gone ({error}); plug it in again and restart")
-
-
-def _open(port: str, baud: int, timeout_s: float) -> serial.Serial:
-    """The port, for this program alone."""
+def _opened(port: str, baud: int, timeout_s: float) -> serial.Serial:
+    """The port, for this program alone; reads do not wait."""
     try:
-        return serial.Serial(port, baud, timeout=timeout_s, write_timeout=timeout_s, exclusive=True)
+        return serial.Serial(port, baud, timeout=0, write_timeout=timeout_s, exclusive=True)
     except (OSError, ValueError, termios.error) as error:
+        reason = _REASONS.get(getattr(error, "errno", None) or 0)
         raise DriverError(
-            f"motor port {port} at {baud} baud cannot be opened ({error}); "
-            "check the name, that nothing else uses it, and that the user is in group dialout"
-        ) from error
+            f"motor port {port!r} at {baud} baud cannot be opened: {reason or _line(error) + '; is it a serial port?'}"
+        ) from None
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())

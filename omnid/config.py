@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
+from drivers.differential_drive import DifferentialDrive
+from drivers.motor_protocols import PROTOCOLS
 from omnid.core.ego_motion import Limits
 from omnid.core.heading import HeadingLimits
 from omnid.core.klt import Klt
@@ -86,11 +88,13 @@ class MotorConfig:
     """The controller of the wheels."""
 
     port: str = knob("", "serial port of the controller, or simulated; empty: none")
-    baud: int = knob(115_200, "bits per second", low=300, high=4_000_000)
+    protocol: str = knob("line", "what the controller speaks", choices=tuple(PROTOCOLS))
+    baud: int = knob(0, "bits per second; 0: the protocol's own", low=0, high=4_000_000)
     rate_hz: float = knob(20.0, "commands per second", low=1, high=200)
     stale_s: float = knob(0.5, "the wheels are stopped when the newest command is older, s", low=0.05, high=10)
     watchdog_ms: int = knob(500, "the controller stops the wheels by itself after so long without a command, ms",
                             low=50, high=10_000)
+    drive: DifferentialDrive = field(default_factory=DifferentialDrive)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +173,20 @@ HEADING: Mapping[str, Knob] = {
     "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
     "gain_hz": _knob("yaw rate per heading error, 1/s", 0.001, 50),
 }
+DRIVE: Mapping[str, Knob] = {
+    "track_m": _knob("between the left and the right wheels, m; where they skid, what makes measured turns right",
+                     0.01, 10),
+    "wheel_radius_m": _knob("radius of the wheels, m", 0.001, 5),
+    "max_wheel_mps": _knob("no wheel is told to roll faster, m/s; for roboteq_power and _mixed: at full power",
+                           0.001, 20),
+    "gear": _knob("turns of the motor for one of the wheel", 0.001, 10_000),
+    "ticks_per_turn": _knob("ros_arduino_bridge: ticks of the encoder for a turn of the motor", 1, 1_000_000),
+    "pole_pairs": _knob("vesc: pole pairs of the motor", 1, 100),
+    "reverse_left": _knob("the left motor turns the other way round"),
+    "reverse_right": _knob("the right motor turns the other way round"),
+    "swapped": _knob("the controller's first motor is the right one"),
+    "can_id": _knob("vesc: id of the second motor's controller", 0, 253),
+}
 BUS: Mapping[str, Knob] = {
     "robot": _knob("first part of every key, and of the topics of --record"),
     "listen": _knob("zenoh endpoints to listen on"),
@@ -184,5 +202,6 @@ def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
         entry.metadata = {"knob": described}  # type: ignore[assignment]  # any mapping will do
 
 
-for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING), (BusConfig, BUS)):
+for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING),
+                      (DifferentialDrive, DRIVE), (BusConfig, BUS)):
     _describe(_kind, _knobs)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 
+from drivers.errors import DriverError
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
+from drivers.motor_protocols import PROTOCOLS
 from drivers.serial_motor import SerialMotor
+from drivers.simulated_controllers import TWINS
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import MotorConfig
 from omnid.graph import Slot
@@ -15,12 +18,16 @@ SIMULATED = "simulated"
 
 
 class MotorTick:
-    """A sink that keeps the newest command with its time of arrival, and the action that sends it."""
+    """A sink that keeps the newest command with its time of arrival, and the action that sends it.
+
+    A controller that does not answer is asked again with each tick, and given up after stale_s.
+    """
 
     def __init__(self, driver: MotorDriver, stale_s: float) -> None:
         self._driver, self._stale_ns = driver, round(stale_s * 1e9)
         self._newest: Slot[tuple[int, VelocityCommand]] = Slot()
-        self.sent = self.stops = 0
+        self._failing: tuple[int, DriverError] | None = None  # since when, and by what
+        self.sent = self.stops = self.errors = 0
 
     def process(self, command: VelocityCommand) -> None:
         """Takes a command, at any rate."""
@@ -30,9 +37,19 @@ class MotorTick:
         """Sends one command now."""
         newest = self._newest.get()
         fresh = newest is not None and time.monotonic_ns() - newest[0] <= self._stale_ns
-        self._driver.send(newest[1] if newest is not None and fresh else stop_command(0))
-        self.sent += 1
+        self._send(newest[1] if newest is not None and fresh else stop_command(0))
         self.stops += not fresh
+
+    def _send(self, command: VelocityCommand) -> None:
+        try:
+            self._driver.send(command)
+            self.sent += 1
+            self._failing = None
+        except DriverError as error:
+            self.errors += 1
+            self._failing = self._failing or (time.monotonic_ns(), error)
+            if time.monotonic_ns() - self._failing[0] > self._stale_ns:
+                raise self._failing[1] from None
 
     def close(self) -> None:
         """Stops the wheels and releases the port."""
@@ -43,8 +60,10 @@ def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[MotorTick, Simu
     """The motor on the configured port, and its simulation where that is asked for; DriverError where it is silent."""
     twin = None
     if config.port == SIMULATED:
-        twin = SimulatedMotor()
+        twin = SimulatedMotor(TWINS[config.protocol](config.drive))
         closing.callback(twin.close)
-    driver = SerialMotor(twin.port if twin else config.port, config.baud, watchdog_ms=config.watchdog_ms)
+    protocol = PROTOCOLS[config.protocol](config.drive)
+    driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud, timeout_s=1 / config.rate_hz,
+                         watchdog_ms=config.watchdog_ms)  # no tick blocks for longer than its period
     closing.callback(driver.close)
     return MotorTick(driver, config.stale_s), twin

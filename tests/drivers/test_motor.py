@@ -1,4 +1,4 @@
-"""The serial motor against its twin: as pure state, and over a real pty."""
+"""The motor of the line protocol and its twin: as pure state, and over a real pty."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers import serial_motor
+from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
-from drivers.line_protocol import SetWatchdog, Status, Velocity, WatchdogSet, decode, encode
+from drivers.line_protocol import LineProtocol, SetWatchdog, Status, Velocity, WatchdogSet, decode, encode
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand, is_stop, stop_command
+from drivers.motor_protocol import Script, T
 from drivers.serial_motor import SerialMotor
-from drivers.simulated_motor import SimulatedMotor, TwinState
+from drivers.simulated_line import SimulatedLine
+from drivers.simulated_motor import SimulatedMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing here is measured against it
 ANSWER_S = 2.0
 
 
-def drive(state: TwinState, seconds: float, command: VelocityCommand) -> None:
+def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
     """Commands at 20 Hz for a while."""
     for _ in range(round(seconds * 20)):
-        assert state.handle(encode(Velocity(state.commands, command))) is not None
-        state.advance(0.05)
+        assert state.handle(encode(Velocity(state.base.commands, command))) is not None
+        state.base.advance(0.05)
 
 
 def until(condition: Callable[[], bool]) -> bool:
@@ -46,96 +48,96 @@ def twin() -> Iterator[SimulatedMotor]:
 
 
 def test_twin_drives_straight() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     drive(state, 2.0, VelocityCommand(0, 0.5, 0.0, 0.0))
-    x_m, y_m, heading_rad = state.pose
+    x_m, y_m, heading_rad = state.base.pose
     assert 0.9 < x_m < 1.0 and y_m == 0.0 and heading_rad == 0.0
-    assert state.errors == 0 and state.commands == 40
+    assert state.base.errors == 0 and state.base.commands == 40
 
 
 @pytest.mark.parametrize("heading_rad", [1.0, -2.0, 3.1, -3.1])
 def test_twin_steers_to_the_heading(heading_rad: float) -> None:
-    state = TwinState()
+    state = SimulatedLine()
     drive(state, 6.0, VelocityCommand(0, 0.2, heading_rad, 0.0))
-    assert state.pose[2] == pytest.approx(heading_rad, abs=0.01)
+    assert state.base.pose[2] == pytest.approx(heading_rad, abs=0.01)
 
 
 def test_twin_crosses_half_a_turn_the_short_way() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
-    before, turned = state.pose[2], 0.0
+    before, turned = state.base.pose[2], 0.0
     for _ in range(40):
         drive(state, 0.05, VelocityCommand(0, 0.2, -3.0, 0.0))
-        turned += math.remainder(state.pose[2] - before, math.tau)
-        before = state.pose[2]
+        turned += math.remainder(state.base.pose[2] - before, math.tau)
+        before = state.base.pose[2]
     assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
 
 
 def test_twin_without_heading_input_follows_the_yaw_rate() -> None:
-    state = TwinState(heading_input=False)
+    state = SimulatedLine(heading_input=False)
     drive(state, 2.0, VelocityCommand(0, 0.5, 2.0, 0.5))
-    x_m, y_m, heading_rad = state.pose
+    x_m, y_m, heading_rad = state.base.pose
     assert heading_rad == pytest.approx(1.0, abs=0.05)
     assert math.hypot(x_m, y_m - 1.0) == pytest.approx(1.0, abs=0.05)  # a circle of radius v / w = 1 m about (0, 1)
 
 
 def test_stop_does_not_turn_towards_its_heading() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     drive(state, 4.0, VelocityCommand(0, 0.2, 1.0, 0.0))
     drive(state, 2.0, stop_command(0))
-    assert state.pose[2] == pytest.approx(1.0, abs=0.01)
-    assert state.velocity_mps == 0.0 and is_stop(stop_command(7))
+    assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
+    assert state.base.velocity_mps == 0.0 and is_stop(stop_command(7))
 
 
 def test_watchdog_stops_the_wheels_and_says_so() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     assert state.handle(encode(SetWatchdog(200))) == encode(WatchdogSet(200))
     drive(state, 1.0, VelocityCommand(0, 0.5, 0.0, 0.0))
-    state.advance(0.14)  # with the 0.05 s of the last command
-    assert not state.watchdog_expired and state.velocity_mps == 0.5
-    state.advance(1.0)
-    assert state.watchdog_expired and state.velocity_mps == 0.0 and state.expiries == 1
+    state.base.advance(0.14)  # with the 0.05 s of the last command
+    assert not state.base.watchdog_expired and state.base.velocity_mps == 0.5
+    state.base.advance(1.0)
+    assert state.base.watchdog_expired and state.base.velocity_mps == 0.0 and state.base.expiries == 1
     answers = [state.handle(encode(Velocity(20 + i, stop_command(0)))) for i in range(2)]
     expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, Status)]
     assert expired == [True, False]
 
 
 def test_noise_does_not_feed_the_watchdog() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     for _ in range(20):
         state.handle(b"$V,0,100,0,0*0000\n")
-        state.advance(0.05)
-    assert state.watchdog_expired and state.errors == 20 and state.commands == 0
+        state.base.advance(0.05)
+    assert state.base.watchdog_expired and state.base.errors == 20 and state.base.commands == 0
 
 
 def test_gap_in_seq_is_an_error_but_obeyed() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
     for seq, told in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
         assert state.handle(encode(Velocity(seq, told))) is not None
-    assert state.errors == 1 and state.last_command == command
+    assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
 def test_heading_counts_from_where_the_host_connected() -> None:
-    state = TwinState()
+    state = SimulatedLine()
     drive(state, 4.0, VelocityCommand(0, 0.0, 1.0, 0.1))
     state.handle(encode(SetWatchdog(500)))
     answer = decode(state.handle(encode(Velocity(0, stop_command(0)))) or b"")
     assert isinstance(answer, Status) and answer.status.heading_rad == 0.0
-    assert state.pose[2] == pytest.approx(1.0, abs=0.01)
+    assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
 
 
 def test_twin_survives_any_line() -> None:
-    rng, state = random.Random(5), TwinState()
+    rng, state = random.Random(5), SimulatedLine()
     for _ in range(1000):
         assert state.handle(rng.randbytes(rng.randint(0, 40))) is None
-    assert state.errors == 1000
+    assert state.base.errors == 1000
 
 
 @pytest.mark.parametrize("dt_s", [-0.1, math.nan, math.inf, 61.0])
 def test_twin_refuses_odd_times(dt_s: float) -> None:
     with pytest.raises(DriverError, match="cannot advance"):
-        TwinState().advance(dt_s)
+        SimulatedLine().base.advance(dt_s)
 
 
 # The serial motor and the twin over a pty
@@ -152,51 +154,34 @@ def test_commands_arrive_and_are_answered(twin: SimulatedMotor) -> None:
     assert twin.errors == 0 and twin.state.watchdog_ms == 10_000
 
 
-def test_close_stops_the_wheels(twin: SimulatedMotor) -> None:
-    motor = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
-    motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
-    motor.close()
-    motor.close()
-    assert twin.last_command == stop_command(0) and twin.commands == 1 + serial_motor.STOPS_AT_CLOSE
-    assert until(lambda: twin.state.velocity_mps == 0.0) and not twin.watchdog_expired
-
-
-def test_silent_host_is_stopped_by_the_watchdog(twin: SimulatedMotor) -> None:
-    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=20)) as motor:
-        motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
-        assert until(lambda: twin.watchdog_expired and twin.state.velocity_mps == 0.0)
-        assert motor.send(stop_command(0)).watchdog_expired
-
-
 def test_many_commands_over_the_end_of_seq(twin: SimulatedMotor) -> None:
-    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor:
-        motor._seq = 65500
+    protocol = LineProtocol(DifferentialDrive())
+    protocol._seq = 65500
+    motor = SerialMotor(twin.port, protocol, timeout_s=ANSWER_S, watchdog_ms=10_000)
+    with contextlib.closing(motor):
         for i in range(100):
-            motor.send(VelocityCommand(i, 0.001 * i, 0.01 * i, -0.02 * i))
-        assert twin.commands == 100 and twin.errors == 0 and motor.garbage == motor.bad_lines == 0
+            motor.send(VelocityCommand(i, 0.001 * i, 0.1 * i, -0.02 * i))
+        assert twin.commands == 101 and twin.errors == 0 and motor.garbage == motor.bad_frames == 0
 
 
 def test_unsendable_command_sends_nothing(twin: SimulatedMotor) -> None:
     with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor:
+        before = twin.commands
         with pytest.raises(DriverError, match="velocity is nan"):
             motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
+        assert twin.commands == before
         motor.send(stop_command(0))
-        assert twin.commands == 1 and twin.errors == 0
+        assert twin.commands == before + 1 and twin.errors == 0
 
 
-def test_port_is_for_one_program(twin: SimulatedMotor) -> None:
-    with (
-        contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)),
-        pytest.raises(DriverError, match=r"cannot be opened .*lock"),
-    ):
-        SerialMotor(twin.port)
-
-
-@pytest.mark.parametrize("port", ["/dev/no-such-motor", "/dev/null", "/", ""])
-def test_open_failure_names_port_and_group(port: str) -> None:
-    with pytest.raises(DriverError, match="dialout") as caught:
+@pytest.mark.parametrize(
+    ("port", "what"),
+    [("/dev/no-such-motor", "no such port"), ("/dev/null", "serial port"), ("/", "serial port"), ("", "port")],
+)
+def test_open_failure_says_what_to_do(port: str, what: str) -> None:
+    with pytest.raises(DriverError, match=what) as caught:
         SerialMotor(port)
-    assert f"motor port {port} " in str(caught.value) and "\n" not in str(caught.value)
+    assert f"motor port {port!r} " in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("watchdog_ms", "timeout_s"), [(0, 0.05), (20_000, 0.05), (500, 0.0), (500, math.nan)])
@@ -205,7 +190,7 @@ def test_settings_must_make_sense(twin: SimulatedMotor, watchdog_ms: int, timeou
         SerialMotor(twin.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
 
 
-class Stubborn(TwinState):
+class Stubborn(SimulatedLine):
     """A controller that keeps its own watchdog time."""
 
     def handle(self, line: bytes) -> bytes | None:
@@ -222,43 +207,7 @@ def test_watchdog_in_force_is_verified() -> None:
         SerialMotor(twin.port, timeout_s=ANSWER_S)
 
 
-class Deaf(TwinState):
-    """A controller that answers nothing after `hearing` lines."""
-
-    def __init__(self, hearing: int) -> None:
-        super().__init__()
-        self.hearing = hearing
-
-    def handle(self, line: bytes) -> bytes | None:
-        """The answer of the twin while it hears."""
-        self.hearing -= 1
-        return super().handle(line) if self.hearing >= 0 else None
-
-
-def test_silence_at_connect() -> None:
-    with contextlib.closing(SimulatedMotor(Deaf(0))) as twin, pytest.raises(DriverError, match="confirmed no watchdog"):
-        SerialMotor(twin.port, connect_s=0.1)
-
-
-def test_silence_later_ends_in_an_error_and_close_returns() -> None:
-    with contextlib.closing(SimulatedMotor(Deaf(1))) as twin:
-        motor = SerialMotor(twin.port, connect_s=PATIENCE_S)
-        with pytest.raises(DriverError, match="no answer to 3 commands"):
-            motor.send(VelocityCommand(0, 1.0, 0.0, 0.0))
-        motor.close()
-
-
-def test_unplugged_motor_is_an_error_and_close_returns() -> None:
-    twin = SimulatedMotor()
-    motor = SerialMotor(twin.port, timeout_s=ANSWER_S)
-    twin.close()
-    twin.close()
-    with pytest.raises(DriverError, match="is gone"):
-        motor.send(stop_command(0))
-    motor.close()
-
-
-class Echo(TwinState):
+class Echo(SimulatedLine):
     """Two crossed wires: what is sent comes back."""
 
     def handle(self, line: bytes) -> bytes | None:
@@ -267,11 +216,11 @@ class Echo(TwinState):
 
 
 def test_echo_is_not_taken_for_an_answer() -> None:
-    with contextlib.closing(SimulatedMotor(Echo())) as twin, pytest.raises(DriverError, match="confirmed no watchdog"):
+    with contextlib.closing(SimulatedMotor(Echo())) as twin, pytest.raises(DriverError, match="no answer"):
         SerialMotor(twin.port, connect_s=0.1)
 
 
-class Noisy(TwinState):
+class Noisy(SimulatedLine):
     """A controller behind a bad cable: noise and stale answers before each good one."""
 
     def handle(self, line: bytes) -> bytes | None:
@@ -286,7 +235,7 @@ def test_noise_before_the_answer_is_skipped_and_counted() -> None:
         contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor,
     ):
         assert motor.send(stop_command(0)).fault == 0
-        assert motor.bad_lines == 2 and motor.garbage == 2 * 6
+        assert motor.bad_frames == 3 and motor.garbage == 3 * 6  # connected, stopped, sent
 
 
 def test_twin_counts_what_is_not_of_the_protocol(twin: SimulatedMotor) -> None:
@@ -303,3 +252,34 @@ def test_twin_outlives_a_host_that_never_reads(twin: SimulatedMotor) -> None:
         os.write(descriptor, encode(Velocity(seq, stop_command(0))))
     assert until(lambda: twin.commands == 2000) and twin.unsent > 0
     os.close(descriptor)
+
+
+# The protocol's host, without a port
+
+
+def test_heading_goes_on_where_it_was_after_a_new_connection() -> None:
+    """A controller counts from 0 again once its watchdog is set; the robot's heading in odom does not."""
+    protocol, twin = LineProtocol(DifferentialDrive()), SimulatedLine()
+    told(protocol.connect(500), twin)
+    turn(protocol, twin, 1.0)
+    assert twin.base.pose[2] == pytest.approx(1.0, abs=0.01)
+    told(protocol.connect(500), twin)
+    status = turn(protocol, twin, 1.5)
+    assert twin.base.pose[2] == pytest.approx(1.5, abs=0.01)
+    assert status.heading_rad == pytest.approx(1.5, abs=0.01)
+
+
+def turn(protocol: LineProtocol, twin: SimulatedLine, heading_rad: float) -> MotorStatus:
+    for _ in range(100):
+        status = told(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), twin)
+        twin.base.advance(0.05)
+    return status
+
+
+def told(script: Script[T], twin: SimulatedLine) -> T:
+    """What a script returns that needs one answer."""
+    try:
+        script.send(twin.handle(next(script)) or b"")
+    except StopIteration as done:
+        return done.value  # type: ignore[no-any-return]
+    raise AssertionError("it wants more")

@@ -1,0 +1,26 @@
+"""The controllers' protocols by the names that the configuration knows them by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from drivers.differential_drive import DifferentialDrive
+from drivers.line_protocol import LineProtocol
+from drivers.motor_protocol import MotorProtocol
+from drivers.odrive_ascii import ODriveAscii
+from drivers.roboteq import MIXED, POWER, Roboteq
+from drivers.ros_arduino_bridge import RosArduinoBridge
+from drivers.vesc import Vesc
+from drivers.waveshare_json import WaveshareJson
+
+PROTOCOLS: Mapping[str, Callable[[DifferentialDrive], MotorProtocol]] = {
+    "line": LineProtocol,
+    "roboteq": Roboteq,
+    "roboteq_power": partial(Roboteq, mode=POWER),
+    "roboteq_mixed": partial(Roboteq, mode=MIXED),
+    "odrive_ascii": ODriveAscii,
+    "vesc": Vesc,
+    "waveshare_json": WaveshareJson,
+    "ros_arduino_bridge": RosArduinoBridge,
+}

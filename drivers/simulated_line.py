@@ -1,0 +1,76 @@
+"""The twin of a base that speaks the line protocol."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.differential_drive import DifferentialDrive
+from drivers.line_protocol import (
+    SEQ_COUNT,
+    LineAssembler,
+    ProtocolError,
+    SetWatchdog,
+    Status,
+    Velocity,
+    WatchdogSet,
+    decode,
+    encode,
+)
+from drivers.motor import MotorStatus, VelocityCommand, is_stop
+from drivers.simulated_base import SimulatedBase, TwinLimits, answered
+
+
+class SimulatedLine:
+    """heading_input: steers to the commanded heading; else follows the commanded yaw rate."""
+
+    def __init__(
+        self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: TwinLimits | None = None
+    ) -> None:
+        self.base = SimulatedBase(drive, limits)
+        self._heading_input = heading_input
+        self._assembler = LineAssembler()
+        self._zero_rad = 0.0  # world heading the controller calls 0
+        self._next_seq: int | None = None
+
+    def feed(self, data: bytes) -> bytes:
+        """The answers to all lines that end in data."""
+        return answered(self.base, self._assembler, lambda line: self.handle(line) or b"", data)
+
+    def handle(self, line: bytes) -> bytes | None:
+        """The answer to a line, None where it gets none."""
+        try:
+            message = decode(line)
+        except ProtocolError:
+            message = None
+        match message:
+            case Velocity(seq, command):
+                return self._obey(seq, command)
+            case SetWatchdog(watchdog_ms):
+                return self._arm(watchdog_ms)
+        self.base.errors += 1
+        return None
+
+    def _obey(self, seq: int, command: VelocityCommand) -> bytes:
+        self.base.errors += self._next_seq not in (None, seq)
+        self._next_seq = (seq + 1) % SEQ_COUNT
+        self.base.commands += 1
+        answer = encode(Status(seq, self._status()))
+        steers = self._heading_input and not is_stop(command)
+        self.base.goal_heading_rad = command.heading_rad + self._zero_rad if steers else None
+        self.base.tell(command.velocity_mps, command.yaw_rate_radps)
+        return answer
+
+    def _arm(self, watchdog_ms: int) -> bytes:
+        """Connects a host: stands still, takes the present heading as zero, and any seq as the first."""
+        self.base.watchdog_ms = watchdog_ms
+        self._next_seq = None
+        self._zero_rad = self.base.pose[2]
+        self.base.tell(0.0, 0.0)
+        return encode(WatchdogSet(watchdog_ms))
+
+    def _status(self) -> MotorStatus:
+        base = self.base
+        heading_rad = math.remainder(base.pose[2] - self._zero_rad, math.tau)
+        return MotorStatus(
+            base.velocity_mps, heading_rad, base.yaw_rate_radps, base.watchdog_expired, base.fault, base.battery_v
+        )

@@ -1,0 +1,122 @@
+"""The twin of an ODrive v3 with two axes; the source is named in drivers/odrive_ascii.py."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from drivers.differential_drive import DifferentialDrive
+from drivers.motor_protocol import TextFramer
+from drivers.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, answered
+
+_FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"
+_WATCHDOG_EXPIRED, _CLOSED_LOOP, _IDLE = 0x800, 8, 1
+
+
+class SimulatedODrive:
+    """Asks for a checksum on every line, which a real one leaves to the host: a damaged line must never be obeyed."""
+
+    def __init__(self, drive: DifferentialDrive | None = None) -> None:
+        self.base = SimulatedBase(drive)
+        self.base.watchdog_ms = 0
+        self._framer = TextFramer()
+        self._state = [_IDLE, _IDLE]
+        self._settings = {
+            f"axis{axis}.{name}": 0.0
+            for axis in SIDES
+            for name in ("config.enable_watchdog", "config.watchdog_timeout", "controller.config.control_mode")
+        }
+
+    def feed(self, data: bytes) -> bytes:
+        """The answers to all lines that end in data."""
+        return answered(self.base, self._framer, self._handle, data)
+
+    def _handle(self, line: bytes) -> bytes:
+        body, star, checksum = line.partition(b"*")
+        found = 0
+        for byte in body:
+            found ^= byte
+        if not star or not re.fullmatch(rb"[0-9]{1,3}", checksum) or int(checksum) != found:
+            self.base.errors += 1
+            return b""
+        answer = self._answer(body.decode("latin-1"))
+        return _sealed(answer) if answer else b""
+
+    def _answer(self, line: str) -> str:
+        self._disarm_expired()
+        if match := re.fullmatch(rf"v ([01]) {_FLOAT}", line):
+            self.base.commands += 1
+            return self._drive(int(match[1]), float(match[2]))
+        if match := re.fullmatch(r"u ([01])", line):
+            return self._fed(int(match[1]))
+        if match := re.fullmatch(r"f ([01])", line):
+            turns = self._turns_per_m()
+            axis = int(match[1])
+            return f"{self.base.channels_m()[axis] * turns:.6f} {self.base.channels_mps()[axis] * turns:.6f}"
+        if match := re.fullmatch(r"r (\S+)", line):
+            return self._read(match[1])
+        if match := re.fullmatch(rf"w (\S+) {_FLOAT}", line):
+            return self._write(match[1], float(match[2]))
+        return self._wrong("unknown command")
+
+    def _drive(self, axis: int, turns_per_s: float) -> str:
+        """A disarmed axis is fed and takes the velocity down, but does not turn."""
+        self._fed(axis)
+        if self._state[axis] == _CLOSED_LOOP:
+            self.base.tell_channel(axis, turns_per_s / self._turns_per_m())
+        elif turns_per_s:
+            self.base.errors += 1
+        return ""
+
+    def _fed(self, axis: int) -> str:
+        self.base.feed(self._side(axis))
+        return ""
+
+    def _read(self, name: str) -> str:
+        if name == "vbus_voltage":
+            return f"{self.base.battery_v:f}"
+        if match := re.fullmatch(r"axis([01])\.error", name):
+            expired = self.base.expired[self._side(int(match[1]))]
+            return str(self.base.fault | _WATCHDOG_EXPIRED * expired)
+        return f"{self._settings[name]:g}" if name in self._settings else self._wrong("invalid property")
+
+    def _write(self, name: str, value: float) -> str:
+        if match := re.fullmatch(r"axis([01])\.(error|requested_state)", name):
+            return self._arm(int(match[1]), match[2], value)
+        if name not in self._settings:
+            return self._wrong("invalid property")
+        self._settings[name] = value
+        times_s = [self._settings[f"axis{axis}.config.watchdog_timeout"] for axis in SIDES]
+        enabled = all(self._settings[f"axis{axis}.config.enable_watchdog"] for axis in SIDES)
+        self.base.watchdog_ms = 1000 * max(times_s) if enabled else 0.0
+        return ""
+
+    def _arm(self, axis: int, what: str, value: float) -> str:
+        if what == "error":
+            self.base.expired[self._side(axis)] = bool(int(value) & _WATCHDOG_EXPIRED)
+        elif value == _CLOSED_LOOP and not self.base.expired[self._side(axis)] and not self.base.fault:
+            self._state[axis] = _CLOSED_LOOP
+            self.base.tell_channel(axis, 0.0)  # its own start is a stop
+        return ""
+
+    def _disarm_expired(self) -> None:
+        for axis in SIDES:
+            if self.base.expired[self._side(axis)]:
+                self._state[axis] = _IDLE
+
+    def _side(self, axis: int) -> int:
+        return RIGHT if bool(axis) != self.base.drive.swapped else LEFT
+
+    def _wrong(self, answer: str) -> str:
+        self.base.errors += 1
+        return answer
+
+    def _turns_per_m(self) -> float:
+        return self.base.drive.gear / (math.tau * self.base.drive.wheel_radius_m)
+
+
+def _sealed(answer: str) -> bytes:
+    checksum = 0
+    for byte in answer.encode():
+        checksum ^= byte
+    return f"{answer}*{checksum}\r\n".encode()

@@ -1,0 +1,86 @@
+"""The twin of a Roboteq dual-channel controller; the manual is named in drivers/roboteq.py."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from drivers.differential_drive import DifferentialDrive
+from drivers.motor_protocol import TextFramer
+from drivers.roboteq import MIXED, RPM
+from drivers.simulated_base import SimulatedBase, answered
+
+_ORDER = re.compile(rb"!([SG]) ([12]) (-?[0-9]{1,5})")
+_TOP = {b"S": 65535, b"G": 1000}
+
+
+class SimulatedRoboteq:
+    """Echoes until it is told not to, as one out of the box."""
+
+    def __init__(self, drive: DifferentialDrive | None = None, mode: str = RPM) -> None:
+        self.base = SimulatedBase(drive)
+        self.base.watchdog_ms = 1000
+        self._mode = mode
+        self._framer = TextFramer()
+        self._echo = True
+        self._mixed = [0.0, 0.0]  # throttle and steering
+
+    def feed(self, data: bytes) -> bytes:
+        """The answers to all lines that end in data."""
+        return answered(self.base, self._framer, self._handle, data)
+
+    def _handle(self, line: bytes) -> bytes:
+        echo = line + b"\r" if self._echo else b""
+        return echo + (self._answer(line) or self._refusal()) + b"\r"
+
+    def _answer(self, line: bytes) -> bytes | None:
+        if order := _ORDER.fullmatch(line):
+            return self._obey(order[1], int(order[2]) - 1, int(order[3]))
+        if setting := re.fullmatch(rb"\^(ECHOF|RWD) ([0-9]{1,5})", line):
+            return self._set(setting[1], int(setting[2]))
+        return self._question(line)
+
+    def _refusal(self) -> bytes:
+        self.base.errors += 1
+        return b"-"
+
+    def _obey(self, kind: bytes, channel: int, value: int) -> bytes | None:
+        if abs(value) > _TOP[kind] or (kind == b"S") != (self._mode == RPM):
+            return None
+        self.base.commands += 1
+        if self._mode == MIXED:
+            return self._mix(channel, value)
+        self.base.tell_channel(channel, value * self._unit_mps())
+        return b"+"
+
+    def _mix(self, channel: int, value: int) -> bytes:
+        """Both motors follow either input, and either feeds the one watchdog."""
+        self._mixed[channel] = value
+        throttle, steering = self._mixed
+        if channel == 1:
+            self.base.tell_channels((throttle + steering) * self._unit_mps(), (throttle - steering) * self._unit_mps())
+        return b"+"
+
+    def _set(self, name: bytes, value: int) -> bytes:
+        if name == b"ECHOF":
+            self._echo = value == 0
+        else:
+            self.base.watchdog_ms = value
+        return b"+"
+
+    def _question(self, line: bytes) -> bytes | None:
+        speeds = b":".join(b"%d" % round(mps / self._unit_mps()) for mps in self.base.channels_mps())
+        return {
+            b"?S": b"S=" + speeds,
+            b"?M": b"M=" + speeds,
+            b"?V 2": b"V=%d" % round(self.base.battery_v * 10),
+            b"?FF": b"FF=%d" % self.base.fault,
+            b"~RWD": b"RWD=%d" % self.base.watchdog_ms,
+            b"~MXMD": b"MXMD=%d" % (self._mode == MIXED),
+        }.get(line)
+
+    def _unit_mps(self) -> float:
+        """Wheel speed of one rpm of the motor, or of a thousandth of full power."""
+        if self._mode == RPM:
+            return math.tau * self.base.drive.wheel_radius_m / (60 * self.base.drive.gear)
+        return self.base.drive.max_wheel_mps / 1000
