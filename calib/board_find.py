@@ -1,7 +1,7 @@
-"""Finds a checkerboard in a mirror's picture: by its own linked corners first, then by OpenCV's detectors.
+"""Finds a checkerboard in a mirror's picture: by linked corners first, then by OpenCV's detectors.
 
-Both look at the picture as it is, with its local contrast raised, enlarged, and unrolled about its middle: on a
-log-polar strip, which keeps small squares square, boards near the hub grow and lose their fan shape.
+Linked corners are looked for in the picture as it is, with its local contrast raised, enlarged, and unrolled about its
+middle: on a log-polar strip, which keeps small squares square, boards near the hub grow and lose their fan shape.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board import Board, BoardView
-from calib.board_corners import find_corners, look_at, smoothed
+from calib.board_corners import Grey, find_corners, look_at, smoothed
 from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
-from calib.board_order import as_grid, in_order, largest_board, place, unevenness
+from calib.board_order import as_grid, in_order, largest_board, place
 from calib.board_refine import refine
+from calib.board_shape import unevenness
 from calib.camera import Array
 
 Image = NDArray[np.uint8]
 BLUR_PX = 0.7
 # Of a picture's grids so many are grown and tried.
 TRIED_GRIDS = 4
-# What a corner may lie off its neighbours, in parts of a square, and how many have to look like corners.
-MAX_UNEVEN = 0.35
-MIN_LIKELY = 0.8
+# What a corner may lie off its neighbours, in parts of a square; so many must be good, or the whole is no board.
+MAX_UNEVEN = 0.2
+MIN_GOOD = 0.75
 # Pictures larger than this are not enlarged.
 MAX_ENLARGED_PIXELS = 1_600_000
 MAX_STRIP_PX = 2400
@@ -54,16 +55,17 @@ class _Look:
 def find_board(image: Image, board: Board, name: str = "") -> Search:
     """The board in a picture (H, W) uint8, its corners to a fraction of a pixel."""
     seen = (0, 0)
+    blurred = smoothed(image, BLUR_PX)
     for look in _looks(image):
         for grid in _grids(look):
             view = _view(image, grid, board, name)
             if view is not None:
                 return Search(view)
             seen = max(seen, largest_board(grid), key=lambda sides: sides[0] * sides[1])
-        for grid in _by_opencv(look, board):
-            view = _view(image, grow(smoothed(image, BLUR_PX), grid), board, name)
-            if view is not None:
-                return Search(view)
+    for grid in _by_opencv(image, board):
+        view = _view(image, grow(blurred, grid), board, name)
+        if view is not None:
+            return Search(view)
     hint = min(seen) >= MIN_HINT_SIDE and seen[0] * seen[1] >= MIN_HINT_CORNERS
     return Search(None, seen if hint else (0, 0))
 
@@ -106,23 +108,26 @@ def _grids(look: _Look) -> Iterator[Grid]:
         yield _back(grow(blurred, grid), look)
 
 
-def _by_opencv(look: _Look, board: Board) -> Iterator[Grid]:
-    """What OpenCV's two detectors find, in the pixels of the first picture."""
+def _by_opencv(image: Image, board: Board) -> Iterator[Grid]:
+    """What OpenCV's two detectors find."""
     size = (board.columns, board.rows)
     sector = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     for detect, flags in ((cv2.findChessboardCornersSB, sector),
                           (cv2.findChessboardCorners, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)):
-        found, corners = detect(look.image, size, flags=flags)
+        found, corners = detect(image, size, flags=flags)
         if found and corners is not None and len(corners) == board.columns * board.rows:
-            grid = as_grid(np.asarray(corners, float).reshape(board.rows, board.columns, 2))
-            yield _back(grid, look)
+            yield _upright(as_grid(np.asarray(corners, float).reshape(board.rows, board.columns, 2)))
 
 
 def _back(grid: Grid, look: _Look) -> Grid:
-    """The grid in the first picture, its rows and columns turning clockwise there."""
+    """The grid in the first picture."""
     pixels = look.origin(np.array(list(grid.values())))
-    back = dict(zip(grid, pixels, strict=True))
-    return back if _clockwise(back) else {(row, column): pixel for (column, row), pixel in back.items()}
+    return _upright(dict(zip(grid, pixels, strict=True)))
+
+
+def _upright(grid: Grid) -> Grid:
+    """The grid with columns turning clockwise to rows."""
+    return grid if _clockwise(grid) else {(row, column): pixel for (column, row), pixel in grid.items()}
 
 
 def _clockwise(grid: Grid) -> bool:
@@ -137,16 +142,32 @@ def _view(image: Image, grid: Grid, board: Board, name: str) -> BoardView | None
     if placed is None:
         return None
     blurred = smoothed(image, BLUR_PX)
-    corners = refine(image, in_order(blurred, placed, board))
-    confidence = _likeliness(image, corners)
-    uneven = unevenness(corners)
-    if uneven > MAX_UNEVEN or confidence < MIN_LIKELY:
+    ordered = in_order(blurred, placed, board)
+    good = _without_strays(blurred, refine(image, ordered))
+    part = float(np.isfinite(good[..., 0]).mean())
+    if part < MIN_GOOD:
         return None
-    return BoardView(name, corners.reshape(-1, 2), confidence * (1 - uneven))
+    return BoardView(name, good.reshape(-1, 2), part * (1 - float(np.nanmean(unevenness(good)))))
 
 
-def _likeliness(image: Image, corners: Array) -> float:
-    """Part of the corners that look like ones."""
-    grid, blurred = as_grid(corners), smoothed(image, BLUR_PX)
+def _without_strays(blurred: Grey, corners: Array) -> Array:
+    """The corners (rows, columns, 2) with NaN for those that do not look like one or lie where none should."""
+    good = corners.copy()
+    good[~_likely(blurred, corners)] = np.nan
+    for _ in range(good.shape[0] * good.shape[1]):
+        off = unevenness(good)
+        worst = np.unravel_index(np.argmax(np.nan_to_num(off)), off.shape)
+        if not off[worst] > MAX_UNEVEN:
+            break
+        good[worst] = np.nan  # one at a time: a stray makes its neighbours look uneven too
+    return good
+
+
+def _likely(blurred: Grey, corners: Array) -> NDArray[np.bool_]:
+    """Which of the corners (rows, columns) look like ones."""
+    grid = as_grid(corners)
     rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    return float(np.mean(look_at(blurred, np.array(list(grid.values())), rings).quality > 0))
+    likely = np.zeros(corners.shape[:2], bool)
+    column, row = np.array(list(grid)).T
+    likely[row, column] = look_at(blurred, np.array(list(grid.values())), rings).quality > 0
+    return likely

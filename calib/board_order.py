@@ -1,4 +1,4 @@
-"""The board in a grid of corners: the part of the right count, whether it can be one flat board, which way round."""
+"""The board in a grid of corners: the part of the right count, and which way round it is."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.board import Board
 from calib.board_corners import Grey, sample
-from calib.board_grid import Grid, predict, spacing
+from calib.board_grid import Grid
 from calib.camera import Array
 
 # A board may lack this part of its corners, if every one of its four borders shows so many of its own.
@@ -73,18 +73,6 @@ def largest_board(grid: Grid) -> tuple[int, int]:
             width = int(np.argmax(lowest * np.arange(1, len(lowest) + 1))) + 1
             best = max(best, (width, int(lowest[width - 1])), key=lambda sides: sides[0] * sides[1])
     return best
-
-
-def unevenness(corners: Array) -> float:
-    """The worst corner's distance from where its neighbours expect it, in parts of a square; inf where squares fold."""
-    along, down = np.diff(corners, axis=1)[:-1], np.diff(corners, axis=0)[:, :-1]
-    turning = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
-    if (turning[np.isfinite(turning)] <= 0).any():
-        return float("inf")
-    grid = as_grid(corners)
-    off = [float(np.linalg.norm(pixel - expected)) / max(spacing(grid, cell), 1e-6)
-           for cell, pixel in grid.items() if (expected := predict(grid, cell)) is not None]
-    return max(off, default=float("inf"))
 
 
 def in_order(image: Grey, corners: Array, board: Board) -> Array:

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board_corners import Grey, sample
+from calib.board_shape import local_mapping, terms
 from calib.camera import Array
 
 # The window reaches so far into the four squares, near to whose far ends other edges begin, and no further than what
 # the picture's blur still bends.
 REACH, REACH_PX = 0.42, 8
 ROUNDS = 4
-# Neighbours in a square of this half side shape the mapping; it has six terms and a corner may lack some of them.
-NEIGHBOURS = 2
-MIN_NEIGHBOURS = 6
 STILL_PX = 2e-3
 # Further than this part of a square from where it started, a corner has run away and is put back.
 MAX_MOVE = 0.3
@@ -40,35 +38,14 @@ def refine(image: NDArray[np.uint8], corners: Array) -> Array:
     return refined
 
 
-def local_mapping(corners: Array, j: int, i: int) -> Array | None:
-    """Coefficients (6, 2) of the picture's place by 1, x, y, x^2, xy, y^2 of the board's [squares] about a corner."""
-    rows, columns = corners.shape[:2]
-    y, x = np.mgrid[max(0, j - NEIGHBOURS):min(rows, j + NEIGHBOURS + 1),
-                    max(0, i - NEIGHBOURS):min(columns, i + NEIGHBOURS + 1)]
-    near = corners[y, x].reshape(-1, 2)
-    x, y = (x - i).ravel().astype(float), (y - j).ravel().astype(float)
-    known = np.isfinite(near[:, 0])
-    if known.sum() < MIN_NEIGHBOURS:
-        return None
-    weight = (np.exp(-(x * x + y * y) / 3) * known)[:, None]
-    A = _terms(x, y)
-    coefficients, _, rank, _ = np.linalg.lstsq(A * weight, np.nan_to_num(near) * weight, rcond=1e-6)
-    coefficients[0] = corners[j, i]
-    return np.asarray(coefficients) if rank == 6 else None
-
-
-def _terms(x: Array, y: Array) -> Array:
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-
-
 def _recentred(grey: Grey, mapping: Array, start: Array) -> Array:
     """The corner's pixel (2,) as the window shows it."""
     size = float(np.sqrt(abs(np.linalg.det(mapping[1:3]))))  # pixels per square
     reach = min(REACH, REACH_PX / max(size, 1e-6))
     side = int(np.clip(np.ceil(2 * reach * size), 5, 2 * REACH_PX)) // 2 * 2 + 1
     x, y = np.meshgrid(*2 * [np.linspace(-reach, reach, side)])
-    shift = _saddle(sample(grey, _terms(x, y) @ mapping), x, y)
-    moved = _terms(shift[0], shift[1]) @ mapping
+    shift = _saddle(sample(grey, terms(x, y) @ mapping), x, y)
+    moved = terms(shift[0], shift[1]) @ mapping
     return moved if np.linalg.norm(moved - start) < MAX_MOVE * size + 0.3 else start
 
 
@@ -80,7 +57,7 @@ def _saddle(window: Array, x: Array, y: Array) -> Array:
     """
     reach = float(x.max())
     weight = np.exp(-(x * x + y * y) / (2 * (0.6 * reach) ** 2)).ravel()
-    A = _terms(x.ravel(), y.ravel()) * weight[:, None]
+    A = terms(x.ravel(), y.ravel()) * weight[:, None]
     _, gx, gy, xx, xy, yy = np.linalg.lstsq(A, window.ravel() * weight, rcond=None)[0]
     determinant = 4 * xx * yy - xy * xy
     if determinant >= 0:

@@ -1,0 +1,58 @@
+"""How the corners of a board lie among their neighbours: the local mapping from board to picture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.camera import Array
+
+# Neighbours in a square of this half side shape the mapping; it has six terms and a corner may lack some of them.
+NEIGHBOURS = 2
+MIN_NEIGHBOURS = 6
+
+
+def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Array | None:
+    """Coefficients (6, 2) of the picture's place by 1, x, y, x^2, xy, y^2 of the board's [squares] about a corner.
+
+    corners (rows, columns, 2), NaN where unknown; without: from its neighbours alone. None: too few of them.
+    """
+    rows, columns = corners.shape[:2]
+    y, x = np.mgrid[max(0, j - NEIGHBOURS):min(rows, j + NEIGHBOURS + 1),
+                    max(0, i - NEIGHBOURS):min(columns, i + NEIGHBOURS + 1)]
+    near = corners[y, x].reshape(-1, 2)
+    x, y = (x - i).ravel().astype(float), (y - j).ravel().astype(float)
+    known = np.isfinite(near[:, 0]) & ((x != 0) | (y != 0) | (not without))
+    if known.sum() < MIN_NEIGHBOURS:
+        return None
+    weight = (np.exp(-(x * x + y * y) / 3) * known)[:, None]
+    A = terms(x, y) * weight
+    coefficients, _, rank, _ = np.linalg.lstsq(A, np.nan_to_num(near) * weight, rcond=1e-6)
+    if not without:
+        coefficients[0] = corners[j, i]
+    return np.asarray(coefficients) if rank == 6 else None
+
+
+def terms(x: Array, y: Array) -> Array:
+    """1, x, y, x^2, xy, y^2 (..., 6)."""
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def unevenness(corners: Array) -> Array:
+    """How far (rows, columns) every corner is from where its neighbours expect it, in parts of a square; NaN: unknown.
+
+    Infinite all over where squares fold over, as those of no board do.
+    """
+    off = np.full(corners.shape[:2], np.inf if folds(corners) else np.nan)
+    for j, i in np.argwhere(np.isfinite(corners[..., 0])):
+        mapping = local_mapping(corners, int(j), int(i), without=True)
+        if mapping is not None and not np.isinf(off[j, i]):
+            size = np.sqrt(abs(np.linalg.det(mapping[1:3])))
+            off[j, i] = np.linalg.norm(corners[j, i] - mapping[0]) / max(float(size), 1e-6)
+    return off
+
+
+def folds(corners: Array) -> bool:
+    """Whether some square of the corners (rows, columns, 2) turns the other way than it must."""
+    along, down = np.diff(corners, axis=1)[:-1], np.diff(corners, axis=0)[:, :-1]
+    turning = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
+    return bool((turning[np.isfinite(turning)] <= 0).any())
