@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
+import os
 import select
 import termios
 import time
@@ -18,7 +19,6 @@ from drivers.line_protocol import LineProtocol
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motor_protocol import MotorProtocol, Script, T
 
-TRIES = 2  # of a command within its time
 CONNECT_TRY_S = 0.3
 STOPS_AT_CLOSE = 3
 READ_LIMIT_BYTES = 4096
@@ -38,12 +38,13 @@ class Silence(DriverError):  # noqa: N818 - it is what was heard
 
 
 class SerialMotor:
-    """The base on `port`, for this program alone. No call blocks for longer than timeout_s, apart from opening.
+    """The base on `port`, for this program alone.
 
-    A command is told at most TRIES times within timeout_s. After an error, a silence in which the controller's watchdog
-    may have expired, or a new connection, the first thing told is an explicit stop, whatever was asked: the status then
-    says watchdog_expired, and the next command drives. A port that is gone is opened again by a later `send`, with
-    growing waits in between, in which `send` fails at once.
+    `send` blocks for at most timeout_s, and for the opening of the port where that was gone; `close` for STOPS_AT_CLOSE
+    times that. A command is told once: who sends at a rate sends the next one anyway. After an error, a silence in
+    which the controller's watchdog may have expired, or a new connection, the first thing told is an explicit stop,
+    whatever was asked: the status then says watchdog_expired, and the next command drives. A port that is gone is
+    opened again by a later `send`, with growing waits in between, in which `send` fails at once.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class SerialMotor:
         now_s = time.monotonic()
         stopping = self._stop_first or now_s - self._heard_s > self._patience_s
         told = stop_command(command.stamp_ns) if stopping else command
-        status = self._told(told, deadline_s)
+        status = self._run(self._protocol.drive(told, now_s), deadline_s)
         self._heard_s = now_s
         self._stop_first = status.watchdog_expired
         if is_stop(command) or not stopping:
@@ -122,33 +123,27 @@ class SerialMotor:
         self.withheld += 1
         return replace(status, watchdog_expired=True)
 
-    def _told(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
-        for left in range(TRIES, 1, -1):
-            now_s = time.monotonic()
-            with contextlib.suppress(Silence):
-                return self._run(self._protocol.drive(command, now_s), now_s + (deadline_s - now_s) / left)
-        return self._run(self._protocol.drive(command, time.monotonic()), deadline_s)
-
     def _connect(self, connect_s: float) -> None:
-        """The first connection may take its time; nothing moves yet."""
+        """The first connection may take its time: nothing moves yet."""
         deadline_s = time.monotonic() + connect_s
         self._open()
         try:
-            while not self._armed:
-                try_s = max(CONNECT_TRY_S, self._timeout_s)
-                self._try_to_arm(min(deadline_s, time.monotonic() + try_s), last=time.monotonic() + try_s >= deadline_s)
-            self._told(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            while self._stop_first:
+                self._try_to_stop(deadline_s)
         except BaseException:
             self._release()
             raise
-        self._heard_s, self._stop_first = time.monotonic(), False
 
-    def _try_to_arm(self, deadline_s: float, *, last: bool) -> None:
+    def _try_to_stop(self, deadline_s: float) -> None:
+        """Silence is borne until the deadline; the last try may go on past it."""
         try:
-            self._arm(deadline_s)
+            self._sent(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
         except Silence:
-            if last:
+            if time.monotonic() >= deadline_s:
                 raise
+            return
+        if self._stop_first and time.monotonic() >= deadline_s:
+            raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
 
     def _arm(self, deadline_s: float) -> None:
         self._stop_first = True
@@ -172,7 +167,7 @@ class SerialMotor:
             raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
         self._next_open_s = time.monotonic() + self._wait_s
         self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
-        self._port = _opened(self._name, self._baud, self._timeout_s)
+        self._port = _opened(self._name, self._baud)
 
     def _release(self) -> None:
         port, self._port, self._armed = self._port, None, False
@@ -207,10 +202,12 @@ class SerialMotor:
             self._port.reset_input_buffer()
 
     def _write(self, data: bytes) -> None:
+        """All of it at once, or none of it counts: a port that takes no more has nobody who reads."""
         if data and self._port is not None:
             try:
-                self._port.write(data)
-            except serial.SerialTimeoutException:
+                if os.write(self._port.fileno(), data) < len(data):
+                    raise Silence
+            except BlockingIOError:
                 raise Silence from None
 
     def _read(self, deadline_s: float) -> bytes:
@@ -231,10 +228,10 @@ class SerialMotor:
         )
 
 
-def _opened(port: str, baud: int, timeout_s: float) -> serial.Serial:
-    """The port, for this program alone; reads do not wait."""
+def _opened(port: str, baud: int) -> serial.Serial:
+    """The port, for this program alone; reads and writes do not wait."""
     try:
-        return serial.Serial(port, baud, timeout=0, write_timeout=timeout_s, exclusive=True)
+        return serial.Serial(port, baud, timeout=0, exclusive=True)
     except (OSError, ValueError, termios.error) as error:
         reason = _REASONS.get(getattr(error, "errno", None) or 0)
         raise DriverError(

@@ -6,8 +6,10 @@ import contextlib
 import math
 import os
 import random
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -207,6 +209,18 @@ def test_watchdog_in_force_is_verified() -> None:
         SerialMotor(twin.port, timeout_s=ANSWER_S)
 
 
+class Stuck(SimulatedLine):
+    """A controller whose watchdog never lets go."""
+
+    def _status(self) -> MotorStatus:
+        return replace(super()._status(), watchdog_expired=True)
+
+
+def test_a_watchdog_that_never_lets_go_is_an_error() -> None:
+    with contextlib.closing(SimulatedMotor(Stuck())) as twin, pytest.raises(DriverError, match="stays stopped"):
+        SerialMotor(twin.port, connect_s=0.1)
+
+
 class Echo(SimulatedLine):
     """Two crossed wires: what is sent comes back."""
 
@@ -283,3 +297,39 @@ def told(script: Script[T], twin: SimulatedLine) -> T:
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
     raise AssertionError("it wants more")
+
+
+class Stalling(SimulatedLine):
+    """A controller that stops reading once it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.going_on = threading.Event()
+        self.going_on.set()
+
+    def feed(self, data: bytes) -> bytes:
+        """The twin's answers, while it goes on."""
+        self.going_on.wait(PATIENCE_S)
+        return super().feed(data)
+
+
+def test_a_line_that_takes_no_more_is_an_error_and_close_returns() -> None:
+    controller = Stalling()
+    with contextlib.closing(SimulatedMotor(controller)) as twin:
+        motor = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
+        controller.going_on.clear()
+        fill(twin.port)
+        with pytest.raises(DriverError, match="gave no answer"):
+            motor.send(VelocityCommand(0, 0.5, 0.0, 0.0))
+        motor.close()
+        controller.going_on.set()
+    assert twin.last_command == stop_command(0)
+
+
+def fill(port: str) -> None:
+    """Writes until the kernel takes no more."""
+    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(descriptor, b"\n" * 1000)
+    os.close(descriptor)

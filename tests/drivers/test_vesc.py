@@ -1,0 +1,87 @@
+"""VESC: packets, the pair on CAN, and a timeout that can only be read."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+
+from drivers.differential_drive import DifferentialDrive
+from drivers.errors import DriverError
+from drivers.motor import VelocityCommand
+from drivers.vesc import MASK, PacketFramer, Vesc, packet
+from tests.drivers.scripts import Unfinished, result, told
+
+DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, pole_pairs=7, can_id=9)  # 420 erpm at 1 m/s
+TURN = VelocityCommand(0, 0.5, 0.0, 1.0)
+
+
+def values(can_id: int, erpm: int, *, fault: int = 0, status: bytes = b"\x00", mask: int = MASK) -> bytes:
+    return struct.pack(">BIihBB", 50, mask, erpm, 245, fault, can_id) + status
+
+
+def config(can_id: int, timeout_ms: int) -> bytes:
+    return struct.pack(">BIBI", 17, 0xDEADBEEF, can_id, timeout_ms) + bytes(400)
+
+
+def test_packets_as_the_firmware_makes_them() -> None:
+    assert packet(b"\x00") == bytes.fromhex("02 01 00 00 00 03")  # COMM_FW_VERSION
+    assert packet(b"\x04") == bytes.fromhex("02 01 04 40 84 03")  # COMM_GET_VALUES
+    assert packet(bytes(256))[:3] == b"\x03\x01\x00"
+
+
+def test_bytes_of_a_command() -> None:
+    asked = bytes.fromhex("32") + MASK.to_bytes(4, "big")
+    speeds = bytes.fromhex("08 00000069"), bytes.fromhex("08 0000013b")  # 105 and 315
+    whole = [asked, b"\x22\x09" + asked, speeds[0], b"\x22\x09" + speeds[1]]
+    assert told(Vesc(DRIVE).drive(TURN, 0.0)) == b"".join(map(packet, whole))
+
+
+def test_status_in_the_units_of_the_base_whoever_answers_first() -> None:
+    for answers in ([values(3, 105), values(9, 315)], [values(9, 315), values(3, 105)]):
+        status = result(Vesc(DRIVE).drive(TURN, 0.0), *answers)
+        assert (status.velocity_mps, status.yaw_rate_radps) == pytest.approx((0.5, 1.0))
+        assert (status.battery_v, status.fault, status.watchdog_expired) == (24.5, 0, False)
+
+
+def test_fault_and_timeout_of_either() -> None:
+    status = result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0), values(9, 0, fault=4, status=b"\x01"))
+    assert status.fault == 4 and status.watchdog_expired
+    assert not result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0, status=b""), values(9, 0, status=b"")).watchdog_expired
+
+
+@pytest.mark.parametrize("answer", [values(9, 0)[:-3], values(9, 0, mask=1), b"\x04" + bytes(14), values(9, 0) + b"xx"])
+def test_what_is_no_answer(answer: bytes) -> None:
+    protocol = Vesc(DRIVE)
+    with pytest.raises(Unfinished):
+        result(protocol.drive(TURN, 0.0), values(3, 0), answer)
+    assert protocol.bad_frames == 1
+
+
+def test_two_answers_of_one_are_not_both() -> None:
+    with pytest.raises(Unfinished):
+        result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0), values(3, 0), values(3, 0))
+
+
+@pytest.mark.parametrize("timeout_ms", [0, 501, 1000])
+def test_a_timeout_that_is_off_or_longer_is_refused(timeout_ms: int) -> None:
+    with pytest.raises(DriverError, match=f"500 ms asked, {timeout_ms} ms in force in the VESC with id 9"):
+        result(Vesc(DRIVE).connect(500), config(3, 500), config(9, timeout_ms))
+    assert result(Vesc(DRIVE).connect(500), config(9, 500), config(3, 400)) == 400
+
+
+def test_the_framer_finds_the_next_packet() -> None:
+    framer = PacketFramer()
+    damaged = bytearray(packet(b"hello"))
+    damaged[4] ^= 1
+    assert framer.feed(b"\x00\xff" + bytes(damaged) + packet(b"\x04") + packet(bytes(300))) == [b"\x04", bytes(300)]
+    assert framer.garbage == 2 + len(damaged)
+
+
+def test_the_framer_gives_up_on_lengths_that_cannot_be() -> None:
+    framer = PacketFramer()
+    assert framer.feed(b"\x02\x00" + b"\x03\x00\x05" + b"\x03\xff\xff" + packet(b"\x04")) == [b"\x04"]
+    framer.feed(b"\x03\x01\xff")
+    framer.reset()
+    assert framer.feed(packet(b"\x04")) == [b"\x04"]

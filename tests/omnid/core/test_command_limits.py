@@ -1,0 +1,84 @@
+"""The last-line limiter: no sequence of anything gets a command past the limits."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from omnid.core.command_limits import STOP, CommandLimits
+from omnid.core.heading import LONGEST_TICK_S, Drive
+from omnid.errors import OmnidError
+
+LIMITS = CommandLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
+                       yaw_acceleration_radps2=3.0)  # fmt: skip
+ODD = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-9)
+SLACK = 1 + 1e-9
+
+
+def anything(rng: random.Random) -> float:
+    return rng.choice(ODD) if rng.random() < 0.3 else rng.gauss(0.0, rng.choice([0.1, 1.0, 10.0]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_output_ever_breaks_a_limit(seed: int) -> None:
+    rng, sent = random.Random(seed), STOP
+    for _ in range(5000):
+        wanted = Drive(anything(rng), anything(rng))
+        dt_s = abs(rng.gauss(0.05, 0.05)) if rng.random() < 0.8 else anything(rng)
+        last, sent = sent, LIMITS.step(wanted, sent, dt_s)
+        assert_within(last, sent, dt_s)
+
+
+def assert_within(last: Drive, sent: Drive, dt_s: float) -> None:
+    passed_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
+    tiny = 1e-12
+    assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
+    assert abs(sent.yaw_rate_radps - last.yaw_rate_radps) <= 3.0 * passed_s * SLACK + tiny
+    gained_mps = abs(sent.velocity_mps) - abs(last.velocity_mps)
+    assert gained_mps <= 0.5 * passed_s * SLACK + tiny
+    assert abs(sent.velocity_mps - last.velocity_mps) <= 2.0 * passed_s * SLACK + tiny
+    if sent.velocity_mps * last.velocity_mps < 0:  # across zero: the part beyond it is an acceleration
+        braking_s = abs(last.velocity_mps) / 2.0
+        assert abs(sent.velocity_mps) <= 0.5 * (passed_s - braking_s) * SLACK + tiny
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_came_before_the_output_is_finite_and_bounded(seed: int) -> None:
+    rng = random.Random(seed)
+    for _ in range(3000):
+        sent = LIMITS.step(*(Drive(anything(rng), anything(rng)) for _ in range(2)), anything(rng))
+        assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
+
+
+def test_gets_there_and_stays() -> None:
+    sent = STOP
+    for _ in range(100):
+        sent = LIMITS.step(Drive(0.7, -1.2), sent, 0.05)
+    assert sent == Drive(0.7, -1.2)
+
+
+@pytest.mark.parametrize("wanted", [STOP, Drive(math.nan, 1.0), Drive(1.0, math.inf), Drive(-math.inf, 0.0)])
+def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Drive) -> None:
+    sent, speeds = Drive(0.8, 1.0), [0.8]
+    while sent != STOP:
+        sent = LIMITS.step(wanted, sent, 0.1)
+        speeds.append(sent.velocity_mps)
+    assert speeds[:5] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
+
+
+def test_reversing_stops_first_and_then_gathers_speed() -> None:
+    assert LIMITS.step(Drive(-0.8, 0.0), Drive(0.1, 0.0), 0.1).velocity_mps == pytest.approx(-0.5 * 0.05)
+    assert LIMITS.step(Drive(0.8, 0.0), Drive(-0.1, 0.0), 0.1).velocity_mps == pytest.approx(0.5 * 0.05)
+
+
+def test_no_time_means_no_change() -> None:
+    for dt_s in (0.0, -1.0, math.nan, math.inf):
+        assert LIMITS.step(Drive(0.5, 0.5), Drive(0.2, 0.1), dt_s) == Drive(0.2, 0.1)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+def test_limits_must_make_sense(bad: float) -> None:
+    with pytest.raises(OmnidError, match="deceleration_mps2"):
+        CommandLimits(deceleration_mps2=bad)
