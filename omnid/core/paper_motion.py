@@ -6,6 +6,7 @@ sides, and what one pair of frames gets wrong stays wrong.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,8 @@ Flags = NDArray[np.bool_]
 TRACKERS = ("improved", "klt")
 REFERENCES = ("previous", "keyframe")
 FEATURES = 500
-ENOUGH = 0.5  # share of the features that must be found for a turn to be the right one ("N is more than needed")
+ENOUGH = 0.5  # share of the features that must be found for a turn to be nearly right ("N is more than needed")
+AMPLE = 0.85  # share that ends the search; between the two the next turn is tried, for as long as it finds more
 EPSILON_PX = 3  # eq. (8): how far a located point may be from a feature that it locates
 THRESHOLD_M = 0.05  # section IV.B: how far a point of the consensus may be from where the motion puts it
 LEAST = 6  # points of the consensus, below which the motion is refused
@@ -145,20 +147,27 @@ def _carried(covariance: Array, T_a_b: Array) -> Array:
     return np.asarray(A @ covariance @ A.T)
 
 
-def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt) -> tuple[Array, Flags]:
+def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt, turns: Sequence[float] | None = None
+                 ) -> tuple[Array, Flags]:
     """The improved KLT of section IV.F: turns by 0, 18, 36 ... degrees until enough features (N, 2) are found.
 
-    Else the turn that finds most. On a panorama a turn of picture k+1 is a shift of its columns, and to start the
-    search that much further along is the same; the columns returned are those of k+1 itself, so the motion estimated
-    from them is the total one. The paper counts what Lucas and Kanade report; but their status says only that the
-    search ended, and four of five points are then wrong after 18 degrees. Only those that come back are counted here.
+    The paper stops at the first turn that will do; but half a step away half of the features may be found as well, so
+    the search goes on while the next turn finds more. If none will do, the turn that finds most. turns [rad]: others to
+    try instead.
+
+    On a panorama a turn of picture k+1 is a shift of its columns, and to start the search that much further along is
+    the same; the columns returned are those of k+1 itself, so the motion estimated from them is the total one. The
+    paper counts what Lucas and Kanade report; but their status says only that the search ended, and four of five points
+    are then wrong after 18 degrees. Only those that come back are counted here.
     """
     best, most = (features, np.zeros(len(features), bool)), -1
-    for turn in steps():
+    for turn in steps() if turns is None else turns:
         shift = turn * previous.lower.width / (2 * np.pi)
         there, found = track(previous.lower, sight.lower, features, features + np.array([shift, 0.0]), klt)
+        if found.sum() <= most and most >= ENOUGH * len(features):
+            break
         if found.sum() > most:
             best, most = (there, found), int(found.sum())
-        if most >= ENOUGH * len(features):
+        if most >= AMPLE * len(features):
             break
     return best

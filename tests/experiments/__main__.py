@@ -8,7 +8,9 @@ from pathlib import Path
 
 from tests.experiments.povray import INSTALL, PovrayError, available
 from tests.experiments.rendering import render_log
-from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
+from tests.experiments.report import RESULTS, report
+from tests.experiments.scenes import EXPERIMENTS, RigOptions
+from tests.experiments.views import Experiment
 
 
 def main() -> None:
@@ -45,13 +47,18 @@ def render(arguments: argparse.Namespace) -> None:
         raise PovrayError(f"povray is not installed: {INSTALL}")
     options = RigOptions(arguments.scale, arguments.baseline_m, arguments.crooked, arguments.xi)
     for seed in arguments.seed:
-        run = build(arguments.name, seed, arguments.size, arguments.pairs, options)
-        folder = arguments.out / f"{arguments.name}_s{seed}"
-        render_log(folder, run, seed, supersample=arguments.supersample, jobs=arguments.jobs)
+        pairs = arguments.pairs or EXPERIMENTS[arguments.name][1]
+        experiment = Experiment(arguments.name, seed, arguments.size, pairs, options)
+        folder = arguments.out / experiment.label
+        experiment.write(folder)
+        render_log(folder, experiment.run, seed, supersample=arguments.supersample, jobs=arguments.jobs)
 
 
 def _add_report(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(run=lambda _: None)
+    parser.add_argument("logs", type=Path, help="the folder that was given to render with --out")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where tables, pictures and numbers go")
+    parser.add_argument("--again", action="store_true", help="measure also what has been measured")
+    parser.set_defaults(run=lambda arguments: report(arguments.logs, arguments.results, arguments.again))
 
 
 if __name__ == "__main__":

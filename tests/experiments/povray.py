@@ -14,6 +14,7 @@ from tempfile import NamedTemporaryFile
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calib import se3
 from calib.camera import Array, OmniCamera
@@ -142,7 +143,7 @@ def _elevation(m: float, xi: float) -> float:
     return float(gamma - xi)
 
 
-def _inside_rim(mounted: MountedCamera, supersample: int) -> Array:
+def _inside_rim(mounted: MountedCamera, supersample: int) -> NDArray[np.bool_]:
     """Which samples (H, W) of the enlarged picture lie on the mirror."""
     width, height = mounted.camera.size
     u = (np.arange(width * supersample) + 0.5) / supersample - 0.5

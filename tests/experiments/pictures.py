@@ -1,0 +1,91 @@
+"""The figures of the report; told apart by shade, dash and mark, so that a black and white print will do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from calib.camera import Array
+from tests.scenes.recipes import Run
+from tests.scenes.surfaces import Rectangle
+
+DPI = 110
+STYLES = (("0.65", ":"), ("0.5", "--"), ("0.0", "-"))
+mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "omnid"})
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=DPI, bbox_inches="tight", metadata={"Software": None})
+
+
+def wall(clouds: dict[str, Array], wall_m: float, path: Path) -> None:
+    """Points (N, 3) of each method from above and from the front, beside each other: fig. 8."""
+    figure = Figure(figsize=(4 * len(clouds), 5.6), layout="constrained")
+    axes = figure.subplots(2, len(clouds), sharex="row", sharey="row", height_ratios=[1.5, 1])
+    for (name, points), (above, front) in zip(clouds.items(), axes.T, strict=True):
+        above.scatter(points[:, 1], points[:, 0], s=0.15, c="0.0", linewidths=0)
+        above.axhline(wall_m, color="0.6", lw=0.6, zorder=0)
+        above.plot(0, 0, "k^")
+        above.set(title=name, xlim=(2.2, -2.2), ylim=(-0.2, 4.2), aspect="equal")
+        off = np.abs(points[:, 0] - wall_m) > 0.05
+        front.scatter(points[~off, 1], points[~off, 2], s=0.15, c="0.6", linewidths=0)
+        front.scatter(points[off, 1], points[off, 2], s=0.6, c="0.0", linewidths=0)
+        front.set(xlim=(2.2, -2.2), ylim=(-0.1, 2.7), aspect="equal", xlabel="left, m")
+    axes[0, 0].set_ylabel("from above: ahead, m")
+    axes[1, 0].set_ylabel("from the front: height, m\n(black: over 5 cm off the wall)")
+    _save(figure, path)
+
+
+def turns(rows: list[dict[str, Any]], path: Path) -> None:
+    """Right features over the angle of the turn, the median of all seeds: fig. 7 at every angle."""
+    figure = Figure(figsize=(7, 3), layout="constrained")
+    axes = figure.subplots()
+    for name, (shade, dash) in zip(rows[0]["found"], STYLES, strict=True):
+        right = [[row["found"][name]["right"] for row in rows if row["turn_deg"] == a] for a in _angles(rows)]
+        axes.plot(_angles(rows), [np.median(r) for r in right], dash, color=shade, marker=".", label=name)
+    axes.set(xlabel="turn between two pictures, degrees", ylabel="features found rightly", xticks=range(0, 181, 18))
+    axes.legend(frameon=False)
+    _save(figure, path)
+
+
+def _angles(rows: list[dict[str, Any]]) -> list[float]:
+    return sorted({row["turn_deg"] for row in rows})
+
+
+def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], path: Path) -> None:
+    """Paths over the true one, and how far each is from it at every pair: fig. 9."""
+    figure = Figure(figsize=(8, 5.4), layout="constrained")
+    above, error = figure.subplots(2, 1, height_ratios=[1, 1.2])
+    true_xy = np.array(truth)
+    above.plot(*true_xy.T, color="0.75", lw=5, label="truth", solid_capstyle="round")
+    for (name, xy), (shade, dash) in zip(estimates.items(), STYLES, strict=True):
+        above.plot(*np.array(xy).T, dash, color=shade, lw=1.2, label=name)
+        error.plot(1e3 * np.linalg.norm(np.array(xy) - true_xy[: len(xy)], axis=1), dash, color=shade, label=name)
+    above.set(aspect="equal", xlabel="m", ylabel="m")
+    error.set(yscale="log", ylim=(0.03, 300), xlabel="pair", ylabel="off the truth, mm")
+    figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=2, loc="outside upper center")
+    _save(figure, path)
+
+
+def floor_plan(run: Run, points: Array, path_xy: dict[str, Array], path: Path) -> None:
+    """The map's points (N, 3) in the world and paths (N, 2) over the true floor plan: fig. 10."""
+    figure = Figure(figsize=(9, 6.8), layout="constrained")
+    axes = figure.subplots()
+    standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 2.2)]
+    axes.scatter(standing[:, 0], standing[:, 1], s=0.4, c="0.55", linewidths=0)
+    for r in filter(_stands, run.scene.rectangles):
+        axes.plot(*r.corners[:2, :2].T, color="black", lw=0.9 if r.name != "box" else 0.6)
+    for (name, xy), (shade, dash) in zip(path_xy.items(), (("0.7", "-"), ("0.0", "--")), strict=True):
+        axes.plot(*xy.T, dash, color=shade, lw=3 if dash == "-" else 1.2, label=name)
+    axes.plot(*path_xy["truth"][0], "ko", ms=5)
+    axes.set(aspect="equal", xlabel="m", ylabel="m")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.06), ncols=2, frameon=False)
+    _save(figure, path)
+
+
+def _stands(r: Rectangle) -> bool:
+    return abs(r.normal[2]) < 0.1 and not r.name.startswith("poster")

@@ -1,0 +1,118 @@
+"""The scenes are what they say: seeded, closed, clear of walls; and POV-Ray shows what the camera models say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.rig_file import read_rig
+from drivers.frame import gray
+from drivers.mcap_reader import LogReader
+from tests.experiments.building import building
+from tests.experiments.povray import INSTALL, PovrayError, available, shoot, view_text, write_world
+from tests.experiments.rendering import render_log
+from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
+from tests.experiments.truth import cast, sees, surface_distance_m
+from tests.experiments.views import Experiment
+from tests.scenes.caster import render_grey
+from tests.scenes.rigs import make_rig
+
+needs_povray = pytest.mark.skipif(not available(), reason=f"POV-Ray is not installed: {INSTALL}")
+CROOKED = (1.0, -2.0, 20.0)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_same_seed_is_the_same_run_and_another_is_another(name: str) -> None:
+    one, again, other = (build(name, seed, 96, 5) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.poses, again.poses)
+    walls, same, others = (run.scene.rectangles for run in (one, again, other))
+    assert all((a.texture == b.texture).all() for a, b in zip(walls, same, strict=True))
+    assert not all(np.array_equal(a.texture, b.texture) for a, b in zip(walls, others, strict=False))
+
+
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_the_round_through_the_building_closes_and_keeps_clear_of_everything(seed: int) -> None:
+    run = build("building", seed, 96)
+    steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
+    heading = np.unwrap([float(se3.yaw(T)) for T in run.poses])
+    assert len(run.poses) == 349 and 25 < steps.sum() < 40
+    np.testing.assert_allclose(run.poses[0], run.poses[-1], atol=1e-9)
+    assert heading[-1] - heading[0] == pytest.approx(2 * np.pi)
+    assert steps.max() > 2 * steps.min()
+    assert surface_distance_m(run.scene, run.poses[:, :3, 3]).min() > 0.35
+
+
+def test_the_rooms_can_be_looked_into_and_not_through() -> None:
+    """From the middle of a room a door shows the corridor, and all other walls are whole."""
+    plan, scene = building(2)
+    middle = np.array([(plan.columns[0] + plan.columns[1]) / 2, (plan.corridor_m + plan.middle_m) / 2, 1.5])
+    azimuth = np.linspace(-np.pi, np.pi, 720, endpoint=False)
+    distance, which = cast(scene, middle, np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth]))
+    out = np.isin(which, range(4))  # the outer walls
+    assert np.isfinite(distance).all() and 0.02 < out.mean() < 0.3
+    assert (np.sin(azimuth[out]) < 0).all()  # the door of a lower row leads to the lower corridor
+
+
+def test_truth_and_caster_see_the_same_distance() -> None:
+    run = build("two_walls", 3, 96, 4)
+    T_world_rig = run.poses[2]
+    points = T_world_rig[:3, 3] + np.array([[0.3, 0.2, 0.1], [0.1, -0.3, -0.2]])
+    distance, which = cast(run.scene, T_world_rig[:3, 3], points - T_world_rig[:3, 3])
+    hits = T_world_rig[:3, 3] + distance[:, None] * (points - T_world_rig[:3, 3])
+    assert (surface_distance_m(run.scene, hits) < 1e-9).all() and (which >= 0).all()
+    assert sees(run.scene, T_world_rig[:3, 3], hits).all()
+    assert not sees(run.scene, T_world_rig[:3, 3], hits + 0.1 * (points - T_world_rig[:3, 3])).any()
+
+
+def test_what_no_mirror_can_do_is_refused() -> None:
+    for rig in (make_rig(size=96, distortion=(0.1, 0, 0, 0)), make_rig(size=96, xi=1.2)):
+        with pytest.raises(PovrayError, match="xi <= 1 and no distortion"):
+            view_text(rig.lower, np.eye(4))
+
+
+@needs_povray
+@pytest.mark.parametrize(("xi", "rim"), [(1.0, 0.48), (0.9, 0.45), (0.7, 0.42)])
+def test_a_traced_mirror_shows_what_the_camera_model_says(xi: float, rim: float, tmp_path: Path) -> None:
+    """Two renderers that share nothing but the textures, a crooked camera and an optical centre off the middle."""
+    run = build("control", 3, 192, 1)
+    rig = make_rig(size=192, xi=xi, rim=rim, crooked_deg=CROOKED, centre_px=(2.3, -3.4))
+    write_world(tmp_path, run.scene)
+    traced = shoot(tmp_path, rig.upper, run.poses[0], 3)
+    model = render_grey(run.scene, rig.upper, run.poses[0], 3)
+    both = cv2.erode(((traced > 0) & (model > 0)).astype(np.uint8), np.ones((21, 21), np.uint8)) > 0
+    start = np.zeros((192, 192, 2), np.float32)
+    pictures = (traced.astype(np.uint8), model.astype(np.uint8))
+    flow = cv2.calcOpticalFlowFarneback(*pictures, start, 0.5, 3, 21, 3, 7, 1.5, 0)
+    assert both.mean() > 0.2
+    assert np.median(np.abs(flow[both])) < 0.03 and np.abs(flow[both].mean(axis=0)).max() < 0.02
+    assert np.corrcoef(traced[both], model[both])[0, 1] > 0.97
+    assert (traced[~rig.upper.visible.contains(_grid(192)).reshape(192, 192)] == 0).mean() > 0.98
+
+
+def _grid(size: int) -> np.ndarray:
+    v, u = np.divmod(np.arange(size * size), size)
+    return np.column_stack([u, v]).astype(float)
+
+
+@needs_povray
+def test_rendering_goes_on_where_it_stopped_and_leaves_a_log_with_its_truth(tmp_path: Path) -> None:
+    experiment = Experiment("control", 3, 96, 2, RigOptions(baseline_m=0.3))
+    frames = tmp_path / "frames"
+    frames.mkdir(parents=True)
+    black = np.zeros((96, 96), np.uint16)
+    cv2.imwrite(str(frames / "0001_upper.png"), black)  # as if drawn before the stop: it is not drawn again
+    render_log(tmp_path, experiment.run, 3, supersample=1)
+    reader = LogReader(tmp_path / "log.mcap")
+    brightness = [gray(frame).mean() for frame in reader.frames()]
+    reader.close()
+    assert len(brightness) == 4 and sum(mean < 12 for mean in brightness) == 1
+    assert read_rig(tmp_path / "rig.toml").baseline_m == pytest.approx(0.3, abs=1e-3)
+    assert len((tmp_path / "truth.txt").read_text().splitlines()) == 2
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == []
+    before = (tmp_path / "log.mcap").stat().st_mtime_ns
+    render_log(tmp_path, experiment.run, 3)
+    assert (tmp_path / "log.mcap").stat().st_mtime_ns == before
