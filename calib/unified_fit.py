@@ -10,23 +10,26 @@ from calib.camera import Array
 from calib.ocam import OcamCamera
 from calib.unified import UnifiedCamera
 
+# How many of the distortion's numbers may be solved for: none, k1 and k2, all.
+TERMS = (0, 2, 4)
 NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 # Where the search for xi starts: pinhole, hyperbolic mirrors, parabola, fisheye lenses.
 START_XI = np.linspace(0.0, 3.0, 31)
 RADII = 60
 
 
-def fit_unified(observed: Observed, ocam: OcamCamera, T_ocam_board: Array) -> Adjusted:
+def fit_unified(observed: Observed, ocam: OcamCamera, T_ocam_board: Array, terms: int = 0) -> Adjusted:
     """The adjusted camera, whose parameters unified_maker and unified_values read, from a fitted ocam camera and poses.
 
+    terms: how many of k1, k2, p1, p2 are solved for; xi, the focal lengths and k1, k2 do nearly the same.
     The axes are the unified model's: x, y along u, v (x against u in a mirror, fu < 0), z along the ray of the centre.
     """
     T_omni_ocam = axes(ocam)
     xi, focal = _profile(ocam, observed)
     flip = -1.0 if ocam.view == "mirror" else 1.0
     camera = UnifiedCamera(xi, (flip * focal, focal), ocam.center, ocam.size)
-    start = np.array([xi, *camera.focal, *camera.center, 0, 0, 0, 0]) / _conversion(ocam.size)
-    return adjust(unified_maker(ocam.size), start, T_omni_ocam @ T_ocam_board, observed)
+    start = np.array([xi, *camera.focal, *camera.center, *[0.0] * terms]) / _conversion(ocam.size, terms)
+    return adjust(unified_maker(ocam.size, terms), start, T_omni_ocam @ T_ocam_board, observed)
 
 
 def axes(ocam: OcamCamera) -> Array:
@@ -50,26 +53,27 @@ def _profile(ocam: OcamCamera, observed: Observed) -> tuple[float, float]:
     return best[1], best[2]
 
 
-def _conversion(size: tuple[int, int]) -> Array:
+def _conversion(size: tuple[int, int], terms: int) -> Array:
     """What turns parameters of a pixel's effect each into the model's own."""
     scale = min(size) / 2
-    return np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
+    return np.array([1, scale, scale, scale, scale, *[1.0] * terms]) / scale
 
 
-def unified_maker(size: tuple[int, int]) -> Make:
+def unified_maker(size: tuple[int, int], terms: int = 0) -> Make:
     """The camera of a vector of parameters."""
-    conversion = _conversion(size)
+    conversion = _conversion(size, terms)
 
     def make(parameters: Array) -> UnifiedCamera:
-        xi, fu, fv, pu, pv, k1, k2, p1, p2 = (float(value) for value in parameters * conversion)
+        xi, fu, fv, pu, pv, *bent = (float(value) for value in parameters * conversion)
+        k1, k2, p1, p2 = (*bent, *[0.0] * (4 - terms))
         return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
 
     return make
 
 
-def unified_values(fit: Adjusted, size: tuple[int, int]) -> list[tuple[str, float, float]]:
-    """Name, value and standard deviation of every parameter as the model's file has them."""
-    conversion = _conversion(size)
+def unified_values(fit: Adjusted, size: tuple[int, int], terms: int = 0) -> list[tuple[str, float, float]]:
+    """Name, value and standard deviation of every solved parameter as the model's file has them."""
+    conversion = _conversion(size, terms)
     deviations = np.sqrt(np.maximum(0, np.diag(fit.covariance))) * conversion
     return [(name, float(value), float(deviation))
-            for name, value, deviation in zip(NAMES, fit.parameters * conversion, deviations, strict=True)]
+            for name, value, deviation in zip(NAMES[:5 + terms], fit.parameters * conversion, deviations, strict=True)]
