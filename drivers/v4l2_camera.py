@@ -19,6 +19,7 @@ from drivers.v4l2_settings import V4l2Settings
 from drivers.v4l2_stream import V4l2Stream, explained
 
 _FIRST_RETRY_S: Final = 0.1
+_SETTLED_FRAMES: Final = 30  # a device that comes and goes is waited for longer each time
 _PAUSE_S: Final = 0.005  # where a driver signals an error but tells none
 
 
@@ -55,7 +56,8 @@ class V4l2Camera:
                     yield from self._pictures()
                 except (OSError, DriverError) as error:
                     self._lose(error)
-                    retry_s = _FIRST_RETRY_S if self.state.frames > given else min(2 * retry_s, self._settings.retry_s)
+                    settled = self.state.frames - given > _SETTLED_FRAMES
+                    retry_s = _FIRST_RETRY_S if settled else min(2 * retry_s, self._settings.retry_s)
                     self._wake.wait(retry_s)
         finally:
             self._reading = False
@@ -73,6 +75,8 @@ class V4l2Camera:
         stream = self._streams[0] if self._streams else self._reopened()
         picture = stream.picture
         self._ledger.begin()
+        if self.state.status == "lost" and self._next(stream) is None:
+            return  # the first picture anew is left out: it may be an old one (v4l2loopback) or a dark one (webcams)
         while (filled := self._next(stream)) is not None:
             stamp_ns, data = filled
             seq = self._counted()

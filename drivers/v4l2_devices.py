@@ -14,7 +14,7 @@ from drivers.errors import DriverError
 from drivers.v4l2_modes import Mode, modes
 from drivers.v4l2_stream import capability, explained
 
-RULES_FILE: Final = "/etc/udev/rules.d/60-omnid-cameras.rules"
+RULES_FILE: Final = "/etc/udev/rules.d/70-omnid-cameras.rules"  # ID_PATH is there after 60-persistent-v4l.rules
 _MEMORY_TO_MEMORY = 0x8000 | 0x4000  # V4L2_CAP_VIDEO_M2M and its multi-planar kin: codecs
 _MAX_DEVICES = 256
 

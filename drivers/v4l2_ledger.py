@@ -54,7 +54,7 @@ class Ledger:
             self._state.errors += 1
             return None
         if buffer.flags & v4l2.TIMESTAMP_MASK != v4l2.TIMESTAMP_MONOTONIC:
-            self._say_once("its driver does not say which clock its stamps are of; taken for CLOCK_MONOTONIC")
+            self._say_once("clock", "its driver does not say which clock its stamps are of; taken for CLOCK_MONOTONIC")
         self._last_stamp_ns = self._stamp(buffer.stamp_ns, arrival_ns)
         return self._last_stamp_ns
 
@@ -73,12 +73,11 @@ class Ledger:
         if max(self._last_stamp_ns, arrival_ns - _OLDEST_NS) < stamp_ns <= arrival_ns:
             return stamp_ns
         self._state.restamped += 1
-        self._say_once(f"a stamp lies {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not after the one "
-                       "before; such pictures are stamped with their arrival and counted")
+        self._say_once("stamp", f"a stamp lies {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not after "
+                       "the one before; such pictures are stamped with their arrival and counted")
         return max(arrival_ns, self._last_stamp_ns + 1)
 
-    def _say_once(self, text: str) -> None:
-        kind = text[:20]
+    def _say_once(self, kind: str, text: str) -> None:
         if kind not in self._said:
             self._said.add(kind)
             self._report(WARNING, f"{self._name}: {text}")

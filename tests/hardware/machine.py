@@ -110,6 +110,6 @@ def _result(job: Path, console: str, elapsed_s: float) -> Result:
     output = (job / "output").read_text("utf-8", "replace") if (job / "output").exists() else ""
     if not (job / "code").exists():
         reason = "the guest's kernel panicked" if PANIC in console else "the guest did not come to an end"
-        raise GuestFailed(f"{reason} after {elapsed_s:.0f} s\n{console[-4000:]}\n{output[-4000:]}")
+        raise GuestFailed(f"{reason} after {elapsed_s:.0f} s\n{console[-4000:]}\n{output[-20000:]}")
     files = {path.name: path.read_bytes() for path in (job / "results").iterdir() if path.is_file()}
     return Result(int((job / "code").read_text("ascii")), output, console, files, elapsed_s)

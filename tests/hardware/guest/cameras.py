@@ -1,0 +1,390 @@
+"""Run by pytest in the guest, as root: the camera driver on vivid and v4l2loopback, the kernel's own virtual cameras.
+
+vivid is loaded afresh for each test; its two cameras are called /dev/omnid/lower and upper by the rules that `omnid
+cameras` prints. v4l2loopback shows what a test writes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers import v4l2_ioctl as v4l2
+from drivers.errors import DriverError
+from drivers.frame import Frame, gray
+from drivers.v4l2_camera import V4l2Camera
+from drivers.v4l2_devices import RULES_FILE, capture_devices, udev_rules
+from drivers.v4l2_settings import V4l2Settings
+
+SIZE = 320, 180
+RATE_HZ = 10.0
+LIMIT_S = 40.0
+LOWER, UPPER = "/dev/omnid/lower", "/dev/omnid/upper"
+LOOPBACKS = "/dev/video10", "/dev/video11"
+BIND = Path("/sys/bus/platform/drivers/vivid")
+DROPS, DISCONNECT, FLAG_ERROR, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F042, 0xF0F046  # vivid's own controls
+GAIN = 0x980913
+# the start of the exposure as stamp: the end of the frame lies in the future; no text within the picture
+STILL = ("timestamp_source=1", "osd_text_mode=2")
+
+
+def run(*command: str) -> str:
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def control(device: str, control_id: int, value: int | None = None) -> int:
+    """Sets or presses a control behind the driver's back, or reads it."""
+    fd = os.open(device, os.O_RDWR)
+    try:
+        entry = v4l2.Control(control_id, value or 0)
+        v4l2.call(fd, v4l2.G_CTRL if value is None else v4l2.S_CTRL, entry)
+        return int(entry.value)
+    finally:
+        os.close(fd)
+
+
+def until(what: Callable[[], object], limit_s: float = LIMIT_S) -> None:
+    end_s = time.monotonic() + limit_s
+    while not what():
+        assert time.monotonic() < end_s, "it did not come about in time"
+        time.sleep(0.02)
+
+
+class Watched:
+    """A camera that is read by a thread of its own; `taken`: seq, stamp and arrival of each frame."""
+
+    def __init__(self, device: str = LOWER, **fields: Any) -> None:
+        fields = {"width_px": SIZE[0], "height_px": SIZE[1], "rate_hz": RATE_HZ, "pixel_format": "GREY",
+                  "timeout_s": 5.0, "controls": STILL} | fields
+        self.said: list[tuple[int, str]] = []
+        self.taken: list[tuple[int, int, int]] = []
+        self.last: Frame | None = None
+        self.camera = V4l2Camera(V4l2Settings(device, **fields), "lower", report=lambda *said: self.said.append(said))
+        self.state = self.camera.state
+        self.thread = threading.Thread(target=self._read, daemon=True)
+
+    def _read(self) -> None:
+        for frame in self.camera.frames():
+            self.taken.append((frame.seq, frame.stamp_ns, time.monotonic_ns()))
+            self.last = frame
+
+    def __enter__(self) -> Watched:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.camera.close()
+        self.thread.join(LIMIT_S)
+        assert not self.thread.is_alive(), "close() did not end frames()"
+
+    def more(self, count: int) -> None:
+        """Waits for so many more frames."""
+        goal = len(self.taken) + count
+        until(lambda: len(self.taken) >= goal)
+
+    def missing(self, period_ns: int = round(1e9 / RATE_HZ)) -> int:
+        """How many frames the stamps say are missing: vivid's are multiples of its period."""
+        stamps = [stamp_ns for _, stamp_ns, _ in self.taken]
+        return sum(round((after - before) / period_ns) - 1 for before, after in pairwise(stamps))
+
+    def require_order(self) -> None:
+        """Numbers without a gap, stamps that rise and lie in the past."""
+        assert [seq for seq, _, _ in self.taken] == list(range(len(self.taken)))
+        stamps = [stamp_ns for _, stamp_ns, _ in self.taken]
+        assert all(before < after for before, after in pairwise(stamps))
+        assert all(stamp_ns <= arrival_ns for _, stamp_ns, arrival_ns in self.taken)
+
+    def require_said(self, *words: str) -> None:
+        """That it was told of the words in this order, and of nothing else."""
+        assert len(self.said) == len(words), self.said
+        assert all(word in text for word, (_, text) in zip(words, self.said, strict=True)), self.said
+
+
+class Writer:
+    """Writes pictures into a loopback camera, as a webcam would send them."""
+
+    def __init__(self, device: str, picture: bytes, pixel_format: str = "GREY", size: tuple[int, int] = SIZE) -> None:
+        self._fd = os.open(device, os.O_RDWR)
+        asked = v4l2.Format(type=2)  # V4L2_BUF_TYPE_VIDEO_OUTPUT
+        pix = asked.fmt.pix
+        pix.width, pix.height, pix.pixelformat, pix.field = *size, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
+        pix.sizeimage = max(len(picture), size[0] * size[1])
+        v4l2.call(self._fd, v4l2.S_FMT, asked)
+        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Number(2))  # else the device never notices that its writer has gone
+        self._picture, self._halt = picture, threading.Event()
+        self.pausing = False
+        self._thread = threading.Thread(target=self._write, daemon=True)
+
+    def _write(self) -> None:
+        while not self._halt.wait(1 / RATE_HZ):
+            if not self.pausing:
+                os.write(self._fd, self._picture)
+
+    def __enter__(self) -> Writer:
+        os.write(self._fd, self._picture)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._halt.set()
+        self._thread.join()
+        os.close(self._fd)
+
+
+@pytest.fixture(scope="session")
+def rules() -> Path:
+    """The rules that name the two cameras, as `omnid cameras` prints them, installed."""
+    path = Path("/run/udev/rules.d", Path(RULES_FILE).name)
+    run("modprobe", "vivid", "n_devs=2", "node_types=0x1,0x1")
+    run("udevadm", "settle")
+    printed = run("python3", "-m", "omnid", "cameras")
+    found = list(udev_rules(capture_devices()))
+    assert len(found) == 2 and all(rule in printed for rule in found)
+    assert "vivid-001-vid-cap" in printed and "GREY 320x180 at 60, 50, 40" in printed
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(found) + "\n", "utf-8")
+    run("modprobe", "-r", "vivid")
+    run("udevadm", "control", "--reload")
+    return path
+
+
+@pytest.fixture
+def vivid(rules: Path) -> Iterator[None]:
+    """Two fresh cameras by their stable names."""
+    run("modprobe", "vivid", "n_devs=2", "node_types=0x1,0x1")
+    run("udevadm", "settle")
+    assert {os.readlink(LOWER), os.readlink(UPPER)} == {"../video0", "../video1"}
+    yield
+    run("modprobe", "-r", "vivid")
+
+
+@pytest.fixture(scope="session")
+def loopback() -> None:
+    run("modprobe", "v4l2loopback", "devices=2", "video_nr=10,11", "card_label=omni-lower,omni-upper",
+        "exclusive_caps=1,1", "max_buffers=4")
+    run("udevadm", "settle")
+
+
+@pytest.fixture(autouse=True)
+def no_file_stays_open() -> Iterator[None]:
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd"))
+    yield
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) <= before
+
+
+def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
+    picture = bytes(SIZE[0] * SIZE[1])
+    with Writer(LOOPBACKS[0], picture), Writer(LOOPBACKS[1], picture):
+        real = [Watched(LOWER), Watched(UPPER)]
+        looped = [Watched(device, controls=()) for device in LOOPBACKS]
+        with real[0], real[1], looped[0], looped[1]:
+            until(lambda: all(len(watched.taken) >= 20 for watched in real + looped))
+    for watched in real + looped:
+        watched.require_order()
+        period_ns = (watched.taken[-1][1] - watched.taken[0][1]) / (len(watched.taken) - 1 + watched.state.drops)
+        print(watched.state, f"{1e9 / period_ns:.2f} Hz")
+        assert 0.5 < 1e9 / period_ns / RATE_HZ < 1.5
+    for watched in real:
+        watched.require_said()
+        assert watched.state.mode == "GREY 320x180 at 10 Hz" and watched.missing() == watched.state.drops
+    for watched in looped:
+        watched.require_said("clock")
+
+
+def test_dropped_buffers_are_counted_exactly(vivid: None) -> None:
+    with Watched(controls=(*STILL, "percentage_of_dropped_buffers=40"), rate_hz=25.0) as watched:
+        watched.more(60)
+    watched.require_order()
+    assert watched.state.drops == watched.missing(40_000_000) > 5
+    assert watched.state.frames == len(watched.taken) and watched.state.errors == watched.state.losses == 0
+
+
+def test_flagged_buffers_are_left_out_and_counted(vivid: None) -> None:
+    with Watched() as watched:
+        for count in (1, 2, 3):
+            watched.more(3)
+            control(LOWER, FLAG_ERROR, 1)
+            until(lambda count=count: watched.state.errors == count)
+        watched.more(3)
+    watched.require_order()
+    assert watched.missing() == watched.state.drops + 3 and watched.state.losses == 0
+
+
+def test_stamps_of_the_future_become_the_arrival(vivid: None) -> None:
+    with Watched(controls=("timestamp_source=0",)) as watched:
+        watched.more(10)
+    watched.require_order()
+    watched.require_said("stamp")
+    assert watched.state.restamped == watched.state.frames
+
+
+def test_an_input_error_is_survived_and_all_is_set_anew(vivid: None) -> None:
+    with Watched(gain=77) as watched:
+        watched.more(5)
+        control(LOWER, GAIN, 5)
+        control(LOWER, FATAL_ERROR, 1)
+        until(lambda: watched.state.reopens)
+        watched.more(5)
+        assert control(LOWER, GAIN) == 77
+    watched.require_order()
+    watched.require_said("lost", "back, GREY 320x180 at 10 Hz")
+    assert (watched.state.losses, watched.state.reopens, watched.state.drops) == (1, 1, 0)
+
+
+def test_both_cameras_are_unplugged_and_come_back(vivid: None) -> None:
+    with Watched(LOWER) as lower, Watched(UPPER) as upper:
+        lower.more(5)
+        upper.more(5)
+        control(LOWER, DISCONNECT, 1)
+        until(lambda: lower.state.losses == 1 and lower.state.status == "streaming")  # vivid connects when it is let go
+        upper.more(5)
+        assert upper.state.losses == 0
+        (BIND / "unbind").write_text("vivid.0")
+        until(lambda: "is not there" in lower.state.problem and "is not there" in upper.state.problem)
+        assert not os.path.lexists(LOWER)
+        (BIND / "bind").write_text("vivid.0")
+        for watched in (lower, upper):
+            until(lambda watched=watched: watched.state.status == "streaming")
+            watched.more(5)
+    lower.require_order()
+    upper.require_order()
+    lower.require_said("lost", "back", "lost", "back")
+    upper.require_said("lost", "back")
+
+
+def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
+    node = os.path.realpath(LOWER)
+    with Watched(node) as watched:
+        watched.more(3)
+        os.rename(node, "/dev/hidden")
+        os.symlink(os.path.realpath(UPPER), node)
+        control("/dev/hidden", FATAL_ERROR, 1)
+        until(lambda: "use a name that stays" in watched.state.problem)
+        assert watched.state.status == "lost"
+        os.rename("/dev/hidden", node)
+        watched.more(3)
+    watched.require_said("lost", "back")
+
+
+def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
+    device, picture = LOOPBACKS[0], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, picture) as writer:
+        watched = Watched(device, controls=(), timeout_s=1.0)
+        with watched:
+            watched.more(5)
+            writer.pausing = True
+            until(lambda: watched.state.status == "lost")
+            assert "no good picture for 1 s" in watched.state.problem
+            until(lambda: watched.state.reopens >= 2)
+            writer.pausing = False
+            watched.more(5)
+    watched.require_order()
+    watched.require_said("clock", "lost", "back")
+
+
+def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
+    device, picture = LOOPBACKS[1], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, picture):
+        watched = Watched(device, controls=(), timeout_s=1.0)
+        watched.thread.start()
+        watched.more(5)
+    until(lambda: "no capture device" in watched.state.problem)
+    with Writer(device, picture):
+        watched.more(5)
+        watched.__exit__()
+    watched.require_order()
+    watched.require_said("clock", "lost", "back")
+
+
+def test_motion_jpeg_arrives_whole(loopback: None) -> None:
+    picture = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
+    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+    with Writer(LOOPBACKS[0], jpeg, "MJPG"), Watched(LOOPBACKS[0], controls=(), pixel_format="auto") as watched:
+        watched.more(5)
+    assert watched.last and watched.last.encoding == "jpeg"
+    assert np.abs(gray(watched.last).astype(int) - picture).max() < 12
+
+
+def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
+    pictures = {}
+    for name in ("GREY", "YUYV", "UYVY", "NV12"):
+        with Watched(pixel_format=name) as watched:
+            watched.more(2)
+        assert watched.last and watched.state.mode.startswith(name)
+        pictures[name] = gray(watched.last)
+        assert pictures[name].shape == SIZE[::-1] and np.ptp(pictures[name]) > 100
+    for name in ("UYVY", "NV12"):
+        np.testing.assert_allclose(pictures[name].astype(int), pictures["YUYV"], atol=3)
+    assert np.corrcoef(pictures["GREY"].ravel(), pictures["YUYV"].ravel())[0, 1] > 0.95
+
+
+def test_controls_are_in_force_before_the_first_picture(vivid: None) -> None:
+    assert control(LOWER, GAIN) != 33
+    with Watched(gain=33, controls=(*STILL, "brightness=40", "hue=-7")):
+        listed = run("v4l2-ctl", "-d", LOWER, "-C", "gain,gain_automatic,brightness,hue")
+    assert listed.splitlines() == ["gain: 33", "gain_automatic: 0", "brightness: 40", "hue: -7"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"gain": 300}, "300 was asked, it takes 0 to 255"),
+        ({"exposure_us": 500}, "no control of its automatic exposure"),
+        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: brightness"),
+        ({"rate_hz": 13.0}, "13 Hz was asked, the device gave 1"),
+        ({"rate_hz": 90.0}, "not offered; choose from: "),
+        ({"pixel_format": "MJPG"}, "not offered; choose from: "),
+        ({"width_px": 322}, "not offered; choose from: "),
+    ],
+)
+def test_what_the_device_does_not_take_is_refused(vivid: None, fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(DriverError, match=said) as caught:
+        Watched(**fields)
+    assert str(caught.value).startswith(f"camera {LOWER}: ") and "\n" not in str(caught.value)
+
+
+def test_a_device_is_had_by_one_alone(vivid: None) -> None:
+    with Watched() as watched:
+        watched.more(3)
+        with pytest.raises(DriverError, match="is used by another program"):
+            Watched()
+        watched.more(3)
+    with Watched(width_px=640, height_px=360) as later:
+        later.more(3)
+    watched.require_said()
+
+
+def test_an_output_is_no_camera(loopback: None) -> None:
+    with pytest.raises(DriverError, match="is no capture device now"):
+        Watched(LOOPBACKS[0], controls=())
+
+
+def test_close_ends_a_wait_and_may_come_at_any_time(vivid: None, loopback: None) -> None:
+    device, picture = LOOPBACKS[0], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, picture) as writer, Watched(device, controls=(), timeout_s=60.0) as watched:
+        watched.more(1)
+        writer.pausing = True
+        time.sleep(0.5)
+        started_s = time.monotonic()
+        watched.camera.close()
+        watched.thread.join(LIMIT_S)
+        assert time.monotonic() - started_s < 30 and watched.state.status == "closed"
+    unread = Watched()
+    unread.camera.close()
+    unread.camera.close()
+    assert list(unread.camera.frames()) == [] and unread.state.status == "closed"
+    with Watched() as again:  # it was let go
+        again.more(1)
