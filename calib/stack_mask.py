@@ -1,0 +1,61 @@
+"""What of a camera's picture never shows the world, from a stack of frames: beyond the rim, the hub, the struts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Mask
+from calib.errors import CalibError
+from calib.rim import find_rim
+
+Image = NDArray[np.uint8]
+MIN_FRAMES = 5
+MAX_FRAMES = 64
+# A fitting is darker than this part of the usual light in all frames, and changes less than the world does.
+DARK_PART = 0.35
+STILL_PART = 0.35
+# Specks smaller than this part of the ring are no fittings; what is found is widened by the blur at its edges.
+MIN_SPECK_PART = 5e-4
+EDGE_PX = 2
+
+
+def find_mask(frames: Sequence[Image], center: tuple[float, float]) -> Mask:
+    """The mask of frames (H, W) uint8 that show different views; its picture is 255 where the world is seen.
+
+    center (u, v) [px]: of the camera, or a fair guess. Raises CalibError where frames are few or show no rim.
+    """
+    if len(frames) < MIN_FRAMES:
+        raise CalibError(f"mask: needs {MIN_FRAMES} frames at least, of different views, found {len(frames)}")
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().astype(int)
+    stack = np.stack([frames[index] for index in chosen])
+    brightest = stack.max(axis=0)
+    rim = find_rim(brightest, center)
+    if rim is None:
+        raise CalibError("mask: no rim of a mirror can be told in these frames; draw the mask by hand, or leave it out")
+    shown = _disc(brightest.shape, rim, rim.outer_px) & ~_disc(brightest.shape, rim, rim.inner_px)
+    shown &= ~_fittings(stack, shown)
+    return Mask(rim.center, rim.inner_px, rim.outer_px, np.where(shown, 255, 0).astype(np.uint8))
+
+
+def _disc(shape: tuple[int, ...], rim: Mask, radius_px: float) -> NDArray[np.bool_]:
+    v, u = np.indices(shape)
+    return np.asarray(np.hypot(u - rim.center[0], v - rim.center[1]) <= radius_px) if radius_px > 0 else np.zeros(
+        shape, bool)
+
+
+def _fittings(stack: NDArray[np.uint8], shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where all frames are dark and alike, within the ring shown: struts."""
+    high, low = np.percentile(stack, 95, axis=0), np.percentile(stack, 5, axis=0)
+    change = high - low
+    usual_light, usual_change = np.median(high[shown]), np.median(change[shown])
+    still = shown & (high < DARK_PART * usual_light) & (change < STILL_PART * usual_change)
+    whole = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    whole = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
+    count, labels, numbers, _ = cv2.connectedComponentsWithStats(whole)
+    large = [n for n in range(1, count) if numbers[n, cv2.CC_STAT_AREA] > MIN_SPECK_PART * shown.sum()]
+    kept = np.isin(labels, large).astype(np.uint8)
+    return np.asarray(cv2.dilate(kept, np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)) > 0)

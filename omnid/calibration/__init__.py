@@ -1,0 +1,1 @@
+"""What stands between the calibration's commands and its numerics: pictures in, reports out."""

@@ -1,0 +1,133 @@
+"""The pictures of one camera: from files, folders and patterns, or from one topic of a log."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import BrokenFrame, DriverError
+from drivers.frame import MAX_PIXELS, Frame, gray
+from drivers.mcap_catalog import Catalog
+from drivers.mcap_messages import DataSection, Message, scan
+from drivers.mcap_records import LogFile
+from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
+from omnid.errors import OmnidError
+
+Image = NDArray[np.uint8]
+Pictures = dict[str, Image]  # by name, all of one size
+SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+MAX_PICTURES = 400
+# So many frames of a log are looked at, evenly spread: a board held by hand does not move much between two of them.
+LOG_FRAMES = 120
+SCAN_BYTES, SCAN_MESSAGES = 64 * 2**20, 2000
+
+
+def read_pictures(sources: Sequence[str], topic: str | None = None) -> Pictures:
+    """Grey pictures of files, folders and patterns, or of a log's topic; OmnidError unless all are, and of one size."""
+    logs = [source for source in sources if Path(source).suffix == ".mcap"]
+    if logs and len(sources) > 1:
+        raise OmnidError(f"{logs[0]}: expected pictures, or one log alone; found {len(sources)} names")
+    if topic and not logs:
+        raise OmnidError(f"--topic {topic}: only a log has topics; found pictures")
+    pictures = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
+    _one_size(pictures)
+    return pictures
+
+
+def _of_files(sources: Sequence[str]) -> Pictures:
+    paths = list(dict.fromkeys(path for source in sources for path in _expanded(source)))
+    if len(paths) > MAX_PICTURES:
+        raise OmnidError(f"calibrate: expected {MAX_PICTURES} pictures at most, found {len(paths)}; 40 are plenty")
+    names = _short_names(paths)
+    return {name: _read(path) for name, path in zip(names, paths, strict=True)}
+
+
+def _expanded(source: str) -> list[Path]:
+    """The files that a name, a folder or a pattern stands for."""
+    path = Path(source)
+    if path.is_dir():
+        found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    else:
+        found = [path] if path.exists() else sorted(map(Path, glob.glob(source)))
+    if not found:
+        what = f"no picture ({' '.join(sorted(SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
+        raise OmnidError(f"{source}: {what}; give files, a folder or a pattern like 'calib/*.png'")
+    return found
+
+
+def _short_names(paths: Sequence[Path]) -> list[str]:
+    """File names, or whole paths where two are called the same."""
+    short = [path.name for path in paths]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+
+
+def _read(path: Path) -> Image:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    except OSError as error:
+        raise OmnidError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except cv2.error:
+        image = None
+    if image is None or image.size > MAX_PIXELS:
+        raise OmnidError(f"{path}: expected a picture (PNG, JPEG, TIFF ...) of sane size, found none; leave it out")
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def _one_size(pictures: Pictures) -> None:
+    sizes: dict[tuple[int, ...], str] = {}
+    for name, image in pictures.items():
+        sizes.setdefault(image.shape[::-1], name)
+    if len(sizes) > 1:
+        shown = ", ".join(f"{size[0]}x{size[1]} ({name})" for size, name in list(sizes.items())[:4])
+        raise OmnidError(f"calibrate: expected pictures of one camera, all of one size, found {shown}")
+
+
+def _of_log(path: Path, topic: str | None) -> Pictures:
+    file = LogFile(path)
+    try:
+        catalog = scan(file, SCAN_BYTES, SCAN_MESSAGES)
+        chosen = _topic(path, catalog, topic)
+        stride = max(1, sum(1 for _ in _messages(file, catalog, chosen)) // LOG_FRAMES)
+        return dict(_frames(file, catalog, chosen, stride))
+    finally:
+        file.close()
+
+
+def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
+    """The topic asked for, or the only one with pictures."""
+    images = sorted(name for name, kind in catalog.topics().items() if kind in (IMAGE, COMPRESSED_IMAGE))
+    if topic in images:
+        return str(topic)
+    if topic is None and len(images) == 1:
+        return images[0]
+    wanted = f"topic {topic}" if topic else "--topic, to say which camera"
+    raise OmnidError(f"{path}: expected {wanted}, found image topics {', '.join(images) or '(none)'}")
+
+
+def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[Message]:
+    for message in DataSection(file, catalog).messages():
+        found = catalog.topic(message.channel_id)
+        if found is not None and found.name == topic:
+            yield message
+
+
+def _frames(file: LogFile, catalog: Catalog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
+    """Every stride-th picture, named by its number; what cannot be decoded is left out."""
+    for number, message in enumerate(_messages(file, catalog, topic)):
+        kind = catalog.topic(message.channel_id)
+        if number % stride or kind is None:
+            continue
+        try:
+            image = parse_image(kind.type, message.data())
+            yield f"frame{number:06d}", gray(Frame(number, image.stamp_ns, "lower", image.encoding, image.data,
+                                                   image.width, image.height, image.step, image.bigendian))
+        except (BrokenFrame, DriverError):
+            continue
+
+

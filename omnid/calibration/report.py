@@ -1,0 +1,97 @@
+"""The report of a camera's calibration: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import cv2
+import numpy as np
+
+from calib.camera import Mask
+from calib.fit import Calibration
+from calib.ocam import OcamCamera
+from omnid.calibration.drawings import (
+    ARROW,
+    Image,
+    coverage_picture,
+    error_by_radius,
+    panorama_picture,
+    residual_picture,
+)
+
+MAX_SHOWN_VIEWS = 40
+JPEG_QUALITY = 80
+STYLE = """body{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse}td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1em 0}figcaption{color:#555}
+.bar{background:#d33;height:.7em;display:inline-block}.warn{color:#a40}"""
+
+
+def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequence[str], mask: Mask | None) -> str:
+    """The whole page; images by the views' names, missing: pictures without a board."""
+    first = images[found.views[0].name]
+    pixels = np.array([view.pixels for view in found.views])
+    parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by picture</h2>",
+             _views(found, missing), "<h2>Error by distance from the centre</h2>",
+             _table(("radius [px]", "mean error [px]", "corners"),
+                    [(f"{r:.0f}", f"{e:.3f}", str(n)) for r, e, n in
+                     error_by_radius(found.fit, pixels, found.camera.center)]),
+             "<h2>Coverage</h2>", _figure(coverage_picture(first, found), "all corners; arrows are the residuals, "
+                                          f"{ARROW:.0f} times as long; the cross is the centre"),
+             "<h2>Unrolled</h2>", _figure(panorama_picture(first, found.camera, mask), f"{found.views[0].name} about "
+                                          "the ray of the centre: what runs along it in the world stands upright"),
+             "<h2>Residuals</h2>", *_residuals(found, images)]
+    return f"<!DOCTYPE html><html><head><meta charset='utf-8'><title>Camera calibration</title><style>{STYLE}</style>" \
+           f"</head><body>{''.join(parts)}</body></html>\n"
+
+
+def _head(found: Calibration) -> str:
+    camera, board = found.camera, found.board
+    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
+    used = int(np.isfinite(found.fit.errors_px).sum())
+    return (f"<h1>Camera calibration</h1><p>Model {model}, {camera.size[0]}x{camera.size[1]} px. Board of "
+            f"{board.columns}x{board.rows} inner corners, {board.square_m * 1e3:g} mm squares. "
+            f"{len(found.views)} views, {used} corners. <b>Mean reprojection error {found.fit.mean_px:.3f} px</b>.</p>")
+
+
+def _warnings(found: Calibration) -> str:
+    lines = [*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)]
+    return "".join(f"<p class='warn'>{escape(line)}</p>" for line in lines)
+
+
+def _parameters(found: Calibration) -> str:
+    return _table(("parameter", "value", "standard deviation"),
+                  [(name, f"{value:.8g}", f"{deviation:.2g}") for name, value, deviation in found.parameters])
+
+
+def _views(found: Calibration, missing: Sequence[str]) -> str:
+    errors = found.view_errors_px
+    worst = float(errors.max())
+    corners = [int(np.isfinite(view.pixels[:, 0]).sum()) for view in found.views]
+    rows = [(escape(view.name), f"{error:.3f}", str(count), f"{view.confidence:.2f}",
+             f"<span class='bar' style='width:{200 * error / worst:.0f}px'></span>")
+            for view, error, count in zip(found.views, errors, corners, strict=True)]
+    none = f"<p>No board found in {escape(', '.join(missing))}.</p>" if missing else ""
+    return _table(("picture", "mean error [px]", "corners", "confidence", ""), rows) + none
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    titles = "".join(f"<th>{title}</th>" for title in head)
+    lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
+
+
+def _residuals(found: Calibration, images: Mapping[str, Image]) -> list[str]:
+    shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
+    return [_figure(residual_picture(images[view.name], view.pixels, residuals),
+                    f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")
+            for view, residuals, error in shown]
+
+
+def _figure(picture: Image, caption: str) -> str:
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    source = base64.b64encode(data.tobytes()).decode()
+    image = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -1,0 +1,153 @@
+"""`omnid calibrate camera`: a camera.toml from pictures of a checkerboard."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.board import Board, BoardView
+from calib.board_find import find_board
+from calib.camera import Mask
+from calib.camera_file import CameraFile, Quality, camera_toml
+from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
+from calib.ocam import VIEWS
+from calib.rig_file import write_file
+from calib.stack_mask import find_mask
+from omnid.calibration.pictures import Pictures, read_pictures
+from omnid.calibration.report import report_html
+from omnid.errors import OmnidError
+from omnid.outputs.files import check_outputs
+
+# A log shows the same board over and over: so many views, far apart, say as much as all, in a fraction of the time.
+MAX_LOG_VIEWS = 40
+
+
+def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `camera` to `omnid calibrate`."""
+    parser = actions.add_parser("camera", help="a camera.toml from pictures of a checkerboard")
+    parser.add_argument("pictures", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
+    parser.add_argument("--corners", required=True, type=_corners, metavar="6x7", help="where four squares meet, "
+                        "counted along both sides of the board")
+    parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
+    parser.add_argument("--topic", help="the camera's topic in a log")
+    parser.add_argument("--model", choices=MODELS, default="ocam", help="polynomial (default) or unified model")
+    parser.add_argument("--view", choices=VIEWS, default="mirror", help="whether the world is seen in a mirror "
+                        "(default) or directly through a lens: a flat board cannot tell")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="a page (HTML) with all there is to see about it")
+    parser.add_argument("--mask", type=Path, metavar="FILE", help="also find rim, hub and struts, and paint them into "
+                        "this PNG beside the camera's file: edit it as you like")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the camera.toml to write")
+    parser.set_defaults(run=run)
+
+
+def _corners(text: str) -> tuple[int, int]:
+    sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
+    if sides is None:
+        raise argparse.ArgumentTypeError(f"expected two numbers of inner corners like 6x7, found {text!r}")
+    return int(sides[1]), int(sides[2])
+
+
+def run(args: argparse.Namespace) -> int:
+    """Finds the boards, fits the camera, writes the files and prints one line."""
+    columns, rows = args.corners
+    board = Board(columns, rows, args.square_mm / 1e3)
+    _check_outputs(args)
+    pictures = read_pictures(args.pictures, args.topic)
+    views = _views(pictures, board, args)
+    found = _fitted(views, pictures, board, args)
+    mask = find_mask(list(pictures.values()), found.camera.center) if args.mask else None
+    _write(found, mask, args)
+    if args.report:
+        missing = sorted(set(pictures) - {view.name for view in views})
+        write_file(args.report, report_html(found, pictures, missing, mask).encode())
+    for line in (*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
+        print(f"warning: {line}", file=sys.stderr)
+    print(f"{args.output}: {describe(found)}")
+    return 0
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    named = [("--output", args.output), ("--report", args.report), ("--mask", args.mask)]
+    read = [("a picture that is read", Path(source)) for source in args.pictures if Path(source).is_file()]
+    check_outputs([(option, path) for option, path in named if path is not None], read)
+    if args.mask and (args.mask.suffix.lower() != ".png" or args.mask.parent.resolve() != args.output.parent.resolve()):
+        raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}, where it is looked for")
+
+
+def _views(pictures: Pictures, board: Board, args: argparse.Namespace) -> list[BoardView]:
+    """The views of the board; OmnidError that says what was seen where there is none."""
+    views, seen = list[BoardView](), Counter[tuple[int, int]]()
+    many = any(source.endswith(".mcap") for source in args.pictures)
+    for number, (name, image) in enumerate(pictures.items(), 1):
+        search = find_board(image, board, name, thorough=not many)
+        if search.view is not None:
+            views.append(search.view)
+        seen[_sorted(search.seen)] += search.seen != (0, 0)
+        said = f"board found, confidence {search.view.confidence:.2f}" if search.view else _no_board(search.seen)
+        if not args.quiet:
+            print(f"[{number}/{len(pictures)}] {name}: {said}", file=sys.stderr)
+    if not views:
+        raise OmnidError(_none_found(len(pictures), board, seen))
+    return _spread(views, MAX_LOG_VIEWS) if many else views
+
+
+def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
+    return min(sides), max(sides)
+
+
+def _no_board(seen: tuple[int, int]) -> str:
+    return f"no board, but a grid of {seen[0]}x{seen[1]}" if seen != (0, 0) else "no board"
+
+
+def _none_found(pictures: int, board: Board, seen: Counter[tuple[int, int]]) -> str:
+    likely, times = seen.most_common(1)[0] if seen else ((0, 0), 0)
+    hint = (f"a grid of {likely[0]}x{likely[1]} was seen in {times}: try --corners {likely[0]}x{likely[1]}" if times
+            else "count the inner corners, and take pictures with the whole board in view, sharp and well lit")
+    return f"calibrate: no board of {board.columns}x{board.rows} inner corners in any of {pictures} pictures; {hint}"
+
+
+def _spread(views: Sequence[BoardView], count: int) -> list[BoardView]:
+    """At most so many views whose corners lie as far as can be from one another's."""
+    corners = np.nan_to_num(np.array([view.pixels[[0, -1]].ravel() for view in views]))
+    chosen = [0]
+    distance = np.full(len(views), np.inf)
+    while len(chosen) < min(count, len(views)):
+        distance = np.minimum(distance, np.linalg.norm(corners - corners[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return [views[index] for index in sorted(set(chosen))]
+
+
+def _fitted(views: list[BoardView], pictures: Pictures, board: Board, args: argparse.Namespace) -> Calibration:
+    height, width = pictures[views[0].name].shape
+    model: Model = args.model
+    found = calibrate(views, board, (width, height), model, args.view)
+    return sharpened(found, pictures, model, args.view)
+
+
+def _write(found: Calibration, mask: Mask | None, args: argparse.Namespace) -> None:
+    if mask is not None and mask.image is not None:
+        write_file(args.mask, _png(mask.image))
+    quality = Quality(found.fit.mean_px, len(found.views), found.parameters)
+    name = args.mask.name if args.mask else ""
+    write_file(args.output, camera_toml(CameraFile(found.camera, mask), quality, name).encode())
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def describe(found: Calibration) -> str:
+    """One line about a camera: model, size, error, views, centre."""
+    u, v = found.camera.center
+    corners = int(np.isfinite(found.fit.errors_px).sum())
+    return (f"{found.camera.size[0]}x{found.camera.size[1]}, centre {u:.2f} {v:.2f}, mean reprojection error "
+            f"{found.fit.mean_px:.3f} px over {corners} corners of {len(found.views)} views")
