@@ -19,7 +19,7 @@ from drivers.line_protocol import LineProtocol
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motor_protocol import MotorProtocol, Script, T
 
-CONNECT_TRY_S = 0.3
+CONNECT_TRY_S = 0.2
 STOPS_AT_CLOSE = 3
 READ_LIMIT_BYTES = 4096
 STALE_SHARE = 0.8  # of the watchdog's time: later than that the controller may have stopped before a command arrives
@@ -176,14 +176,17 @@ class SerialMotor:
                 port.close()
 
     def _run(self, script: Script[T], deadline_s: float) -> T:
-        """What a script returns; Silence at the deadline."""
+        """What a script returns; Silence at the deadline, after a last look at what a late thread finds waiting."""
         heard = self._framer.garbage + self._protocol.bad_frames
         try:
             self._forget_input()
             self._write(next(script))
-            while True:
+            overdue = False
+            while not overdue:
+                overdue = time.monotonic() >= deadline_s
                 for frame in self._framer.feed(self._read(deadline_s)):
                     self._write(script.send(frame))
+            raise Silence
         except StopIteration as done:
             result: T = done.value
             return result
@@ -212,9 +215,9 @@ class SerialMotor:
 
     def _read(self, deadline_s: float) -> bytes:
         """What has arrived, or arrives until the deadline."""
-        if self._port is None or (wait_s := deadline_s - time.monotonic()) <= 0:
+        if self._port is None:
             raise Silence
-        readable, _, _ = select.select([self._port.fileno()], [], [], wait_s)
+        readable, _, _ = select.select([self._port.fileno()], [], [], max(0.0, deadline_s - time.monotonic()))
         return bytes(self._port.read(READ_LIMIT_BYTES)) if readable else b""
 
     def _silence(self, nonsense: int) -> Silence:

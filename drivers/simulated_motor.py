@@ -85,6 +85,13 @@ class SimulatedMotor:
         while self._expiring.is_set() and self._thread.is_alive():
             time.sleep(STEP_S)
 
+    def say(self, data: bytes) -> None:
+        """Sends bytes, asked or not; drops them where nobody reads."""
+        with contextlib.suppress(BlockingIOError):
+            if os.write(self._device, data) == len(data):
+                return
+        self.unsent += 1
+
     def close(self) -> None:
         """Ends the thread and the pty; a second call does nothing."""
         if not self._thread.is_alive():
@@ -114,10 +121,4 @@ class SimulatedMotor:
             return
         answer = self.controller.feed(data)
         if answer and not self.silent:
-            self._send(self.garbage + answer)
-
-    def _send(self, answer: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):
-            if os.write(self._device, answer) == len(answer):
-                return
-        self.unsent += 1
+            self.say(self.garbage + answer)

@@ -21,6 +21,7 @@ class SimulatedODrive:
         self.base.watchdog_ms = 0
         self._framer = TextFramer()
         self._state = [_IDLE, _IDLE]
+        self._input_vel = [0.0, 0.0]  # turns/s; stays while an axis is disarmed, and counts once it is armed
         self._settings = {
             f"axis{axis}.{name}": 0.0
             for axis in SIDES
@@ -61,11 +62,10 @@ class SimulatedODrive:
 
     def _drive(self, axis: int, turns_per_s: float) -> str:
         """A disarmed axis is fed and takes the velocity down, but does not turn."""
+        self._input_vel[axis] = turns_per_s
         self._fed(axis)
         if self._state[axis] == _CLOSED_LOOP:
             self.base.tell_channel(axis, turns_per_s / self._turns_per_m())
-        elif turns_per_s:
-            self.base.errors += 1
         return ""
 
     def _fed(self, axis: int) -> str:
@@ -96,7 +96,7 @@ class SimulatedODrive:
             self.base.expired[self._side(axis)] = bool(int(value) & _WATCHDOG_EXPIRED)
         elif value == _CLOSED_LOOP and not self.base.expired[self._side(axis)] and not self.base.fault:
             self._state[axis] = _CLOSED_LOOP
-            self.base.tell_channel(axis, 0.0)  # its own start is a stop
+            self.base.tell_channel(axis, self._input_vel[axis] / self._turns_per_m())
         return ""
 
     def _disarm_expired(self) -> None:

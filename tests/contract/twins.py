@@ -33,7 +33,7 @@ def controller_of(name: str, drive: DifferentialDrive = BASE, watchdog_ms: int =
 
 def shortest_watchdog_ms(name: str) -> int:
     """What can be asked of the controller and is soon over."""
-    return 2000 if name == "ros_arduino_bridge" else 200
+    return 2000 if name == "ros_arduino_bridge" else 100
 
 
 def answer(script: Script[T], controller: SimulatedController, framer: Framer) -> T:
