@@ -8,7 +8,10 @@ from typing import Any
 
 from drivers.differential_drive import DifferentialDrive
 from drivers.motor_protocols import PROTOCOLS
+from drivers.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
+from omnid.core.command_limits import CommandLimits
 from omnid.core.ego_motion import Limits
+from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import HeadingLimits
 from omnid.core.klt import Klt
 from omnid.core.stereo_matching import METHODS, Matching
@@ -21,6 +24,53 @@ class LogConfig:
     """How a log is read."""
 
     reorder_frames: int = knob(32, "pictures that may wait for one that was written late", low=1, high=1000)
+
+
+@dataclass(frozen=True, slots=True)
+class CamerasConfig:
+    """The cameras of the robot and how they are set; both alike."""
+
+    rig: str = knob("/etc/omnid/rig.toml", "the calibration of the cameras, see `omnid calibrate`")
+    lower: str = knob("/dev/omnid/lower", "device of the lower camera, by a name that stays, see `omnid cameras`")
+    upper: str = knob("/dev/omnid/upper", "device of the upper camera")
+    width_px: int = knob(1280, "width of the pictures, px", low=16, high=16384)
+    height_px: int = knob(960, "height of the pictures, px", low=16, high=16384)
+    rate_hz: float = knob(30.0, "pictures per second; 0: what the camera does by itself", low=0, high=1000)
+    pixel_format: str = knob("auto", "how pictures come over the wire", choices=PIXEL_FORMATS)
+    auto_exposure: str = knob("keep", "automatic exposure", choices=SWITCH)
+    exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
+    auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
+    gain: int = knob(-1, "fixed gain in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
+    auto_white_balance: str = knob("keep", "automatic white balance", choices=SWITCH)
+    auto_focus: str = knob("keep", "automatic focus; best off: every move of the lens spoils the calibration",
+                           choices=SWITCH)
+    focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
+    power_line: str = knob("keep", "against the flicker of lamps, Hz", choices=POWER_LINE)
+    controls: tuple[str, ...] = knob((), "other controls, as v4l2-ctl --list-ctrls names them: 'sharpness=2'")
+    buffers: int = knob(4, "pictures the kernel holds", low=2, high=32)
+    timeout_s: float = knob(2.0, "a camera without a picture for so long is opened anew, s", low=0.05, high=60)
+    retry_s: float = knob(2.0, "longest wait between two tries to open a lost camera, s", low=0.05, high=60)
+
+    def settings(self, camera: str) -> V4l2Settings:
+        """The settings of the lower or the upper camera; DriverError where they contradict each other."""
+        shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
+        return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
+
+
+@dataclass(frozen=True, slots=True)
+class HelmConfig:
+    """When the wheels of a live robot must stand, and what they may be told at most."""
+
+    deadlines: Deadlines = field(default_factory=Deadlines)
+    limits: CommandLimits = field(default_factory=CommandLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveConfig:
+    """What `omnid run` says while it runs."""
+
+    status_s: float = knob(1.0, "between two reports of the state, s", low=0.1, high=60)
+    cloud_s: float = knob(2.0, "between two maps on the bus, s; 0: only at the end", low=0, high=3600)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +164,34 @@ class GraphConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ServiceConfig:
+    """How the daemon is watched."""
+
+    hung_s: float = knob(10.0, "a stage that has been at one message for longer is hung: systemd is to restart, s",
+                         low=0.5, high=600)
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeConfig:
+    """What the live daemon asks of the kernel and of Python, so that nothing makes a deadline wait."""
+
+    lock_memory: bool = knob(True, "nothing is swapped out; needs LimitMEMLOCK=infinity")
+    freeze_gc: bool = knob(True, "what exists at the start is never looked at again by the garbage collector")
+    switch_interval_ms: float = knob(1.0, "after so long a thread lets others into Python, ms; 0: Python's own 5 ms",
+                                     low=0, high=100)
+    motor_priority: int = knob(20, "SCHED_FIFO priority of the motor's tick, needs LimitRTPRIO; 0: none", low=0,
+                               high=99)
+    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take pictures; 0: none", low=0, high=99)
+    longest_run_ms: int = knob(500, "a SCHED_FIFO thread that runs for longer without a wait ends the daemon, ms; "
+                               "0: never", low=0, high=10_000)
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """All of it."""
 
     log: LogConfig = field(default_factory=LogConfig)
+    cameras: CamerasConfig = field(default_factory=CamerasConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
@@ -125,9 +199,13 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     motor: MotorConfig = field(default_factory=MotorConfig)
+    helm: HelmConfig = field(default_factory=HelmConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
+    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
+    service: ServiceConfig = field(default_factory=ServiceConfig)
 
 
 def _knob(doc: str, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Knob:
@@ -187,6 +265,18 @@ DRIVE: Mapping[str, Knob] = {
     "swapped": _knob("the controller's first motor is the right one"),
     "can_id": _knob("vesc: id of the second motor's controller", 0, 253),
 }
+DEADLINES: Mapping[str, Knob] = {
+    "pose_s": _knob("the wheels stop when the newest pose's pictures are older, s", 0.05, 10),
+    "command_s": _knob("the wheels stop when the newest command came longer ago, s", 0.05, 10),
+    "tick_s": _knob("the wheels stop when the host lets a tick come so much too late, s", 0.01, 10),
+}
+COMMAND: Mapping[str, Knob] = {
+    "velocity_mps": _knob("highest speed, m/s", 0.001, 10),
+    "acceleration_mps2": _knob("highest acceleration, m/s^2", 0.001, 100),
+    "deceleration_mps2": _knob("highest deceleration, at stops as well, m/s^2", 0.001, 100),
+    "yaw_rate_radps": _knob("highest yaw rate, rad/s", 0.001, 20),
+    "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
+}
 BUS: Mapping[str, Knob] = {
     "robot": _knob("first part of every key, and of the topics of --record"),
     "listen": _knob("zenoh endpoints to listen on"),
@@ -203,5 +293,5 @@ def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
 
 
 for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING),
-                      (DifferentialDrive, DRIVE), (BusConfig, BUS)):
+                      (DifferentialDrive, DRIVE), (BusConfig, BUS), (Deadlines, DEADLINES), (CommandLimits, COMMAND)):
     _describe(_kind, _knobs)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.flow import nothing
 from omnid.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import MapUpdate, Odometry
+from omnid.messages import FramePair, MapUpdate, Odometry
 from omnid.outputs.encoded import Outgoing
 from omnid.outputs.motor import MotorTick
 from omnid.stages.dewarp import Dewarp
@@ -19,7 +16,6 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.guidance import Guidance
 from omnid.stages.mapping import Mapping
 from omnid.stages.odometry import OdometryStage
-from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 
 
@@ -32,35 +28,25 @@ class Ends:
     recorder: Sink[Outgoing] | None = None
     bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Frames:
-    """Where the flow comes from: opened in the source's own thread, woken when the run is to end."""
-
-    open: Callable[[], Iterable[Frame]]
-    wake: Callable[[], None] = nothing
+    map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
 class Watched(NamedTuple):
     """The stages that know what the input is worth and what was left out."""
 
-    pair: PairSync
     stereo: Stereo
     mapping: Mapping | None
 
 
-def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends: Ends) -> Watched:
-    """Joins the stages; gives those that are asked at the end."""
-    pair, stereo = PairSync(geometry.rig, config.pair), Stereo(geometry, config.stereo)
-    frames = graph.source("read", source.open, wake=source.wake)
-    pairs = graph.stage("pair", pair, frames)
+def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, ends: Ends) -> Watched:
+    """Joins the stages from the pairs on; gives those that are asked at the end."""
+    stereo = Stereo(geometry, config.stereo)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
     depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
     spoken: list[Stream[Outgoing]] = [odometry, commands]
-    mapping = Mapping(config.mapping) if ends.maps or ends.recorder or ends.bus else None
+    mapping = Mapping(config.mapping, ends.map_every_s) if ends.maps or ends.recorder or ends.bus else None
     if mapping:
         maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
         spoken.append(maps)
@@ -74,7 +60,7 @@ def wire(graph: Graph, source: Frames, geometry: Geometry, config: Config, ends:
         graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
     if ends.motor:
         _drive(graph, ends.motor, commands, 1.0 / config.motor.rate_hz)
-    return Watched(pair, stereo, mapping)
+    return Watched(stereo, mapping)
 
 
 def _drive(graph: Graph, motor: MotorTick, commands: Stream[VelocityCommand], period_s: float) -> None:

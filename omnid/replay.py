@@ -16,11 +16,12 @@ import cv2
 from calib.rig import Rig
 from calib.rig_file import parse_rig, read_rig, rig_toml
 from drivers.errors import DriverError
+from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.graph import LOSSLESS, NEWEST, Graph
+from omnid.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
@@ -30,8 +31,8 @@ from omnid.outputs.recorder import Recorder
 from omnid.outputs.summary import counters, summary
 from omnid.outputs.tally import Tally
 from omnid.outputs.verdict import doubts, found_nothing
-from omnid.pipeline import Ends, Frames, Watched, wire
-from omnid.realtime import Pace
+from omnid.pace import Pace
+from omnid.pipeline import Ends, Watched, wire
 from omnid.settings import dump
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
@@ -86,18 +87,20 @@ class Replay:
             closing.callback(reader.close)
             place = self._geometry(reader, rig)
             ends = self._ends(place, closing)
-            watched = wire(self._graph, self._frames(reader), place, self._config, ends)
+            pair = PairSync(place.rig, self._config.pair)
+            pairs = self._graph.stage("pair", pair, self._frames(reader))
+            watched = wire(self._graph, pairs, place, self._config, ends)
             if isinstance(ends.recorder, Recorder):
-                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, watched.pair))
+                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
             self._show_progress(reader)
             try:
                 with self._stopped_by_signals():
                     self._graph.run()
             except (OmnidError, DriverError):
                 if self._tally.poses:  # what there was until then is whole
-                    self._conclude(reader, watched)
+                    self._conclude(reader, pair, watched)
                 raise
-            self._conclude(reader, watched)
+            self._conclude(reader, pair, watched)
         return 128 + self._signal if self._signal else int(found_nothing(self._tally))
 
     def _inputs(self, rig: Path | None) -> list[tuple[str, Path]]:
@@ -134,11 +137,11 @@ class Replay:
             )
         return parse_rig(attached, None, f"{self._log}: attached rig.toml")
 
-    def _frames(self, reader: LogReader) -> Frames:
+    def _frames(self, reader: LogReader) -> Stream[Frame]:
         if not self._options.realtime:
-            return Frames(reader.frames)
+            return self._graph.source("read", reader.frames)
         pace = Pace()
-        return Frames(lambda: pace.frames(reader.frames()), pace.wake)
+        return self._graph.source("read", lambda: pace.frames(reader.frames()), wake=pace.wake)
 
     def _ends(self, place: Geometry, closing: ExitStack) -> Ends:
         """Opens all outputs: what cannot be opened is said now."""
@@ -177,9 +180,9 @@ class Replay:
             progress = Progress(self._tally, reader.pair_estimate())
             self._graph.ticker("progress", progress.period_s, progress)
 
-    def _conclude(self, reader: LogReader, watched: Watched) -> None:
-        pair, found = watched.pair, self._tally.poses or not self._signal
-        doubtful = doubts(watched, self._tally, self._config.pair) if found else ()
+    def _conclude(self, reader: LogReader, pair: PairSync, watched: Watched) -> None:
+        found = self._tally.poses or not self._signal
+        doubtful = doubts(pair, watched.stereo, self._tally, self._config.pair) if found else ()
         for warning in [*self._warnings, *reader.warnings, *doubtful]:
             print(f"omnid: warning: {warning}", file=sys.stderr)
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,10 +27,13 @@ class Encoded(NamedTuple):
 
 
 class Encoder:
-    """Turns messages into those of ROS 2; their odom is the base's frame at the first pair, not the rig's."""
+    """Turns messages into those of ROS 2; their odom is the base's frame at the first pair, not the rig's.
 
-    def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int) -> None:
-        self._T_base_rig, self._cloud_points = T_base_rig, cloud_points
+    offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
+    """
+
+    def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int, offset_ns: int = 0) -> None:
+        self._T_base_rig, self._cloud_points, self._offset_ns = T_base_rig, cloud_points, offset_ns
 
     def __call__(self, message: Outgoing) -> Iterator[Encoded]:
         """All that is said about a message."""
@@ -38,16 +41,16 @@ class Encoder:
             case Odometry():
                 yield from self._poses(message)
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
-                payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
+                payload = codec.twist_stamped_cdr(stamp_ns + self._offset_ns, "base_link", velocity_mps, yaw_rate_radps)
                 yield Encoded("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
                 points, confidence = _surest(message.points, self._cloud_points)
                 in_odom = se3.apply(self._T_base_rig, points.astype(float))
-                payload = codec.point_cloud_cdr(message.stamp_ns, "odom", in_odom, confidence)
+                payload = codec.point_cloud_cdr(message.stamp_ns + self._offset_ns, "odom", in_odom, confidence)
                 yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
-        stamp_ns = odometry.stamp_ns
+        stamp_ns = odometry.stamp_ns + self._offset_ns
         T_odom_base, covariance, *velocity = of_base(odometry, self._T_base_rig)
         pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
         yield Encoded("odom", codec.ODOMETRY_SCHEMA, pose)
@@ -71,14 +74,17 @@ class StateReports:
             level = ("tracking", "degraded", "lost").index(odometry.state)
             values = {"state": odometry.state, "resets": str(odometry.reset_counter),
                       "landmarks": f"{odometry.inliers} of {odometry.tracks}"}
-            payload = codec.diagnostics_cdr(odometry.stamp_ns, "omnid: odometry", level, odometry.state, values)
-            yield Encoded("status", codec.DIAGNOSTICS_SCHEMA, payload)
+            yield status_report(odometry.stamp_ns, [codec.Status("omnid: odometry", level, odometry.state, values)])
 
 
 def summary_report(stamp_ns: int, values: dict[str, str]) -> Encoded:
     """The counters of a run as one diagnostic message."""
-    payload = codec.diagnostics_cdr(stamp_ns, "omnid: summary", 0, "the run has ended", values)
-    return Encoded("status", codec.DIAGNOSTICS_SCHEMA, payload)
+    return status_report(stamp_ns, [codec.Status("omnid: summary", 0, "the run has ended", values)])
+
+
+def status_report(stamp_ns: int, statuses: Sequence[codec.Status]) -> Encoded:
+    """Statuses as one diagnostic message."""
+    return Encoded("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
 
 
 def _surest(points: MapPoints, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from omnid.config import PairConfig
 from omnid.outputs.tally import Tally
-from omnid.pipeline import Watched
+from omnid.stages.pair import PairSync
+from omnid.stages.stereo import Stereo
 
 
 def found_nothing(tally: Tally) -> bool:
@@ -14,9 +15,8 @@ def found_nothing(tally: Tally) -> bool:
     return tally.poses == tally.states["lost"]
 
 
-def doubts(watched: Watched, tally: Tally, config: PairConfig) -> Iterator[str]:
+def doubts(pair: PairSync, stereo: Stereo, tally: Tally, config: PairConfig) -> Iterator[str]:
     """One line for each thing that is amiss."""
-    pair, stereo, _ = watched
     if pair.fault:
         yield f"{pair.counts['broken']} pictures could not be decoded; the first: {pair.fault}"
     counts = pair.counts

@@ -40,10 +40,12 @@ class Path:
 
 
 class Mapping:
-    """Fuses the points that are certain enough, at poses that are; the map comes at the end."""
+    """Fuses the points that are certain enough, at poses that are; the map comes at the end, and every so often."""
 
-    def __init__(self, config: MappingConfig) -> None:
+    def __init__(self, config: MappingConfig, every_s: float = 0.0) -> None:
+        """every_s: by the stamps, between two maps; 0: only at the end."""
         self._config = config
+        self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
         self._path = Path(config.path_poses)
         self._newest: tuple[int, int] | None = None
@@ -53,8 +55,8 @@ class Mapping:
         """Voxels held, voxels given up for want of room, points that were no use."""
         return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
 
-    def process(self, odometry: Odometry) -> None:
-        """Takes the points of a pair."""
+    def process(self, odometry: Odometry) -> MapUpdate | None:
+        """Takes the points of a pair, and gives the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
         self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
         if odometry.state == TRACKING:
@@ -62,9 +64,14 @@ class Mapping:
             sure = depth.variance_m2 < self._config.max_sigma_m**2
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])
             self._map.insert(points, depth.variance_m2[sure], odometry.seq)
+        if not self._every_ns or odometry.stamp_ns - self._given_ns < self._every_ns:
+            return None
+        self._given_ns = odometry.stamp_ns
+        return self._update(odometry.seq, odometry.stamp_ns)
 
     def finish(self) -> list[MapUpdate]:
         """The whole map, if there was a pair at all."""
-        if self._newest is None:
-            return []
-        return [MapUpdate(*self._newest, self._map.points(self._config.min_frames), self._path.xy())]
+        return [] if self._newest is None else [self._update(*self._newest)]
+
+    def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
+        return MapUpdate(seq, stamp_ns, self._map.points(self._config.min_frames), self._path.xy())

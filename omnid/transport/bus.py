@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -57,6 +58,14 @@ class Bus:
             )
         except zenoh.ZError as error:
             raise OmnidError(f"bus cannot publish {self._robot}/{key_suffix}: {_reason(error)}; restart") from error
+
+    def subscribe(self, key_suffix: str, take: Callable[[str, bytes], None]) -> None:
+        """Has take(key_suffix, payload) called for whatever comes as `<robot>/<key_suffix>`, in a thread of zenoh's."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            take(key_suffix, sample.payload.to_bytes())
+
+        self._session.declare_subscriber(f"{self._robot}/{key_suffix}", on_sample)
 
     def close(self) -> None:
         """Ends the session; a second call does nothing. A listener that hangs is left alone after zenoh's 10 s."""

@@ -26,6 +26,7 @@ TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
+VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 QUATERNION_TOLERANCE = 1e-3
@@ -56,6 +57,16 @@ class FrameTransform:
     parent: str
     child: str
     T_parent_child: Array  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What one part has to say of itself."""
+
+    name: str
+    level: int  # 0 ok, 1 warning, 2 error, 3 stale
+    message: str
+    values: Mapping[str, str]
 
 
 @cache
@@ -164,13 +175,17 @@ def _packed(points: ArrayLike, confidence: ArrayLike) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.hstack([points, confidence]))
 
 
-def diagnostics_cdr(stamp_ns: int, name: str, level: int, message: str, values: Mapping[str, str]) -> bytes:
-    """A diagnostic_msgs/msg/DiagnosticArray with one status; level 0 ok, 1 warning, 2 error, 3 stale."""
-    if not 0 <= level <= 3:
-        raise OmnidError(f"diagnostic level {level} of {name} is none of 0 ok, 1 warning, 2 error, 3 stale")
-    pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in values.items()]
-    status = ros.diagnostic_msgs__msg__DiagnosticStatus(level, name, message, "", pairs)
-    return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), [status]), DIAGNOSTICS_SCHEMA)
+def diagnostics_cdr(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
+    """A diagnostic_msgs/msg/DiagnosticArray."""
+    entries = [_status(status) for status in statuses]
+    return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA)
+
+
+def _status(status: Status) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
+    if not 0 <= status.level <= 3:
+        raise OmnidError(f"diagnostic level {status.level} of {status.name} is none of 0 ok, 1 warning, 2 error, 3 stale")
+    pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
+    return ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
 
 
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
@@ -179,12 +194,46 @@ def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_rad
     return _cdr(ros.geometry_msgs__msg__TwistStamped(_header(stamp_ns, frame), twist), TWIST_SCHEMA)
 
 
+def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
+    """A geometry_msgs/msg/Vector3Stamped in odom as command: x the speed, z the heading to hold."""
+    vector = _vector((velocity_mps, 0, heading_rad))
+    return _cdr(ros.geometry_msgs__msg__Vector3Stamped(_header(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
+
+
+def twist_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
+    """Stamp [ns], frame, forward speed [m/s] and yaw rate [rad/s] of a TwistStamped, finite or not.
+
+    Any bytes may come: OmnidError unless they are one.
+    """
+    message = _message(payload, TWIST_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
+    return (_loose_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
+            message.twist.angular.z)
+
+
+def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
+    """Stamp [ns], frame, speed [m/s] and heading [rad] of a Vector3Stamped, finite or not; OmnidError unless it is one.
+    """
+    message = _message(payload, VECTOR_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
+    return _loose_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
+
+
+def _message(payload: bytes, schema: str) -> object:
+    try:
+        return _typestore().deserialize_cdr(bytes(payload), schema)
+    except SerdeError as error:
+        raise OmnidError(f"{len(payload)} bytes are no {schema} in CDR ({error}); check the sender") from error
+
+
+def _loose_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    """A stamp that may be senseless: whoever reads it knows how far to trust it."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
 def odometry_from_cdr(payload: bytes) -> OdometryRecord:
     """What an Odometry message says; any bytes may come: OmnidError unless they are one with a finite, rigid pose."""
-    try:
-        message = _typestore().deserialize_cdr(bytes(payload), ODOMETRY_SCHEMA)
-    except SerdeError as error:
-        raise OmnidError(f"{len(payload)} bytes are no {ODOMETRY_SCHEMA} in CDR ({error}); check the sender") from error
+    message = _message(payload, ODOMETRY_SCHEMA)
     assert isinstance(message, ros.nav_msgs__msg__Odometry)
     twist = message.twist.twist
     return OdometryRecord(

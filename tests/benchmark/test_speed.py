@@ -18,8 +18,9 @@ from omnid.graph import Graph
 from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.summary import counters, summary
 from omnid.outputs.tally import Tally
-from omnid.pipeline import Ends, Frames, wire
+from omnid.pipeline import Ends, wire
 from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.pair import PairSync
 from tests.replay.test_memory import to_and_fro
 
 TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"
@@ -44,7 +45,8 @@ def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
     place = geometry(with_rims(rig, frames), config.panorama)
     graph = Graph(threaded=threaded)
     ends = Ends({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
-    wire(graph, Frames(lambda: to_and_fro(frames, PAIRS)), place, config, ends)
+    read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
+    wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)

@@ -18,10 +18,10 @@ from drivers.mcap_reader import LogReader
 from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
 from omnid.core.trajectory import read_tum
-from omnid.graph import Graph
+from omnid.graph import Graph, Stream
 from omnid.messages import Depth, FramePair, Odometry, Panoramas
 from omnid.outputs.tally import Tally
-from omnid.pipeline import Ends, Frames, wire
+from omnid.pipeline import Ends, wire
 from omnid.realtime import Pace
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
@@ -249,6 +249,11 @@ def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:
     assert next(waiting) is apart[1]
 
 
+def paired(graph: Graph, place: Geometry, frames: list[Frame]) -> tuple[PairSync, Stream[FramePair]]:
+    pair = PairSync(place.rig, CONFIG.pair)
+    return pair, graph.stage("pair", pair, graph.source("read", lambda: frames))
+
+
 def test_nobody_waits_for_the_bus(place: Geometry, frames: list[Frame]) -> None:
     """A bus that is slower than the cameras loses messages, and counts them; all poses are made all the same."""
 
@@ -257,7 +262,7 @@ def test_nobody_waits_for_the_bus(place: Geometry, frames: list[Frame]) -> None:
             time.sleep(0.2)
 
     graph, tally = Graph(), Tally()
-    wire(graph, Frames(lambda: frames), place, CONFIG, Ends({"tally": tally}, bus=SlowBus()))
+    wire(graph, paired(graph, place, frames)[1], place, CONFIG, Ends({"tally": tally}, bus=SlowBus()))
     graph.run()
     drops = {stage.name: stage.dropped for stage in graph.telemetry.stages}
     assert tally.poses == PAIRS and drops["bus"] > PAIRS and sum(drops.values()) == drops["bus"]
@@ -273,6 +278,7 @@ def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> 
             poses.append(message)
 
     graph = Graph(threaded=threaded)
-    pair, *_ = wire(graph, Frames(lambda: frames), place, CONFIG, Ends(poses={"keep": Keep()}))
+    pair, pairs = paired(graph, place, frames)
+    wire(graph, pairs, place, CONFIG, Ends(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

@@ -19,8 +19,9 @@ from omnid.graph import Graph
 from omnid.messages import Odometry
 from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.tally import Tally
-from omnid.pipeline import Ends, Frames, wire
+from omnid.pipeline import Ends, wire
 from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.pair import PairSync
 
 PAIRS = 2000
 PERIOD_NS = 100_000_000
@@ -58,7 +59,8 @@ def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
     poses = {"watch": watch, "tally": tally, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
     ends = Ends(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
-    wire(graph, Frames(lambda: to_and_fro(frames, PAIRS)), place, config, ends)
+    read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
+    wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
     graph.run()
     print(tally.states, watch.mib)
     assert tally.poses == PAIRS

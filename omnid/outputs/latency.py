@@ -1,0 +1,21 @@
+"""How old pictures are when something has come of them."""
+
+from __future__ import annotations
+
+import time
+
+from omnid.messages import Odometry
+from omnid.telemetry import Histogram
+
+
+class Latency:
+    """A sink that measures from the capture of a pose's pictures to the pose; for stamps of CLOCK_MONOTONIC."""
+
+    def __init__(self) -> None:
+        self.to_pose = Histogram()
+        self.newest_ns = 0  # capture of the newest pose
+
+    def process(self, odometry: Odometry) -> None:
+        """Takes the time."""
+        self.newest_ns = odometry.stamp_ns
+        self.to_pose.add((time.monotonic_ns() - odometry.stamp_ns) * 1e-9)

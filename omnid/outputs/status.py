@@ -1,0 +1,134 @@
+"""The state of a live daemon as diagnostics: stages, cameras, pairing, odometry, wheels; rates, drops, latencies."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from drivers.v4l2_ledger import CameraState
+from omnid.outputs.helm import Helm
+from omnid.outputs.tally import Tally
+from omnid.stages.live_pair import LivePair
+from omnid.telemetry import Histogram, StageStats, Telemetry
+from omnid.transport.codec import Status
+from omnid.transport.commands import Commands
+
+OK, WARN, ERROR, STALE = range(4)
+WANDERED_NS = 3_000_000  # of the skew of the cameras: their clocks do not run alike
+STATES = {"tracking": OK, "degraded": WARN, "lost": ERROR}
+
+
+class Rates:
+    """Counts per second since the last time of asking."""
+
+    def __init__(self) -> None:
+        self._before: dict[str, int] = {}
+        self._before_s = time.monotonic()
+        self._span_s = math.nan
+
+    def begin(self) -> None:
+        """A new time of asking."""
+        now_s = time.monotonic()
+        self._span_s, self._before_s = now_s - self._before_s, now_s
+
+    def __call__(self, name: str, count: int) -> float:
+        """How much the count of that name has grown per second."""
+        before, self._before[name] = self._before.get(name, 0), count
+        return (count - before) / self._span_s if self._span_s > 0 else math.nan
+
+
+class Watched(NamedTuple):
+    """What a live run is asked about."""
+
+    telemetry: Telemetry
+    cameras: Mapping[str, CameraState]
+    pair: LivePair
+    tally: Tally
+    to_pose: Histogram
+    helm: Helm | None
+    commands: Commands | None
+    tickers: frozenset[str]  # their `dropped` are missed deadlines
+
+
+class StatusReport:
+    """Asks everybody and says it in the words of diagnostic_msgs."""
+
+    def __init__(self, watched: Watched) -> None:
+        self._watched = watched
+        self._rates = Rates()
+
+    def __call__(self) -> list[Status]:
+        """One status for each part."""
+        self._rates.begin()
+        w = self._watched
+        helm = [] if w.helm is None else [self._helm(w.helm, w.commands)]
+        return [self._odometry(), self._pairing(), *self._cameras(), *helm, *map(self._stage, w.telemetry.stages)]
+
+    def _odometry(self) -> Status:
+        tally, newest = self._watched.tally, self._watched.tally.newest
+        if newest is None:
+            return Status("omnid: odometry", STALE, "no pose yet", {})
+        age_s = (time.monotonic_ns() - newest.stamp_ns) * 1e-9
+        stale = age_s > 1.0
+        values = {"rate_hz": f"{self._rates('poses', tally.poses):.1f}", "age_s": f"{age_s:.3f}",
+                  "landmarks": f"{newest.inliers} of {newest.tracks}", "resets": str(newest.reset_counter),
+                  "length_m": f"{tally.length_m:.2f}", **_times("capture_to_pose", self._watched.to_pose)}
+        said = f"no pose for {age_s:.1f} s" if stale else newest.state
+        return Status("omnid: odometry", STALE if stale else STATES[newest.state], said, values)
+
+    def _pairing(self) -> Status:
+        pair = self._watched.pair
+        skew, counts = pair.skew, pair.counts
+        wandered = abs(skew.wandered_ns) > WANDERED_NS
+        values = {name: str(count) for name, count in counts.items()} | {
+            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "most_skew_ms": f"{skew.most_ns * 1e-6:.3f}",
+            "wandered_ms": f"{skew.wandered_ns * 1e-6:.3f}"}
+        said = "the cameras' clocks drift apart: synchronise them" if wandered else "in step"
+        return Status("omnid: pairing", WARN if wandered else OK, said, values)
+
+    def _cameras(self) -> Iterable[Status]:
+        for name, state in self._watched.cameras.items():
+            counts = {key: str(getattr(state, key)) for key in
+                      ("frames", "drops", "errors", "restamped", "restarts", "losses", "reopens")}
+            rate = f"{self._rates(f'{name} frames', state.frames):.1f}"
+            lost = state.status == "lost"
+            yield Status(f"omnid: {name} camera", ERROR if lost else OK, state.problem if lost else state.status,
+                         {"mode": state.mode, "rate_hz": rate, **counts})
+
+    def _helm(self, helm: Helm, commands: Commands | None) -> Status:
+        values = {"sent": str(helm.sent), "errors": str(helm.errors)}
+        values |= {f"stopped, {reason}": str(count) for reason, count in helm.stops.items()}
+        values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
+        if commands is not None:
+            values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
+            values |= {f"refused, {reason}": str(count) for reason, count in commands.refused.items()}
+        return Status("omnid: wheels", OK, helm.reason or "driving", values)
+
+    def _stage(self, stage: StageStats) -> Status:
+        missed = "missed" if stage.name in self._watched.tickers else "dropped"
+        values = {"rate_hz": f"{self._rates(stage.name, stage.processed):.1f}", "processed": str(stage.processed),
+                  missed: str(stage.dropped), **_times("work", stage.wall)}
+        return Status(f"omnid: stage {stage.name}", OK, "", values)
+
+
+def _times(name: str, histogram: Histogram) -> dict[str, str]:
+    """Median, 99th percentile and maximum in ms, once there is one."""
+    if not histogram.count:
+        return {}
+    found = (("p50", histogram.p(0.5)), ("p99", histogram.p(0.99)), ("max", histogram.max_s))
+    return {f"{name}_{which}_ms": f"{1e3 * value_s:.2f}" for which, value_s in found}
+
+
+class StatusTick:
+    """The action of a ticker: makes the report and hands it to whoever wants it."""
+
+    def __init__(self, report: StatusReport, *wants: Callable[[list[Status]], None]) -> None:
+        self._report, self._wants = report, wants
+
+    def __call__(self) -> None:
+        """One report."""
+        statuses = self._report()
+        for want in self._wants:
+            want(statuses)
