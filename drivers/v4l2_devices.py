@@ -101,8 +101,8 @@ def _asked(node: Path) -> tuple[str, str, tuple[Mode, ...]] | None:
 
 
 def _link(root: Path, folder: str, node: Path) -> str:
-    """The name in /dev/v4l/by-path or by-id that leads to the node; with newer udev two do, the older one is stable."""
-    links = sorted((root / "dev/v4l" / folder).glob("*"), key=lambda link: ("-usbv" in link.name, link.name))
+    """The name in /dev/v4l/by-path or by-id that leads to the node; of two, which newer udev gives, the older."""
+    links = sorted((root / "dev/v4l" / folder).glob("*"))  # "-usb-" comes before "-usbv2-"
     return next((_in(root, link) for link in links if link.resolve() == node.resolve()), "")
 
 

@@ -127,9 +127,8 @@ class QueryControl(ctypes.Structure):
 
 
 class QueryMenu(ctypes.Structure):
-    """struct v4l2_querymenu, which is packed; name may be a 64-bit number instead."""
+    """struct v4l2_querymenu; the first 8 bytes of name may be a number instead."""
 
-    _pack_ = 1
     _fields_ = (("id", _u32), ("index", _u32), ("name", ctypes.c_char * 32), ("reserved", _u32))
 
 

@@ -53,6 +53,9 @@ class Mode:
         return f"{self.pixel_format} {self.widths}x{self.heights}" + (f" at {rates} Hz" if rates else "")
 
 
+_ANY_SIZE: Final = (Sizes(1, 16384), Sizes(1, 16384))  # of a driver that tells none: what it gives is looked at
+
+
 def choose(modes: Iterable[Mode], pixel_format: str, size_px: tuple[int, int], rate_hz: float) -> str:
     """The four letters of the format to ask for: the one named, or for "auto" the first of ENCODINGS that fits.
 
@@ -73,7 +76,7 @@ def choose(modes: Iterable[Mode], pixel_format: str, size_px: tuple[int, int], r
 def modes(fd: int) -> list[Mode]:
     """All modes of an open device, in the driver's order."""
     return [Mode(v4l2.fourcc(code), widths, heights, tuple(_rates(fd, code, widths.low, heights.low)))
-            for code in _formats(fd) for widths, heights in _sizes(fd, code)]
+            for code in _formats(fd) for widths, heights in list(_sizes(fd, code)) or [_ANY_SIZE]]
 
 
 def _formats(fd: int) -> Iterator[int]:

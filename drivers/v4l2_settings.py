@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from typing import Final
@@ -45,7 +44,7 @@ class V4l2Settings:
                                 ("buffers", 2, 32), ("timeout_s", 0.05, 60), ("retry_s", 0.05, 60),
                                 ("exposure_us", 0, 10**7), ("gain", -1, 2**31 - 1), ("focus", -1, 2**31 - 1)):
             value = getattr(self, name)
-            self._require(name, math.isfinite(value) and low <= value <= high, f"{low} to {high}")
+            self._require(name, low <= value <= high, f"{low} to {high}")
         self._require("device", self.device.startswith("/"), "a path such as /dev/v4l/by-path/..., see `omnid cameras`")
         for text in self.controls:
             self._require("controls", re.fullmatch(r"\w+ *= *-?\d{1,10}", text) is not None, "entries such as 'gain=3'")

@@ -41,7 +41,11 @@ BUILD_TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "depmod": "kmo
 
 
 class NoImage(Exception):  # noqa: N818 - it is told of the image, not of the program
-    """The image is not there and cannot be built; the message says what to install or to run."""
+    """The image is not there and cannot be built here; the message says what to install or to run."""
+
+
+class BuildFailed(Exception):  # noqa: N818 - as above
+    """A step of the build went wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +96,9 @@ def pinned() -> list[str]:
 
 def kernel_package() -> str:
     """The package that linux-image-amd64 stands for today, or the one that is cached where apt cannot say."""
-    found = subprocess.run(["apt-cache", "depends", "linux-image-amd64"], capture_output=True, text=True, check=False)
-    names = re.findall(r"Depends: (linux-image-[\w.-]+)", found.stdout)
-    names += sorted(f"linux-image-{path.parent.name[:-9]}" for path in cache_folder().glob("*/root.ext4"))
+    known = _run("apt-cache", "depends", "linux-image-amd64", check=False) if shutil.which("apt-cache") else ""
+    names = re.findall(r"Depends: (linux-image-[\w.-]+)", known)
+    names += [f"linux-image-{path.parent.name.rpartition('-')[0]}" for path in cache_folder().glob("*/root.ext4")]
     if not names:
         raise NoImage("apt knows no linux-image-amd64: run `apt-get update` on a Debian machine")
     return names[0]
@@ -217,7 +221,7 @@ def _unpacked(kernel: bytes) -> bytes:
     """The ELF file within a bzImage, which QEMU starts by its PVH entry."""
     elf = lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(kernel[kernel.index(b"\xfd7zXZ\0") :])
     if not elf.startswith(b"\x7fELF"):
-        raise NoImage("the kernel is not packed by xz as Debian's is")
+        raise BuildFailed("the kernel is not packed by xz as Debian's is")
     return elf
 
 
@@ -225,7 +229,7 @@ def _run(*command: object, cwd: Path | None = None, check: bool = True) -> str:
     words = [str(word) for word in command]
     done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
     if check and done.returncode:
-        raise NoImage(f"{' '.join(words)[:200]} ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+        raise BuildFailed(f"{' '.join(words)[:200]} ended with {done.returncode}: {done.stderr.strip()[-500:]}")
     return done.stdout
 
 

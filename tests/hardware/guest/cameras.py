@@ -26,12 +26,12 @@ from drivers.frame import Frame, gray
 from drivers.v4l2_camera import V4l2Camera
 from drivers.v4l2_devices import RULES_FILE, capture_devices, udev_rules
 from drivers.v4l2_settings import V4l2Settings
+from tests.hardware.guest.loopback import DEVICES, Loopback, load_loopback
 
 SIZE = 320, 180
 RATE_HZ = 10.0
 LIMIT_S = 40.0
 LOWER, UPPER = "/dev/omnid/lower", "/dev/omnid/upper"
-LOOPBACKS = "/dev/video10", "/dev/video11"
 BIND = Path("/sys/bus/platform/drivers/vivid")
 DROPS, DISCONNECT, FLAG_ERROR, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F042, 0xF0F046  # vivid's own controls
 GAIN = 0x980913
@@ -112,16 +112,10 @@ class Watched:
 
 
 class Writer:
-    """Writes pictures into a loopback camera, as a webcam would send them."""
+    """Shows a picture on a loopback camera over and over, as a webcam would."""
 
-    def __init__(self, device: str, picture: bytes, pixel_format: str = "GREY", size: tuple[int, int] = SIZE) -> None:
-        self._fd = os.open(device, os.O_RDWR)
-        asked = v4l2.Format(type=2)  # V4L2_BUF_TYPE_VIDEO_OUTPUT
-        pix = asked.fmt.pix
-        pix.width, pix.height, pix.pixelformat, pix.field = *size, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
-        pix.sizeimage = max(len(picture), size[0] * size[1])
-        v4l2.call(self._fd, v4l2.S_FMT, asked)
-        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Number(2))  # else the device never notices that its writer has gone
+    def __init__(self, device: str, picture: bytes, pixel_format: str = "GREY") -> None:
+        self._loopback = Loopback(device, pixel_format, SIZE)
         self._picture, self._halt = picture, threading.Event()
         self.pausing = False
         self._thread = threading.Thread(target=self._write, daemon=True)
@@ -129,17 +123,17 @@ class Writer:
     def _write(self) -> None:
         while not self._halt.wait(1 / RATE_HZ):
             if not self.pausing:
-                os.write(self._fd, self._picture)
+                self._loopback.write(self._picture)
 
     def __enter__(self) -> Writer:
-        os.write(self._fd, self._picture)
+        self._loopback.write(self._picture)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._halt.set()
         self._thread.join()
-        os.close(self._fd)
+        self._loopback.close()
 
 
 @pytest.fixture(scope="session")
@@ -171,9 +165,7 @@ def vivid(rules: Path) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def loopback() -> None:
-    run("modprobe", "v4l2loopback", "devices=2", "video_nr=10,11", "card_label=omni-lower,omni-upper",
-        "exclusive_caps=1,1", "max_buffers=4")
-    run("udevadm", "settle")
+    load_loopback()
 
 
 @pytest.fixture(autouse=True)
@@ -187,9 +179,9 @@ def no_file_stays_open() -> Iterator[None]:
 
 def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
     picture = bytes(SIZE[0] * SIZE[1])
-    with Writer(LOOPBACKS[0], picture), Writer(LOOPBACKS[1], picture):
+    with Writer(DEVICES[0], picture), Writer(DEVICES[1], picture):
         real = [Watched(LOWER), Watched(UPPER)]
-        looped = [Watched(device, controls=()) for device in LOOPBACKS]
+        looped = [Watched(device, controls=()) for device in DEVICES]
         with real[0], real[1], looped[0], looped[1]:
             until(lambda: all(len(watched.taken) >= 20 for watched in real + looped))
     for watched in real + looped:
@@ -280,7 +272,7 @@ def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
 
 
 def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
-    device, picture = LOOPBACKS[0], bytes(SIZE[0] * SIZE[1])
+    device, picture = DEVICES[0], bytes(SIZE[0] * SIZE[1])
     with Writer(device, picture) as writer:
         watched = Watched(device, controls=(), timeout_s=1.0)
         with watched:
@@ -296,7 +288,7 @@ def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
 
 
 def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
-    device, picture = LOOPBACKS[1], bytes(SIZE[0] * SIZE[1])
+    device, picture = DEVICES[1], bytes(SIZE[0] * SIZE[1])
     with Writer(device, picture):
         watched = Watched(device, controls=(), timeout_s=1.0)
         watched.thread.start()
@@ -312,7 +304,7 @@ def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
 def test_motion_jpeg_arrives_whole(loopback: None) -> None:
     picture = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
     jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
-    with Writer(LOOPBACKS[0], jpeg, "MJPG"), Watched(LOOPBACKS[0], controls=(), pixel_format="auto") as watched:
+    with Writer(DEVICES[0], jpeg, "MJPG"), Watched(DEVICES[0], controls=(), pixel_format="auto") as watched:
         watched.more(5)
     assert watched.last and watched.last.encoding == "jpeg"
     assert np.abs(gray(watched.last).astype(int) - picture).max() < 12
@@ -369,11 +361,11 @@ def test_a_device_is_had_by_one_alone(vivid: None) -> None:
 
 def test_an_output_is_no_camera(loopback: None) -> None:
     with pytest.raises(DriverError, match="is no capture device now"):
-        Watched(LOOPBACKS[0], controls=())
+        Watched(DEVICES[0], controls=())
 
 
 def test_close_ends_a_wait_and_may_come_at_any_time(vivid: None, loopback: None) -> None:
-    device, picture = LOOPBACKS[0], bytes(SIZE[0] * SIZE[1])
+    device, picture = DEVICES[0], bytes(SIZE[0] * SIZE[1])
     with Writer(device, picture) as writer, Watched(device, controls=(), timeout_s=60.0) as watched:
         watched.more(1)
         writer.pausing = True

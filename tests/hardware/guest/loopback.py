@@ -1,0 +1,38 @@
+"""Pictures of our own as the pictures of a camera, by v4l2loopback; for scripts in a guest."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+from drivers import v4l2_ioctl as v4l2
+
+DEVICES = "/dev/video10", "/dev/video11"
+OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT
+
+
+def load_loopback() -> None:
+    """Two loopback cameras; more than 4 buffers have been seen to crash the kernel when the reader asks for 4."""
+    subprocess.run(["modprobe", "v4l2loopback", "devices=2", "video_nr=10,11", "card_label=omni-lower,omni-upper",
+                    "exclusive_caps=1,1", "max_buffers=4"], check=True)
+    subprocess.run(["udevadm", "settle"], check=True)
+
+
+class Loopback:
+    """The inner end of a loopback camera, which is a camera from the first picture until it is closed."""
+
+    def __init__(self, device: str, pixel_format: str, size_px: tuple[int, int]) -> None:
+        self._fd = os.open(device, os.O_RDWR)
+        asked = v4l2.Format(type=OUTPUT)
+        pix = asked.fmt.pix
+        pix.width, pix.height, pix.pixelformat, pix.field = *size_px, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
+        v4l2.call(self._fd, v4l2.S_FMT, asked)
+        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Number(OUTPUT))  # else its writer is never seen to go
+
+    def write(self, picture: bytes) -> None:
+        """Shows the picture; the kernel stamps it now."""
+        os.write(self._fd, picture)
+
+    def close(self) -> None:
+        """Pulls the plug, as far as a reader can tell: pictures stop."""
+        os.close(self._fd)
