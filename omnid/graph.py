@@ -48,10 +48,12 @@ class _Inbox:
                 self._messages.popleft()
                 self._stats.dropped += 1
             self._messages.append(message)
+            self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
             self._changed.notify_all()
 
     def get(self) -> object:
         with self._changed:
+            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0  # what was in hand is finished
             self._changed.wait_for(lambda: self._closed or self._messages or not self._writers)
             if not self._messages:
                 return END
@@ -69,6 +71,7 @@ class _Inbox:
             self._closed = True
             self._stats.dropped += len(self._messages)
             self._messages.clear()
+            self._stats.busy_since_ns = 0
             self._changed.notify_all()
 
 
@@ -97,7 +100,9 @@ class Ticker:
         while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
             skipped = skipped_deadlines(deadline_ns, time.monotonic_ns(), self._period_ns)
             self.stats.dropped += skipped
+            self.stats.busy_since_ns = time.monotonic_ns()
             self.stats.timed(self._action)
+            self.stats.busy_since_ns = 0
             deadline_ns += (1 + skipped) * self._period_ns
 
     def close(self) -> None:
@@ -114,11 +119,19 @@ class Graph:
     """The wiring of one run, and the run itself.
 
     `policy` holds for all inboxes, a sink may overrule it; `depth` is an inbox's room for messages of each input.
+    `on_thread` is called with the name of each thread, in it, before its work; it must not raise.
     """
 
-    def __init__(self, *, policy: Policy = LOSSLESS, threaded: bool = True, depth: int = 2) -> None:
+    def __init__(
+        self,
+        *,
+        policy: Policy = LOSSLESS,
+        threaded: bool = True,
+        depth: int = 2,
+        on_thread: Callable[[str], object] = nothing,
+    ) -> None:
         self.telemetry = Telemetry()
-        self._policy, self._threaded, self._depth = policy, threaded, depth
+        self._policy, self._threaded, self._depth, self._on_thread = policy, threaded, depth, on_thread
         self._sources: list[Source] = []
         self._inboxes: list[_Inbox] = []
         self._tickers: list[Ticker] = []
@@ -217,6 +230,7 @@ class Graph:
 
     def _thread(self, name: str, body: Callable[..., None], *args: object) -> None:
         def run() -> None:
+            self._on_thread(name)
             body(*args)
             self._ended.add(name)
             self._bell.put(None)
@@ -269,6 +283,7 @@ class Graph:
                 turns.append(source)
 
     def _beat(self, ticker: Ticker) -> None:
+        self._on_thread(ticker.name)
         self._succeeds(ticker.name, ticker.run, lambda: self._stopping)
         self._succeeds(ticker.name, ticker.close)
 

@@ -1,34 +1,137 @@
-"""A log at the pace at which it was recorded."""
+"""What the live daemon asks of the kernel and of Python so that its deadlines hold, and what it was refused.
+
+Only threads that mostly wait become SCHED_FIFO, never the process: a FIFO thread that runs on keeps its core from
+everybody else. Three things guard against one: threads it starts are ordinary ones again (SCHED_RESET_ON_FORK), the
+kernel ends the daemon when one runs for too long without a wait (RLIMIT_RTTIME, SIGXCPU), and by default it leaves
+5 % of each second to the others (sched_rt_runtime_us). A FIFO thread still waits for Python's lock, up to the switch
+interval, which is therefore short.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator
+import ctypes
+import gc
+import os
+import resource
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
 
-from drivers.frame import Frame
+import cv2
 
-_NAP_S = 0.05
+from omnid.config import RealtimeConfig
+from omnid.journal import WARNING, say
+
+CAP_IPC_LOCK: Final = 14
+CAP_SYS_NICE: Final = 23
+_PR_SET_NAME: Final = 15
+_NAME_BYTES: Final = 15
+_EVERYTHING: Final = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, without which untouched stacks take 400 MB
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
-class Pace:
-    """Frames no earlier than their stamps say, counted from the first; `wake` ends all waiting."""
+def prepare(config: RealtimeConfig, opencv_threads: int) -> list[str]:
+    """Settles the process once all is wired, before the graph runs; gives a line for each thing that was refused."""
+    cv2.setNumThreads(opencv_threads)
+    if config.switch_interval_ms > 0:
+        sys.setswitchinterval(config.switch_interval_ms * 1e-3)
+    if config.freeze_gc:
+        gc.collect()
+        gc.freeze()
+    limit_runs(config.longest_run_ms)
+    refused = lock_memory() if config.lock_memory else ""
+    return [refused] if refused else []
 
-    def __init__(self) -> None:
-        self._awake = False
 
-    def wake(self) -> None:
-        """Nobody waits any more."""
-        self._awake = True
+class ThreadStart:
+    """What each thread of the graph does first: tells the kernel its name, and asks for its priority.
 
-    def frames(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The same frames in time."""
-        offset_ns: int | None = None
-        for frame in frames:
-            if offset_ns is None:
-                offset_ns = time.monotonic_ns() - frame.stamp_ns
-            self._wait(frame.stamp_ns + offset_ns)
-            yield frame
+    Called in the thread itself. A refusal is said once for all threads: they go on as ordinary ones.
+    """
 
-    def _wait(self, until_ns: int) -> None:
-        while not self._awake and (left_s := (until_ns - time.monotonic_ns()) * 1e-9) > 0:
-            time.sleep(min(left_s, _NAP_S))
+    def __init__(self, priorities: Mapping[str, int], report: Callable[[int, str], object] = say) -> None:
+        """priorities: of SCHED_FIFO by thread, 1 to 99; 0, or no entry, is an ordinary thread."""
+        self._priorities, self._report = dict(priorities), report
+        self.refused = False
+
+    def __call__(self, name: str) -> None:
+        """Names and raises the calling thread."""
+        name_thread(name)
+        priority = self._priorities.get(name, 0)
+        if priority and not raise_thread(priority) and not self.refused:
+            self.refused = True
+            self._report(WARNING, f"thread '{name}' cannot have real-time priority {priority}, nor can others: "
+                         f"{priority_advice(max(self._priorities.values()))}")
+
+
+def priorities(config: RealtimeConfig, motor: str, *captures: str) -> dict[str, int]:
+    """The priorities by thread, for ThreadStart: the motor's tick comes before the pictures."""
+    return {name: config.capture_priority for name in captures} | {motor: config.motor_priority}
+
+
+def raise_thread(priority: int) -> bool:
+    """Makes the calling thread SCHED_FIFO; False where that is not allowed."""
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))  # 0: this thread
+        return True
+    return False
+
+
+def name_thread(name: str) -> None:
+    """Names the calling thread for the kernel, as `top -H` shows it, by the first 15 bytes."""
+    _LIBC.prctl(_PR_SET_NAME, name.encode()[:_NAME_BYTES], 0, 0, 0)
+
+
+def limit_runs(longest_ms: int) -> None:
+    """Has the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs so long without a wait; 0: never.
+
+    Where whoever started us allows less, that holds.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
+    wanted = longest_ms * 1000 if longest_ms else hard
+    if hard == resource.RLIM_INFINITY or wanted <= hard:
+        resource.setrlimit(resource.RLIMIT_RTTIME, (wanted, hard))
+
+
+def lock_memory() -> str:
+    """Keeps all memory from being swapped out, now and later; why not, or "".
+
+    Under a limit nothing is locked: what is allocated beyond it would fail.
+    """
+    if not may_lock():
+        return f"memory is not locked, it may be swapped out: {LOCK_ADVICE}"
+    if _LIBC.mlockall(_EVERYTHING) != 0:
+        return f"memory is not locked, it may be swapped out: {os.strerror(ctypes.get_errno())}; {LOCK_ADVICE}"
+    return ""
+
+
+def may_lock() -> bool:
+    """Whether this process may lock any amount of memory."""
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or has_capability(CAP_IPC_LOCK)
+
+
+def highest_priority() -> int:
+    """The highest real-time priority this process may give its threads; 0: none."""
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    return 99 if has_capability(CAP_SYS_NICE) or limit == resource.RLIM_INFINITY else limit
+
+
+def has_capability(number: int) -> bool:
+    """Whether this process has the capability in effect; False where /proc is not there."""
+    with suppress(OSError, ValueError):
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+        words = next(line.split() for line in status.splitlines() if line.startswith("CapEff:"))
+        return bool(int(words[1], 16) >> number & 1)
+    return False
+
+
+LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
+                      "realtime.lock_memory = false")
+
+
+def priority_advice(priority: int) -> str:
+    """How to be allowed a real-time priority."""
+    return (f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
+            "realtime.motor_priority = 0 and realtime.capture_priority = 0")

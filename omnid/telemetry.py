@@ -73,11 +73,14 @@ class StageStats:
     """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
 
     A source's durations are the waits for its next message; a ticker's `dropped` are missed deadlines.
+    `busy_since_ns` (CLOCK_MONOTONIC) tells whoever watches from when on a message waits or is in hand and none has been
+    finished; 0 when there is nothing to do. Only readers that have an inbox, and tickers, tell it.
     """
 
     name: str
     processed: int = 0
     dropped: int = 0
+    busy_since_ns: int = 0
     wall: Histogram = field(default_factory=Histogram)
     cpu: Histogram = field(default_factory=Histogram)  # of the calling thread only
 

@@ -1,0 +1,34 @@
+"""A log at the pace at which it was recorded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+
+from drivers.frame import Frame
+
+_NAP_S = 0.05
+
+
+class Pace:
+    """Frames no earlier than their stamps say, counted from the first; `wake` ends all waiting."""
+
+    def __init__(self) -> None:
+        self._awake = False
+
+    def wake(self) -> None:
+        """Nobody waits any more."""
+        self._awake = True
+
+    def frames(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The same frames in time."""
+        offset_ns: int | None = None
+        for frame in frames:
+            if offset_ns is None:
+                offset_ns = time.monotonic_ns() - frame.stamp_ns
+            self._wait(frame.stamp_ns + offset_ns)
+            yield frame
+
+    def _wait(self, until_ns: int) -> None:
+        while not self._awake and (left_s := (until_ns - time.monotonic_ns()) * 1e-9) > 0:
+            time.sleep(min(left_s, _NAP_S))
