@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -15,19 +16,23 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.errors import DriverError
+from drivers.file_lock import hold
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
 _MAX_CHANNELS = 4096
-_FLUSH_NS = 10**9
+_FLUSH_NS = 5 * 10**8
 
 
 class LogWriter:
-    """Writes a log that loses at most the last chunk, or second of stamps, when the program dies.
+    """Writes a log that loses at most the last chunk, or half a second of stamps, when the program dies.
 
     attachments (name -> bytes) come first in the file, so they survive a crash. compression: lz4 or none; pictures that
-    are JPEG already gain nothing by it. An existing file is replaced. Raises DriverError where the file cannot be made
-    or written (a full disk), and for a message type that ROS 2 does not know.
+    are JPEG already gain nothing by it. An existing file is replaced, unless exclusive. Until its end the file is
+    locked. Raises DriverError where the file cannot be made or written (a full disk), and for a message type that
+    ROS 2 does not know.
+
+    messages: how many the file was given; kept: how many of them would survive the program now.
     """
 
     def __init__(
@@ -37,11 +42,14 @@ class LogWriter:
         chunk_bytes: int = 256 * 1024,
         *,
         compression: Literal["lz4", "none"] = "lz4",
+        exclusive: bool = False,
     ) -> None:
         self._path = Path(path)
+        self.messages = self.kept = 0
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
-        self._file = self._open()
+        self._file = self._open("xb" if exclusive else "wb")
+        hold(self._file)
         self._usable = True
         self._flushed_bytes = 0
         self._flushed_ns: int | None = None
@@ -49,6 +57,7 @@ class LogWriter:
             self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
             self._writer.start("ros2", "omnid")
             self._attach(attachments or {})
+            self._flushed_bytes = self._file.tell()
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Adds a message, CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry, at its stamp."""
@@ -56,11 +65,31 @@ class LogWriter:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
         with self._guarded():
             channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
+            self.messages += 1
             self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns)
             self._flush_when_due(stamp_ns)
 
+    @property
+    def usable(self) -> bool:
+        """Whether it can be written to: neither closed nor failed."""
+        return self._usable
+
+    @property
+    def size_bytes(self) -> int:
+        """How long the file is without the chunk at hand."""
+        return self._flushed_bytes
+
+    def sync(self) -> None:
+        """Ends the chunk and brings all to the disk; DriverError where the file has been deleted meanwhile as well."""
+        with self._guarded():
+            self._flush()
+            self._reach_disk()
+
     def close(self) -> None:
-        """Writes the index, which makes the file whole, and brings it to the disk; may be called twice."""
+        """Writes the index, which makes the file whole, and brings it to the disk; may be called twice.
+
+        DriverError where that fails, or where the file has been deleted meanwhile.
+        """
         if self._file.closed:
             return
         try:
@@ -78,9 +107,9 @@ class LogWriter:
     ) -> None:
         self.close()
 
-    def _open(self) -> IO[bytes]:
+    def _open(self, mode: Literal["wb", "xb"]) -> IO[bytes]:
         try:
-            return self._path.open("wb")
+            return self._path.open(mode)
         except OSError as error:
             raise DriverError(
                 f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
@@ -125,20 +154,35 @@ class LogWriter:
         return channel
 
     def _flush_when_due(self, stamp_ns: int) -> None:
-        """Ends the chunk after a second of stamps, and hands ended chunks to the kernel at once."""
+        """Ends the chunk after half a second of stamps, and hands ended chunks to the kernel at once."""
         if self._flushed_ns is None:
             self._flushed_ns = stamp_ns
         if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
             self._flushed_ns = stamp_ns
-            self._writer.flush()  # type: ignore[no-untyped-call]
-        elif (written := self._file.tell()) != self._flushed_bytes:
-            self._flushed_bytes = written
+            self._flush()
+        elif self._file.tell() != self._flushed_bytes:
             self._file.flush()
+            self._note_kept()
+
+    def _flush(self) -> None:
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._note_kept()
+
+    def _note_kept(self) -> None:
+        self._flushed_bytes = self._file.tell()
+        self.kept = self.messages
 
     def _finish(self) -> None:
+        self._flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
+        self._reach_disk()
+
+    def _reach_disk(self) -> None:
         os.fsync(self._file.fileno())
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            self.kept = 0
+            raise FileNotFoundError(errno.ENOENT, "the file has been deleted")
 
 
 _typestore = cache(get_typestore)

@@ -1,0 +1,29 @@
+"""Whether a program is writing a file at this moment: it holds an advisory lock, which its death gives back."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+
+def hold(file: IO[bytes]) -> None:
+    """Marks the open file as being written until it is closed; without effect where the file system has no locks."""
+    with suppress(OSError):
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_held(path: str | os.PathLike[str]) -> bool:
+    """Whether somebody writes the file, this program included; false where it cannot be opened."""
+    if not Path(path).is_file():
+        return False
+    try:
+        with open(path, "rb") as file:
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False

@@ -1,0 +1,309 @@
+"""Recordings of limited size and age, on disks that fill up, fail and vanish."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from drivers.errors import DriverError
+from drivers.file_lock import is_held
+from drivers.log_folder import LogFolder, Rotation
+from drivers.mcap_catalog import Catalog
+from drivers.mcap_messages import DataSection
+from drivers.mcap_records import LogFile
+from drivers.mcap_writer import LogWriter
+from drivers.rotating_log import NOTICE, WARNING, RotatingLog
+from tests.drivers.mcap_logs import COMPRESSED, LOWER, START_NS, picture
+
+ROOT = Path(__file__).parents[2]
+RIG = {"rig.toml": b"version = 1"}
+ROOMY = Rotation(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0, retry_s=0.5)
+TICK_NS = 33_333_333
+
+
+class Heard(list[tuple[int, str]]):
+    """Reports, in order."""
+
+    def __call__(self, severity: int, text: str) -> None:
+        self.append((severity, text))
+
+
+class Bench:
+    """A recording of noise that no compression makes smaller, at 30 messages a second of stamps."""
+
+    def __init__(self, folder: Path, rotation: Rotation, name: str = "robot") -> None:
+        self.folder, self.heard = folder, Heard()
+        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, report=self.heard)
+        self.state, self._count = self.log.state, 0
+
+    def write(self, count: int, size: int = 1000) -> None:
+        for _ in range(count):
+            self.log.write(LOWER, COMPRESSED, os.urandom(size), START_NS + self._count * TICK_NS)
+            self._count += 1
+
+    def names(self) -> list[str]:
+        return sorted(path.name for path in self.folder.iterdir())
+
+
+def counted(path: Path) -> int:
+    with path.open("rb") as file:
+        summary = make_reader(file, validate_crcs=True).get_summary()
+    assert summary is not None and summary.statistics is not None
+    return summary.statistics.message_count
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    """Makes benches in the test's own folder."""
+    benches: list[Bench] = []
+
+    def make(rotation: Rotation = ROOMY, name: str = "robot", folder: Path = tmp_path / "log") -> Bench:
+        benches.append(Bench(folder, rotation, name))
+        return benches[-1]
+
+    yield make
+    for each in benches:
+        each.log.close()
+
+
+def test_a_file_is_part_until_it_is_whole(bench: Callable[..., Bench]) -> None:
+    recording = bench()
+    recording.write(30)
+    assert recording.names() == ["robot_20231114T221320Z_001.mcap.part"]
+    assert is_held(recording.state.file)
+    recording.log.close()
+    recording.log.close()
+    recording.write(1)
+    (path,) = recording.folder.iterdir()
+    assert path.name == "robot_20231114T221320Z_001.mcap" and counted(path) == 30 and not is_held(path)
+    assert (recording.state.status, recording.state.messages, recording.state.lost) == ("closed", 31, 1)
+
+
+@pytest.mark.parametrize("rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)],
+                         ids=["size", "age"])
+def test_a_new_file_is_begun_by_size_and_by_age(bench: Callable[..., Bench], rotation: Rotation) -> None:
+    recording = bench(rotation)
+    recording.write(200, size=10_000)
+    recording.log.close()
+    files = sorted(recording.folder.iterdir())
+    counts = [counted(file) for file in files]
+    assert len(files) == recording.state.files == 4 and sum(counts) == 200
+    assert all(45 <= count <= 80 for count in counts[:-1])
+    for file in files:  # each can be replayed alone
+        with file.open("rb") as opened:
+            assert [a.name for a in make_reader(opened).iter_attachments()] == ["rig.toml"]
+
+
+def test_the_oldest_files_are_deleted_and_counted(bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, file_s=1.0, keep_files=3))
+    strangers = ["notes.txt", "robot_20200101T000000Z_001.mcap.bak", "other_20200101T000000Z_001.mcap"]
+    recording.folder.mkdir()
+    for name in strangers:
+        (recording.folder / name).write_bytes(b"mine")
+    left_by_a_crash = recording.folder / "robot_20200101T000000Z_001.mcap.part"
+    left_by_a_crash.write_bytes(b"cut")
+    recording.write(300)
+    recording.log.close()
+    names = recording.names()
+    assert set(strangers) < set(names) and left_by_a_crash.name not in names
+    assert [name[-8:] for name in names if name not in strangers] == ["008.mcap", "009.mcap", "010.mcap"]
+    assert recording.state.deleted == 8 and recording.state.lost == 0
+
+
+def test_all_files_together_stay_within_their_size(bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, file_bytes=300_000, keep_bytes=1_000_000))
+    sizes = []
+    for _ in range(60):
+        recording.write(5, size=10_000)
+        sizes.append(sum(path.stat().st_size for path in recording.folder.iterdir()))
+    assert max(sizes) <= 1_000_000 + 256 * 1024 and recording.state.deleted > 3  # one chunk beyond the file's size
+
+
+def test_two_daemons_in_one_folder_leave_each_other_alone(bench: Callable[..., Bench]) -> None:
+    few = replace(ROOMY, file_s=1.0, keep_files=1)
+    one, other = bench(few), bench(few)
+    for _ in range(20):
+        one.write(20)
+        other.write(20)
+    one.log.close()
+    other.log.close()
+    assert one.state.lost == other.state.lost == 0 and not one.heard and not other.heard
+    files = list(one.folder.iterdir())
+    assert len(files) + one.state.deleted + other.state.deleted == one.state.files + other.state.files >= 26
+    assert all(file.suffix == ".mcap" and counted(file) for file in files)
+
+
+def test_a_message_that_is_none_is_refused_and_leaves_the_file_alone(bench: Callable[..., Bench]) -> None:
+    recording = bench()
+    recording.write(1)
+    for schema, stamp_ns in (("no/msg/Such", START_NS), (COMPRESSED, -1), (COMPRESSED, 2**64)):
+        recording.log.write(LOWER, schema, b"", stamp_ns)
+    recording.write(1)
+    recording.log.close()
+    assert (recording.state.refused, recording.state.lost, recording.state.files) == (3, 0, 1)
+    assert len(recording.heard) == 1 and "no/msg/Such" in recording.heard[0][1]
+    assert counted(next(recording.folder.iterdir())) == 2
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 3 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(disk)]
+    made = subprocess.run(command, capture_output=True, check=False)
+    if made.returncode:
+        pytest.skip("only root can mount a small file system")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """A file of somebody else's that takes all there is."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as file, suppress(OSError):
+        while file.write(bytes(4096)):
+            pass
+    return ballast
+
+
+def try_again(recording: Bench) -> None:
+    """Writes until it works, a message each time."""
+    deadline_s = time.monotonic() + 20
+    while recording.state.status == "stopped":
+        assert time.monotonic() < deadline_s, recording.state
+        recording.write(1)
+        time.sleep(0.01)
+
+
+def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, file_bytes=10**6), folder=small_disk / "log")
+    recording.write(40, size=10_000)
+    ballast = fill(small_disk)
+    recording.write(300, size=10_000)
+    assert recording.state.status == "stopped" and "No space left" in recording.heard[0][1]
+    assert [severity for severity, _ in recording.heard] == [WARNING] and recording.names() == [
+        "robot_20231114T221320Z_001.mcap.part"]  # what was saved until then, and no more than that
+    lost = recording.state.lost
+    time.sleep(1.1)
+    recording.write(10)  # tried again in vain, and not said again
+    assert recording.state.lost == lost + 10 and len(recording.heard) == 1
+    ballast.unlink()
+    try_again(recording)
+    recording.write(50, size=10_000)
+    recording.log.close()
+    assert [severity for severity, _ in recording.heard] == [WARNING, NOTICE]
+    assert recording.heard[1][1].endswith(f"; {recording.state.lost} messages were lost")
+    whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
+    saved = len(list(DataSection(LogFile(recording.folder / recording.names()[0]), Catalog()).messages()))
+    assert saved >= 25 and whole >= 50 and recording.state.stops == 1
+    assert recording.state.messages == saved + whole + recording.state.lost
+
+
+def test_what_is_to_be_left_free_stays_free_and_the_file_is_whole(
+    small_disk: Path, bench: Callable[..., Bench]
+) -> None:
+    rotation = replace(ROOMY, file_bytes=2 * 10**6, free_bytes=10**6, sync_s=0.0)
+    recording = bench(rotation, folder=small_disk / "log")
+    recording.write(20, size=10_000)
+    (small_disk / "ballast").write_bytes(bytes(1_200_000))
+    recording.write(300, size=10_000)
+    disk = os.statvfs(small_disk)
+    assert 700_000 < disk.f_bavail * disk.f_frsize <= 10**6
+    assert recording.state.status == "stopped" and "make room" in recording.state.problem
+    assert len(recording.heard) == 1 and "MB are free" in recording.heard[0][1]
+    assert sum(map(counted, recording.folder.iterdir())) + recording.state.lost == 320
+
+
+def test_a_file_that_may_not_grow_costs_no_more_than_what_is_beyond(tmp_path: Path) -> None:
+    """Without any right to mount: the kernel refuses files over 300 kB."""
+    program = """
+import resource, signal, sys
+from pathlib import Path
+from dataclasses import replace
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+from tests.drivers.test_rotating_log import Bench, ROOMY
+recording = Bench(Path(sys.argv[1]), ROOMY)
+recording.write(200, size=10_000)
+state = recording.state
+print(state.status, state.messages, state.lost, state.stops, len(recording.heard), len(recording.names()))
+"""
+    command = [sys.executable, "-c", program, str(tmp_path / "log")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    status, *numbers = done.stdout.split()
+    messages, lost, stops, reports, files = map(int, numbers)
+    assert (status, messages, stops, reports, files) == ("stopped", 200, 1, 1, 1) and 170 <= lost < 200
+    saved = len(list(DataSection(LogFile(next((tmp_path / "log").iterdir())), Catalog()).messages()))
+    assert saved == messages - lost > 0
+
+
+def test_a_folder_that_vanishes_is_noticed_and_its_return_too(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    stick = tmp_path / "stick"
+    stick.mkdir()
+    recording = bench(replace(ROOMY, sync_s=0.0), folder=stick / "log")
+    recording.write(30)
+    shutil.rmtree(stick)
+    recording.write(30)
+    assert recording.state.status == "stopped" and recording.state.lost == 60
+    assert len(recording.heard) == 1 and "deleted" in recording.heard[0][1]
+    stick.mkdir()
+    try_again(recording)
+    recording.log.close()
+    assert [severity for severity, _ in recording.heard] == [WARNING, NOTICE]
+    assert counted(next(recording.folder.iterdir())) == recording.state.messages - recording.state.lost > 0
+
+
+@pytest.mark.parametrize("path", ["missing/log", "file", "file/log", "x" * 300])
+def test_a_folder_that_cannot_be_had_is_told_once(bench: Callable[..., Bench], tmp_path: Path, path: str) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    recording = bench(folder=tmp_path / path)
+    recording.write(100)
+    recording.log.close()
+    assert (recording.state.lost, recording.state.stops, len(recording.heard)) == (100, 1, 1)
+    assert str(tmp_path / path) in recording.heard[0][1] and "\n" not in recording.heard[0][1]
+
+
+@pytest.mark.parametrize("name", ["a/b", "ü n/../..", "-", "%s\0\n"])
+def test_no_name_leaves_the_folder(bench: Callable[..., Bench], name: str) -> None:
+    recording = bench(name=name)
+    recording.write(3)
+    recording.log.close()
+    (file,) = recording.folder.iterdir()
+    assert counted(file) == 3 and file.name.isprintable()
+
+
+def test_the_memory_does_not_grow_with_the_recording(bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, file_bytes=10**7, keep_files=1))
+    recording.write(10, size=100_000)
+    tracemalloc.start()
+    try:
+        recording.write(500, size=100_000)
+        assert tracemalloc.get_traced_memory()[1] < 4 * 2**20 and recording.state.files >= 5
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_survives_is_counted_at_every_moment(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path, chunk_bytes=3000) as log:
+        for n in range(100):
+            log.write(*picture(LOWER, START_NS + n * TICK_NS))
+            kept = len(list(DataSection(LogFile(path), Catalog()).messages()))
+            assert log.kept == kept and log.messages == n + 1
+        assert n - log.kept < 15 and log.size_bytes == path.stat().st_size
+        log.sync()
+        assert log.kept == 100
+    with pytest.raises(DriverError, match="File exists"):
+        LogWriter(path, exclusive=True)
