@@ -11,6 +11,7 @@ from pathlib import Path
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.mcap_reader import LogReader
+from drivers.v4l2_ledger import CameraState
 
 MOST_BYTES = 1 << 30
 NAP_S = 0.02
@@ -36,14 +37,14 @@ class Pictures:
             raise DriverError(f"{path}: no pictures in this log: give one with the frames of two cameras")
         first_ns = frames[0].stamp_ns
         timed = [(frame.stamp_ns - first_ns, frame) for frame in frames]
-        lower, upper = (tuple(t for t in timed if t[1].camera == name) for name in ("lower", "upper"))
-        return Pictures(lower, upper)
+        return Pictures(tuple(t for t in timed if t[1].camera == "lower"),
+                        tuple(t for t in timed if t[1].camera == "upper"))
 
 
 def _bounded(frames: Iterator[Frame], path: Path) -> Iterator[Frame]:
     held = 0
     for frame in frames:
-        held += memoryview(frame.data).nbytes
+        held += len(frame.data)  # bytes, as LogReader gives them
         if held > MOST_BYTES:
             raise DriverError(f"{path}: more than {MOST_BYTES >> 20} MiB of pictures: cut the log into shorter ones")
         yield frame
@@ -62,7 +63,7 @@ class LogCamera:
         self._last_ns = max(at for both in (pictures.lower, pictures.upper) for at, _ in both[-1:])
         self._epoch_ns, self._pace, self._once = epoch_ns, pace, once
         self._closed = False
-        self.late = 0
+        self.state = CameraState(mode="a recorded log")
 
     def frames(self) -> Iterator[Frame]:
         """The frames when they are due, until closed; what nobody takes in time is left out and counted."""
@@ -72,8 +73,10 @@ class LogCamera:
             if self._closed:
                 return
             if time.monotonic_ns() > stamp_ns + LATEST_NS:
-                self.late += 1
+                self.state.drops += 1
             else:
+                self.state.status = "streaming"
+                self.state.frames += 1
                 yield replace(frame, seq=seq, stamp_ns=stamp_ns)
 
     def close(self) -> None:

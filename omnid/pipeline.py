@@ -10,6 +10,7 @@ from omnid.config import Config
 from omnid.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, Odometry
 from omnid.outputs.encoded import Outgoing
+from omnid.outputs.helm import Helm
 from omnid.outputs.motor import MotorTick
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
@@ -27,7 +28,8 @@ class Ends:
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     recorder: Sink[Outgoing] | None = None
     bus: Sink[Outgoing] | None = None
-    motor: MotorTick | None = None
+    motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
+    helm: Helm | None = None  # of a live robot: it decides by itself, at its own rate
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
@@ -44,8 +46,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
     depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
-    commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
-    spoken: list[Stream[Outgoing]] = [odometry, commands]
+    spoken: list[Stream[Outgoing]] = [odometry, _commands(graph, odometry, geometry, config, ends)]
     mapping = Mapping(config.mapping, ends.map_every_s) if ends.maps or ends.recorder or ends.bus else None
     if mapping:
         maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
@@ -58,12 +59,19 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         graph.sink("record", ends.recorder, *spoken)
     if ends.bus:
         graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
-    if ends.motor:
-        _drive(graph, ends.motor, commands, 1.0 / config.motor.rate_hz)
     return Watched(stereo, mapping)
 
 
-def _drive(graph: Graph, motor: MotorTick, commands: Stream[VelocityCommand], period_s: float) -> None:
-    """The motor's deadline waits for nobody: it reads the newest command from a slot."""
-    graph.sink("commands", motor, commands)
-    graph.ticker("motor", period_s, motor)
+def _commands(graph: Graph, odometry: Stream[Odometry], geometry: Geometry, config: Config, ends: Ends
+              ) -> Stream[VelocityCommand]:
+    """What the wheels are told. Their deadline waits for nobody: the newest pose or command lies in a slot."""
+    period_s = 1.0 / config.motor.rate_hz
+    if ends.helm:
+        graph.sink("helm", ends.helm, odometry, policy=NEWEST, depth=1)
+        graph.ticker("motor", period_s, ends.helm)
+        return graph.source("drive", ends.helm.told, wake=ends.helm.hush)
+    commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
+    if ends.motor:
+        graph.sink("commands", ends.motor, commands)
+        graph.ticker("motor", period_s, ends.motor)
+    return commands

@@ -25,7 +25,7 @@ from omnid.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
-from omnid.outputs.motor import open_motor
+from omnid.outputs.motor import MotorTick, open_motor
 from omnid.outputs.progress import Progress
 from omnid.outputs.recorder import Recorder
 from omnid.outputs.summary import counters, summary
@@ -150,7 +150,8 @@ class Replay:
         motor = recorder = None
         bus = self._bus(encode, closing) if options.publish else None
         if config.motor.port:
-            motor, self._twin = open_motor(config.motor, closing)
+            driver, self._twin = open_motor(config.motor, closing)
+            motor = MotorTick(driver, config.motor.stale_s)
         if options.record:
             attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
             recorder = Recorder(options.record, attachments, config.bus.robot, encode)

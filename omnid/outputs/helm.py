@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from queue import Empty, Full, Queue
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ from omnid.stages.odometry import of_base
 from omnid.telemetry import Histogram
 
 LONGEST_RAMP_S = 3.0  # at the end: whatever has not stood still by then is stopped at once
+TOLD = 16  # commands that may wait for whoever records them
 NS = 1e-9
 
 
@@ -73,6 +76,7 @@ class Helm:
         self._sent = STOP
         self.reason = IDLE
         self.stops: Counter[str] = Counter()  # by reason
+        self._told: Queue[VelocityCommand | None] = Queue(TOLD)
         self.sent = self.errors = 0
         self.to_wheel = Histogram()  # s from the capture of a pose's pictures to the first command that follows it
         self.lateness = Histogram()  # s by which ticks come too late
@@ -104,6 +108,22 @@ class Helm:
         if pose is not None and pose.stamp_ns > self._driven_ns:
             self._driven_ns = pose.stamp_ns
             self.to_wheel.add((time.monotonic_ns() - pose.stamp_ns) * NS)
+
+    def finish(self) -> None:
+        """There will be no more poses."""
+        self.hush()
+
+    def told(self) -> Iterator[VelocityCommand]:
+        """What the wheels have been told, for whoever keeps or shows it, until hushed; too much of it is forgotten."""
+        while (command := self._told.get()) is not None:
+            yield command
+
+    def hush(self) -> None:
+        """Ends `told`; for any thread."""
+        with suppress(Empty):
+            while True:
+                self._told.get_nowait()
+        self._told.put(None)
 
     def close(self) -> None:
         """Slows down to a stand, then releases the driver; the wheels stand when this returns."""
@@ -146,8 +166,9 @@ class Helm:
         return wanted, heading_rad if goal_rad is None else goal_rad
 
     def _send(self, drive: Drive, goal_rad: float, now_ns: int) -> None:
+        command = VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps)
         try:
-            self._driver.send(VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps))
+            self._driver.send(command)
         except DriverError as error:
             if not self._failed:
                 self._report(str(error))
@@ -156,3 +177,5 @@ class Helm:
             return
         self._failed, self._sent = False, drive
         self.sent += 1
+        with suppress(Full):
+            self._told.put_nowait(command)

@@ -59,7 +59,7 @@ class MotorTick:
         self._driver.close()
 
 
-def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[MotorTick, SimulatedMotor | None]:
+def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[SerialMotor, SimulatedMotor | None]:
     """The motor on the configured port, and its simulation where that is asked for; DriverError where it is silent."""
     twin = None
     if config.port == SIMULATED:
@@ -69,4 +69,4 @@ def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[MotorTick, Simu
     driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud, timeout_s=1 / config.rate_hz,
                          watchdog_ms=config.watchdog_ms)  # no tick blocks for longer than its period
     closing.callback(driver.close)
-    return MotorTick(driver, config.stale_s), twin
+    return driver, twin

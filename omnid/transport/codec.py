@@ -183,7 +183,8 @@ def diagnostics_cdr(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
 
 def _status(status: Status) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
     if not 0 <= status.level <= 3:
-        raise OmnidError(f"diagnostic level {status.level} of {status.name} is none of 0 ok, 1 warning, 2 error, 3 stale")
+        raise OmnidError(
+            f"diagnostic level {status.level} of {status.name} is none of 0 ok, 1 warning, 2 error, 3 stale")
     pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
     return ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
 

@@ -1,0 +1,137 @@
+"""A run on the robot itself: two cameras, the stages, the wheels, the bus, until it is told to end."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import chain, islice
+from pathlib import Path
+from types import FrameType
+from typing import Protocol
+
+import cv2
+
+from calib.rig_file import read_rig
+from drivers.frame import Camera, FrameSource
+from drivers.simulated_motor import SimulatedMotor
+from drivers.v4l2_ledger import CameraState
+from omnid.config import Config
+from omnid.errors import OmnidError
+from omnid.graph import NEWEST, Graph
+from omnid.outputs.bus import BusSink
+from omnid.outputs.encoded import Encoder, status_report
+from omnid.outputs.helm import Helm, HelmSettings
+from omnid.outputs.latency import Latency
+from omnid.outputs.motor import open_motor
+from omnid.outputs.status import StatusReport, StatusTick, Watched
+from omnid.outputs.tally import Tally
+from omnid.pipeline import Ends, wire
+from omnid.stages.geometry import Geometry, geometry, with_rims
+from omnid.stages.live_pair import LivePair
+from omnid.transport.bus import Bus
+from omnid.transport.codec import Status
+from omnid.transport.commands import Commands
+
+CAMERAS: tuple[Camera, ...] = ("lower", "upper")
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LOOKS = 60  # pictures of either camera in which the rim is looked for, where the rig has no mask
+TICKERS = frozenset({"motor", "status", "watchdog"})
+Say = Callable[[int, str], None]  # severity as syslog has it, and one line
+
+
+class LiveCamera(FrameSource, Protocol):
+    """A source of frames that tells how it is."""
+
+    state: CameraState
+
+
+Opener = Callable[[Camera], LiveCamera]  # may be asked twice for a camera, once the first has been closed
+
+
+class Live:
+    """One run of the daemon."""
+
+    def __init__(self, config: Config, open_camera: Opener, say: Say) -> None:
+        self._config, self._open, self._say = config, open_camera, say
+        self._graph = Graph(policy=NEWEST, depth=1)
+        self._tally, self._latency = Tally(), Latency()
+        self.offset_ns = time.time_ns() - time.monotonic_ns()  # from the stamps in here to Unix time
+        self.twin: SimulatedMotor | None = None
+
+    def run(self) -> int:
+        """The exit code, 0 after a signal to end."""
+        cv2.setNumThreads(self._config.graph.opencv_threads)
+        with ExitStack() as closing:
+            place = self._geometry()
+            self._wire(place, {name: self._opened(name, closing) for name in CAMERAS}, closing)
+            with self._ended_by_signals():
+                self._graph.run()
+        return 0
+
+    def _opened(self, name: Camera, closing: ExitStack) -> LiveCamera:
+        camera = self._open(name)
+        closing.callback(camera.close)
+        return camera
+
+    def _geometry(self) -> Geometry:
+        """The rig; the mirrors' rims are looked for in the first pictures where it has no masks."""
+        rig = read_rig(Path(self._config.cameras.rig))
+        if rig.lower.mask is None or rig.upper.mask is None:
+            with ExitStack() as closing:
+                both = (islice(self._opened(name, closing).frames(), LOOKS) for name in CAMERAS)
+                rig = with_rims(rig, chain.from_iterable(zip(*both, strict=False)))
+        return geometry(rig, self._config.panorama)
+
+    def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], closing: ExitStack) -> None:
+        config, graph = self._config, self._graph
+        encode = Encoder(place.rig.T_base_rig, config.record.cloud_points, self.offset_ns)
+        helm = self._helm(place, closing) if config.motor.port else None
+        bus = Bus(config.bus)
+        closing.callback(bus.close)
+        pair = LivePair(place.rig, config.pair)
+        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
+        ends = Ends(poses={"tally": self._tally, "latency": self._latency}, bus=BusSink(bus, encode), helm=helm,
+                    map_every_s=config.live.cloud_s)
+        wire(graph, graph.stage("pair", pair, *frames), place, config, ends)
+        commands = self._commands(bus, helm) if helm else None
+        report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
+                                      self._tally, self._latency.to_pose, helm, commands, TICKERS))
+        graph.ticker("status", config.live.status_s, StatusTick(report, self._publisher(bus)))
+
+    def _helm(self, place: Geometry, closing: ExitStack) -> Helm:
+        config = self._config
+        driver, self.twin = open_motor(config.motor, closing)
+        settings = HelmSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
+                                config.helm.limits)
+        return Helm(driver, place.rig.T_base_rig, settings, lambda text: self._say(4, text))
+
+    def _commands(self, bus: Bus, helm: Helm) -> Commands:
+        commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
+        for key in commands.keys:
+            bus.subscribe(key, commands.take)
+        return commands
+
+    def _publisher(self, bus: Bus) -> Callable[[list[Status]], None]:
+        """What publishes statuses; the bus may be slow, and only the ticker waits for it."""
+
+        def publish(statuses: list[Status]) -> None:
+            said = status_report(time.time_ns(), statuses)
+            with suppress(OmnidError):  # the next one comes in a second
+                bus.publish(said.topic, said.payload)
+
+        return publish
+
+    @contextmanager
+    def _ended_by_signals(self) -> Iterator[None]:
+        """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once."""
+        before = {number: signal.signal(number, self._on_signal) for number in STOPPING}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        self._graph.stop()
