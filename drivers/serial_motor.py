@@ -22,7 +22,7 @@ from drivers.motor_protocol import MotorProtocol, Script, T
 CONNECT_TRY_S = 0.2
 STOPS_AT_CLOSE = 3
 READ_LIMIT_BYTES = 4096
-STALE_SHARE = 0.8  # of the watchdog's time: later than that the controller may have stopped before a command arrives
+STALE_SHARE = 0.5  # of the watchdog's time: later than that the controller may have stopped before a command arrives
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 _REASONS = {

@@ -16,6 +16,7 @@ from omnid.graph import Slot
 
 SIMULATED = "simulated"
 SILENCE_S = 3.0
+WATCHDOG_TICKS = 4  # the least that fits in; the driver tells a stop first after a pause of half the watchdog
 
 
 class MotorTick:
@@ -60,7 +61,14 @@ class MotorTick:
 
 
 def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[SerialMotor, SimulatedMotor | None]:
-    """The motor on the configured port, and its simulation where that is asked for; DriverError where it is silent."""
+    """The motor on the configured port, and its simulation where that is asked for.
+
+    DriverError where it is silent, and for a watchdog so short that a tick or two late would trip it.
+    """
+    least_ms = WATCHDOG_TICKS * 1000 / config.rate_hz
+    if config.watchdog_ms < least_ms:
+        raise DriverError(f"motor.watchdog_ms is {config.watchdog_ms} at motor.rate_hz {config.rate_hz:g}; "
+                          f"give at least {least_ms:.0f}, {WATCHDOG_TICKS} ticks, or a higher rate")
     twin = None
     if config.port == SIMULATED:
         twin = SimulatedMotor(TWINS[config.protocol](config.drive))
