@@ -44,7 +44,7 @@ class Summary:
 
 def read_summary(file: LogFile) -> Summary | None:
     """The log's summary, None where the file is cut, was written without one, or the summary's CRC is wrong."""
-    section = _summary_section(file)
+    section = summary_section(file)
     if section is None:
         return None
     catalog, counts = Catalog(), Counter[int]()
@@ -75,7 +75,8 @@ def _footer(file: LogFile) -> bytes | None:
     return end[:size] if whole else None
 
 
-def _summary_section(file: LogFile) -> Buffer | None:
+def summary_section(file: LogFile) -> Buffer | None:
+    """The records at the end of the log, None where read_summary would give none."""
     footer = _footer(file)
     if footer is None:
         return None

@@ -1,0 +1,283 @@
+"""A whole log out of a cut or corrupt one: what can be read is written anew, with an index and a summary."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
+from mcap.writer import CompressionType, Writer
+
+from drivers.errors import DriverError
+from drivers.file_lock import hold, is_held
+from drivers.mcap_index import has_footer, read_summary, summary_section
+from drivers.mcap_records import (
+    MAGIC,
+    PARSE_ERRORS,
+    LogFile,
+    Record,
+    RecordError,
+    Source,
+    content,
+    parsing,
+    records,
+    unpack_chunk,
+)
+
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_COMPRESSIONS = {b"lz4": CompressionType.LZ4, b"zstd": CompressionType.ZSTD}
+_CHUNK_BYTES: Final = 2**20
+_MAX_DEFINITIONS: Final = 4096
+_MAX_DEFINITION_BYTES: Final = 64 * 2**20  # of all together
+_LOOKED_AT: Final = 10_000  # records at the start, for the first chunk
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What became of a log."""
+
+    messages: int  # saved
+    attachments: int  # saved
+    lost: int | None  # messages; None where the log does not say how many there were
+    broken: int  # chunks and records that were skipped
+    end: int  # byte of the log up to which it could be read
+    whole: bool  # there was nothing to mend
+
+
+def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recovery:
+    """Writes what can be read of any MCAP log to a new file, in the same order and with the same compression.
+
+    Streams, so that neither the size of the log nor what is wrong with it costs memory: at most a few of its chunks.
+    Raises DriverError, and leaves no file, where `path` is no log, is still being written or holds nothing that can
+    be read, and where `out` exists or cannot be written.
+    """
+    if is_held(path):
+        raise DriverError(f"cannot mend {str(path)!r}: it is being written; stop the recording first")
+    file = LogFile(path)
+    try:
+        with _created(Path(out)) as target:
+            hold(target)
+            return _written(file, target, Path(out))
+    finally:
+        file.close()
+
+
+def _created(out: Path) -> IO[bytes]:
+    try:
+        return out.open("xb")
+    except FileExistsError as error:
+        raise DriverError(f"cannot write {str(out)!r}: it exists and is not overwritten; name another file by -o"
+                          ) from error
+    except OSError as error:
+        raise DriverError(f"cannot write {str(out)!r}: {error.strerror}; name another file by -o") from error
+
+
+def _written(file: LogFile, target: IO[bytes], out: Path) -> Recovery:
+    """As recover; a target that cannot be made whole is deleted."""
+    try:
+        found = _copied(file, target)
+        if not (found.messages or found.attachments):
+            raise DriverError(f"nothing in {str(file.path)!r} can be saved: no message and no attachment is whole")
+        return found
+    except OSError as error:
+        out.unlink(missing_ok=True)
+        raise DriverError(f"cannot write {str(out)!r}: {error.strerror}; free the disk or name another") from error
+    except BaseException:
+        out.unlink(missing_ok=True)
+        raise
+
+
+def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
+    header = _header(file)
+    writer = Writer(target, _CHUNK_BYTES, _compression(file))
+    writer.start(header.profile, header.library)
+    copy, trail = _Copy(writer), _Trail(file)
+    copy.define(file)
+    for record in trail.records():
+        if record.opcode == Opcode.CHUNK:
+            copy.chunk(file, record)
+        else:
+            copy.single(file, record)
+    writer.finish()  # type: ignore[no-untyped-call]
+    target.flush()
+    os.fsync(target.fileno())
+    summary = read_summary(file)
+    known = sum(summary.message_counts.values()) if summary else 0
+    lost = max(0, known - copy.messages) if known else None
+    whole = trail.ended and not (trail.jumps or copy.broken or lost) and summary is not None and has_footer(file)
+    return Recovery(copy.messages, copy.attachments, 0 if whole else lost, copy.broken + trail.jumps, trail.end, whole)
+
+
+def _header(file: LogFile) -> Header:
+    """The log's own; an empty one where it is unreadable."""
+    first = next(records(file, len(MAGIC), file.size), None)
+    if first is not None and first.opcode == Opcode.HEADER and first.size < _CHUNK_BYTES:
+        try:
+            header: Header = Header.read(parsing(content(file, first)))
+            return header
+        except (RecordError, *PARSE_ERRORS):
+            pass
+    return Header("", "")
+
+
+def _compression(file: LogFile) -> CompressionType:
+    """That of the first chunk."""
+    for count, record in enumerate(records(file, len(MAGIC), file.size)):
+        if record.opcode == Opcode.CHUNK:
+            head = bytes(file.read(record.at + 28, 8))  # after three numbers of 8 bytes and one of 4
+            return _COMPRESSIONS.get(head[4 : 4 + min(head[0], 4)] if head else b"", CompressionType.NONE)
+        if count >= _LOOKED_AT:
+            break
+    return CompressionType.NONE
+
+
+class _Trail:
+    """The records of a log's data section; where one is longer than it can be, on from the next chunk that is indexed.
+
+    After its end: end is the byte reached, ended whether that was the proper end, jumps how often something was
+    skipped.
+    """
+
+    def __init__(self, file: LogFile) -> None:
+        self._file = file
+        self._chunks = _indexed_chunks(file)
+        self.ended = False
+        self.jumps = 0
+        self.end = len(MAGIC)
+
+    def records(self) -> Iterator[Record]:
+        """All that can be found; RecordErrors are for whoever reads what they hold."""
+        start: int | None = len(MAGIC)
+        while start is not None:
+            yield from self._run(start)
+            start = None if self.ended else self._next_chunk(max(start, self.end))
+            self.jumps += start is not None
+
+    def _run(self, start: int) -> Iterator[Record]:
+        for record in records(self._file, start, self._file.size):
+            end = record.at + record.size
+            if (self._next_chunk(record.at) or end) < end:
+                return  # its length is wrong: nothing reaches into a chunk
+            self.ended = record.opcode == Opcode.DATA_END
+            if self.ended:
+                return
+            self.end = end
+            yield record
+
+    def _next_chunk(self, after: int) -> int | None:
+        index = bisect_right(self._chunks, after)
+        return self._chunks[index] if index < len(self._chunks) else None
+
+
+def _indexed_chunks(file: LogFile) -> list[int]:
+    """Where the chunks start, as the summary says; nothing without one."""
+    section, places = summary_section(file), []
+    if section is not None:
+        for record in records(section, 0, section.size):
+            if record.opcode == Opcode.CHUNK_INDEX:
+                with suppress(RecordError, *PARSE_ERRORS):
+                    places.append(int(ChunkIndex.read(parsing(content(section, record))).chunk_start_offset))
+    return sorted(places)
+
+
+class _Copy:
+    """Puts records into a writer, with channels and schemas under new numbers; counts what cannot be read as broken."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._ids: dict[tuple[int, int], int] = {}  # (opcode, number in the log) -> number in the copy
+        self._definitions: dict[tuple[int, int], bytes] = {}
+        self._definition_bytes = 0
+        self.messages = self.attachments = self.broken = 0
+        self._takers: dict[int, Callable[[memoryview], None]] = {
+            Opcode.SCHEMA: self._schema,
+            Opcode.CHANNEL: self._channel,
+            Opcode.MESSAGE: self._message,
+            Opcode.ATTACHMENT: self._attachment,
+            Opcode.METADATA: self._metadata,
+        }
+
+    def define(self, file: LogFile) -> None:
+        """Takes channels and schemas from the summary, for the chunk that defines them may be lost."""
+        section = summary_section(file)
+        if section is not None:
+            for record in records(section, 0, section.size):
+                if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self.single(section, record)
+
+    def chunk(self, file: LogFile, record: Record) -> None:
+        """Takes what is in a chunk."""
+        try:
+            chunk = unpack_chunk(content(file, record))
+        except RecordError:
+            self.broken += 1
+            return
+        end = 0
+        for inner in records(chunk, 0, chunk.size):
+            end = inner.at + inner.size
+            self.single(chunk, inner)
+        self.broken += end != chunk.size
+
+    def single(self, source: Source, record: Record) -> None:
+        """Takes one record; what belongs to an index is made anew."""
+        take = self._takers.get(record.opcode)
+        if take is None:
+            return
+        try:
+            take(content(source, record))
+        except (RecordError, *PARSE_ERRORS):
+            self.broken += 1
+
+    def _schema(self, body: memoryview) -> None:
+        schema = Schema.read(parsing(body))
+        if self._is_new(Opcode.SCHEMA, schema.id, body):
+            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._ids[Opcode.SCHEMA, schema.id] = number
+
+    def _channel(self, body: memoryview) -> None:
+        channel = Channel.read(parsing(body))
+        schema = self._ids.get((Opcode.SCHEMA, channel.schema_id)) if channel.schema_id else 0
+        if schema is None:
+            raise RecordError("a channel of an unknown schema")
+        if self._is_new(Opcode.CHANNEL, channel.id, body):
+            arguments = channel.topic, channel.message_encoding, schema, channel.metadata
+            self._ids[Opcode.CHANNEL, channel.id] = self._writer.register_channel(*arguments)
+
+    def _is_new(self, opcode: int, number: int, body: memoryview) -> bool:
+        """Whether a definition is not yet there; RecordError where there are too many."""
+        definition = bytes(body)
+        if self._definitions.get((opcode, number)) == definition:
+            return False
+        self._definition_bytes += len(body)
+        if len(self._ids) >= _MAX_DEFINITIONS or self._definition_bytes > _MAX_DEFINITION_BYTES:
+            raise RecordError("more channels and schemas than any robot has")
+        self._definitions[opcode, number] = definition
+        return True
+
+    def _message(self, body: memoryview) -> None:
+        channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(body)
+        number = self._ids.get((Opcode.CHANNEL, channel))
+        if number is None:
+            raise RecordError("a message of an unknown channel")
+        self._writer.add_message(number, log_time_ns, bytes(body[_MESSAGE.size :]), publish_time_ns, sequence)
+        self.messages += 1
+
+    def _attachment(self, body: memoryview) -> None:
+        crc = int.from_bytes(body[-4:], "little")
+        if crc and zlib.crc32(body[:-4]) != crc:
+            raise RecordError("an attachment does not match its CRC")
+        found = Attachment.read(parsing(body))
+        self._writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+        self.attachments += 1
+
+    def _metadata(self, body: memoryview) -> None:
+        found = Metadata.read(parsing(body))
+        self._writer.add_metadata(found.name, found.metadata)

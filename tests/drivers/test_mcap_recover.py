@@ -1,0 +1,219 @@
+"""Whole logs out of cut, corrupt and hostile ones."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import tracemalloc
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+
+from drivers.errors import DriverError
+from drivers.mcap_reader import LogReader
+from drivers.mcap_records import MAGIC
+from drivers.mcap_recover import Recovery, recover
+from drivers.mcap_writer import LogWriter
+from tests.drivers.mcap_logs import BARE, START_NS, Entry, pairs, text, write_log
+from tests.drivers.test_mcap_damage import HOSTILE, LAYOUTS
+
+RIG = [("rig.toml", b"version = 1"), ("big", bytes(3 * 2**20))]
+
+
+def messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
+    """What the mcap package itself reads of a whole log, its CRCs checked, in the order of the file."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = reader.iter_messages(log_time_order=False)
+        return [(c.topic, m.log_time, m.publish_time, m.sequence, m.data) for _, c, m in found]
+
+
+def mended(path: Path, out: Path) -> Recovery | None:
+    """None where nothing can be saved: then there is no file, and one line that says why."""
+    out.unlink(missing_ok=True)
+    try:
+        found = recover(path, out)
+    except DriverError as error:
+        assert str(error).isprintable() and not out.exists()
+        return None
+    again = out.with_name("again.mcap")
+    again.unlink(missing_ok=True)
+    assert replace(recover(out, again), end=0) == Recovery(found.messages, found.attachments, 0, 0, 0, True)
+    return found
+
+
+@pytest.mark.parametrize("layout", [*LAYOUTS, BARE | {"use_chunking": False}])
+def test_a_log_cut_anywhere_becomes_whole(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path, out = write_log(tmp_path / "log.mcap", pairs(3), RIG[:1], **layout), tmp_path / "out.mcap"
+    whole, size = messages(path), path.stat().st_size
+    saved = []
+    for cut in range(size, 0, -71):
+        os.truncate(path, cut)
+        found = mended(path, out)
+        if found is None:
+            saved.append(0)
+            continue
+        assert found.whole == (cut == size and layout.get("use_statistics", True))
+        assert messages(out) == whole[: found.messages]
+        with out.open("rb") as file:
+            assert [(a.name, a.data) for a in make_reader(file).iter_attachments()] == RIG[: found.attachments]
+        saved.append(found.messages)
+    assert saved == sorted(saved, reverse=True) and saved[0] == 6 and 0 in saved
+
+
+def test_other_readers_take_what_comes_out(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(30), RIG, compression=CompressionType.ZSTD)
+    entries = sorted(pairs(30))
+    os.truncate(path, path.stat().st_size - 3000)
+    out = tmp_path / "out.mcap"
+    found = recover(path, out)
+    with AnyReader([out]) as bag:
+        read = [Entry(c.topic, c.msgtype, bytes(data), stamp) for c, stamp, data in bag.messages()]
+    assert 40 <= len(read) == found.messages and set(read) <= set(entries) and found.attachments == 2
+    reader = LogReader(out)
+    assert len(list(reader.frames())) == found.messages and not reader.warnings
+    with out.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None and {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+        assert make_reader(file).get_header().profile == "ros2"
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_flipped_bits_never_escape(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path, out = write_log(tmp_path / "log.mcap", pairs(3), RIG[:1], **layout), tmp_path / "out.mcap"
+    whole, expected, chance = path.read_bytes(), set(messages(path)), random.Random(11)
+    saved = 0
+    for _ in range(40):
+        data = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 5))):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
+        found = mended(path, out)
+        if found is not None and layout.get("use_chunking", True):
+            assert {entry[1:] for entry in messages(out)} <= {entry[1:] for entry in expected}  # names have no CRC
+        saved += found.messages if found is not None else 0
+    assert saved > 40
+
+
+@pytest.mark.parametrize("damage", range(20))
+def test_noise_gives_one_line(tmp_path: Path, damage: int) -> None:
+    chance = random.Random(damage)
+    (tmp_path / "log.mcap").write_bytes(MAGIC * (damage % 2) + chance.randbytes(chance.randrange(2000)))
+    assert mended(tmp_path / "log.mcap", tmp_path / "out.mcap") is None
+
+
+@pytest.mark.parametrize("inner", HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_records_take_no_memory(tmp_path: Path, inner: bytes) -> None:
+    path, out = write_log(tmp_path / "log.mcap", pairs(2)), tmp_path / "out.mcap"
+    whole = path.read_bytes()
+    at = whole.index(b"\x06", len(MAGIC) + 20)
+    path.write_bytes(whole[:at] + inner + whole[at:])
+    tracemalloc.start()
+    try:
+        mended(path, out)
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def chunk_places(path: Path) -> list[int]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+
+
+@pytest.mark.parametrize("where", [0, 7], ids=["the first chunk, which defines the channels", "another"])
+@pytest.mark.parametrize("offset", [3, 6, 60], ids=["its length", "its length, beyond the file", "its content"])
+def test_a_corrupt_chunk_costs_only_itself_where_there_is_an_index(tmp_path: Path, where: int, offset: int) -> None:
+    path, out = write_log(tmp_path / "log.mcap", pairs(30), RIG[:1], chunk_size=700), tmp_path / "out.mcap"
+    expected, places = messages(path), chunk_places(path)
+    data = bytearray(path.read_bytes())
+    data[places[where] + offset] ^= 0x11
+    path.write_bytes(data)
+    found = recover(path, out)
+    assert 56 <= found.messages < 60 and found.lost == 60 - found.messages and not found.whole
+    assert 1 <= found.broken <= 2 and set(messages(out)) < set(expected)
+
+
+def test_what_other_writers_write_is_kept(tmp_path: Path) -> None:
+    path, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, 200, CompressionType.LZ4)
+        writer.start("other", "somebody")
+        writer.add_metadata("rosbag2", {"storage": "mcap"})
+        for n in range(5):  # without a schema, as JSON may be
+            channel = writer.register_channel(f"/json/{n}", "json", 0, {"n": str(n)})
+            writer.add_message(channel, n, b'{"a": 1}', n + 100, n + 7)
+        writer.add_attachment(3, 4, "late", "text/x", b"")
+        writer.finish()
+    os.truncate(path, path.stat().st_size - 1)
+    expected = [(f"/json/{n}", n, n + 100, n + 7, b'{"a": 1}') for n in range(5)]
+    assert replace(recover(path, out), end=0) == Recovery(5, 1, None, 0, 0, False)
+    assert messages(out) == expected
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("rosbag2", {"storage": "mcap"})]
+        (late,) = reader.iter_attachments()
+        assert (late.create_time, late.log_time, late.media_type) == (3, 4, "text/x")
+        summary = reader.get_summary()
+        assert summary is not None and [c.metadata for c in summary.channels.values()] == [
+            {"n": str(n)} for n in range(5)]
+
+
+def test_nothing_is_overwritten_and_nothing_half_done_is_left(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(3))
+    os.truncate(path, path.stat().st_size - 1)
+    kept = tmp_path / "kept.mcap"
+    kept.write_bytes(b"mine")
+    for out, reason in ((kept, "it exists"), (path, "it exists"), (tmp_path / "no" / "out.mcap", "No such file")):
+        with pytest.raises(DriverError, match=reason):
+            recover(path, out)
+    assert kept.read_bytes() == b"mine" and sorted(os.listdir(tmp_path)) == ["kept.mcap", "log.mcap"]
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """The kernel refuses files over 100 kB."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_leaves_no_file(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    path, out = write_log(tmp_path / "log.mcap", pairs(300)), tmp_path / "out.mcap"
+    os.truncate(path, path.stat().st_size - 1)
+    request.getfixturevalue("small_files")
+    with pytest.raises(DriverError, match="File too large"):
+        recover(path, out)
+    assert not out.exists()
+
+
+def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log.mcap") as log:
+        log.write("/a", "std_msgs/msg/String", text("a"), START_NS)
+        with pytest.raises(DriverError, match="being written"):
+            recover(tmp_path / "log.mcap", tmp_path / "out.mcap")
+    shutil.copy(tmp_path / "log.mcap", tmp_path / "copy.mcap")
+    assert recover(tmp_path / "log.mcap", tmp_path / "out.mcap").whole
+
+
+def test_the_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    entries = (e._replace(data=e.data + os.urandom(200_000)) for e in pairs(100))
+    path, out = write_log(tmp_path / "log.mcap", entries, chunk_size=2**20), tmp_path / "out.mcap"
+    os.truncate(path, path.stat().st_size - 1)
+    tracemalloc.start()
+    try:
+        assert recover(path, out).messages == 200
+        assert tracemalloc.get_traced_memory()[1] < 12 * 2**20 < path.stat().st_size
+    finally:
+        tracemalloc.stop()
