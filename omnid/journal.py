@@ -11,6 +11,7 @@ import os
 import re
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TextIO
@@ -39,10 +40,10 @@ class _Kind:
 class Journal(logging.Handler):
     """Writes lines; any thread may, but no signal handler. As a handler of `logging` it takes what libraries log."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self, stream: TextIO | None = None, clock_s: Callable[[], float] = time.monotonic) -> None:
         """stream: where to, else what sys.stderr is at the time."""
         super().__init__()
-        self._stream = stream
+        self._stream, self._clock_s = stream, clock_s
         self._kinds: dict[str, _Kind] = {}  # the one that was spoken of last comes last
         self.held_back = 0  # lines in all
 
@@ -76,7 +77,7 @@ class Journal(logging.Handler):
             self.release()
 
     def _judge(self, priority: int, line: str, key: str) -> None:
-        kind = self._kind(key or _NUMBER.sub("#", line), time.monotonic())
+        kind = self._kind(key or _NUMBER.sub("#", line), self._clock_s())
         if kind.written == _BURST:
             kind.held_back += 1
             self.held_back += 1

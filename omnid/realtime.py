@@ -121,8 +121,8 @@ def highest_priority() -> int:
 def has_capability(number: int) -> bool:
     """Whether this process has the capability in effect; False where /proc is not there."""
     with suppress(OSError, ValueError):
-        status = Path("/proc/self/status").read_text("ascii", "replace")
-        words = next(line.split() for line in status.splitlines() if line.startswith("CapEff:"))
+        status = Path("/proc/self/status").read_bytes()
+        words = next(line.split() for line in status.splitlines() if line.startswith(b"CapEff:"))
         return bool(int(words[1], 16) >> number & 1)
     return False
 

@@ -1,0 +1,196 @@
+"""Real-time rights: what is asked for is in force where it is allowed, and said, not raised, where it is not.
+
+Whatever changes the whole process is done in one of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from omnid.config import RealtimeConfig
+from omnid.graph import Graph
+from omnid.journal import WARNING
+from omnid.realtime import ThreadStart, has_capability, highest_priority, may_lock, name_thread, priorities
+
+ROOT = Path(__file__).parents[2]
+NOBODY = 65534
+allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
+PREAMBLE = """
+import gc, json, os, resource, sys, threading, time
+from pathlib import Path
+from omnid.config import RealtimeConfig
+from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread
+def locked_kb():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
+"""
+WITHOUT_RIGHTS = f"""
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, 1 << 20))
+if os.getuid() == 0:
+    os.setgid({NOBODY}); os.setuid({NOBODY})
+"""
+
+
+def process(script: str) -> subprocess.CompletedProcess[str]:
+    """What a process says that runs the script."""
+    return subprocess.run([sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True,
+                          timeout=60)
+
+
+def answer(script: str) -> SimpleNamespace:
+    """What it prints as JSON."""
+    done = process(script)
+    assert done.returncode == 0, done.stderr
+    return SimpleNamespace(**json.loads(done.stdout))
+
+
+def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
+    """Name and policy, for the kernel, of the threads of a graph: a source of this name and the sink that reads it."""
+    seen = {}
+
+    def look(whose: str) -> None:
+        task = Path(f"/proc/self/task/{threading.get_native_id()}")
+        seen[whose] = (task.joinpath("comm").read_text().strip(), os.sched_getscheduler(0))
+
+    def numbers() -> range:
+        look("source")
+        return range(1)
+
+    graph = Graph(on_thread=start)
+    graph.sink("sink", SimpleNamespace(process=lambda number: look("sink")), graph.source(name, numbers))
+    graph.run()
+    return seen
+
+
+def test_the_kernel_knows_the_threads_by_name() -> None:
+    assert seen_in("lower", ThreadStart({})) == {"source": ("lower", os.SCHED_OTHER), "sink": ("sink", os.SCHED_OTHER)}
+
+
+def test_a_long_name_is_cut() -> None:
+    thread = threading.Thread(target=lambda: (name_thread("a name of many letters"), names.append(comm())))
+    names: list[str] = []
+
+    def comm() -> str:
+        return Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().strip()
+
+    thread.start()
+    thread.join()
+    assert names == ["a name of many"]
+
+
+@allowed
+def test_only_the_named_thread_has_priority_and_does_not_pass_it_on() -> None:
+    seen = seen_in("lower", ThreadStart({"lower": 10}))
+    assert seen == {"source": ("lower", os.SCHED_FIFO | os.SCHED_RESET_ON_FORK), "sink": ("sink", os.SCHED_OTHER)}
+
+
+@allowed
+def test_priorities_are_those_of_the_configuration() -> None:
+    found = priorities(RealtimeConfig(motor_priority=18, capture_priority=7), "motor", "lower", "upper")
+    assert found == {"motor": 18, "lower": 7, "upper": 7}
+    script = """
+def motor():
+    ThreadStart({"motor": 18})("motor")
+    found["own"] = os.sched_getparam(0).sched_priority
+    child = threading.Thread(target=lambda: found.update(child=os.sched_getscheduler(0)))
+    child.start(); child.join()
+found = {"main": os.sched_getscheduler(0)}
+thread = threading.Thread(target=motor); thread.start(); thread.join()
+print(json.dumps(found))
+"""
+    assert vars(answer(script)) == {"main": os.SCHED_OTHER, "own": 18, "child": os.SCHED_OTHER}
+
+
+def test_without_the_right_the_threads_go_on_and_it_is_said_once_with_what_to_do() -> None:
+    done = answer(WITHOUT_RIGHTS + """
+said = []
+start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: said.append(words))
+for name in ("motor", "lower", "stereo"):
+    start(name)
+print(json.dumps({"said": said, "policy": os.sched_getscheduler(0)}))
+""")
+    ((priority, text),) = done.said
+    assert priority == WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
+    assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
+
+
+def test_under_a_limit_memory_is_not_locked_and_grows_freely() -> None:
+    done = answer(WITHOUT_RIGHTS + """
+said = lock_memory()
+grown = len(bytearray(50 << 20))
+print(json.dumps({"said": said, "locked": locked_kb()}))
+""")
+    assert "LimitMEMLOCK=infinity" in done.said and done.locked == 0
+
+
+@pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
+def test_all_memory_is_locked_without_being_filled() -> None:
+    done = answer("""
+before = locked_kb()
+said = lock_memory()
+room = bytearray(8 << 20)
+lines = Path("/proc/self/status").read_text().splitlines()
+resident = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+print(json.dumps({"said": said, "before": before, "locked": locked_kb(), "resident": resident}))
+""")
+    assert done.said == "" and done.before == 0
+    assert done.locked > 100_000 and done.resident < done.locked / 2  # stacks of OpenCV's threads, never touched
+
+
+def test_python_is_prepared() -> None:
+    done = answer("""
+refused = prepare(RealtimeConfig(lock_memory=False, switch_interval_ms=2.0, longest_run_ms=300), 3)
+import cv2
+print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinterval(), "refused": refused,
+                  "opencv": cv2.getNumThreads(), "run": resource.getrlimit(resource.RLIMIT_RTTIME)[0]}))
+""")
+    assert done.frozen > 1000 and done.refused == []
+    assert (done.switch_s, done.opencv, done.run) == (pytest.approx(2e-3), 3, 300_000)
+
+
+def test_what_is_not_wanted_stays_as_it_is() -> None:
+    done = answer("""
+before = sys.getswitchinterval()
+refused = prepare(RealtimeConfig(False, False, 0.0, 0, 0, 0), 1)
+print(json.dumps({"frozen": gc.get_freeze_count(), "same": before == sys.getswitchinterval(), "refused": refused,
+                  "run": resource.getrlimit(resource.RLIMIT_RTTIME), "locked": locked_kb()}))
+""")
+    assert (done.frozen, done.same, done.refused, done.locked) == (0, True, [], 0)
+    assert done.run[0] == done.run[1]
+
+
+def test_a_stricter_limit_of_whoever_started_us_holds() -> None:
+    done = answer("""
+resource.setrlimit(resource.RLIMIT_RTTIME, (1000, 2000))
+limit_runs(500)
+print(json.dumps({"run": resource.getrlimit(resource.RLIMIT_RTTIME)}))
+""")
+    assert done.run == [1000, 2000]
+
+
+@allowed
+def test_a_real_time_thread_that_runs_on_ends_the_daemon() -> None:
+    done = process("""
+limit_runs(50)
+assert raise_thread(10)
+until_s = time.monotonic() + 20
+while time.monotonic() < until_s:
+    pass
+""")
+    assert done.returncode == -signal.SIGXCPU
+
+
+def test_capabilities_are_read() -> None:
+    mask = next(int(line.split()[1], 16) for line in Path("/proc/self/status").read_text().splitlines()
+                if line.startswith("CapEff"))
+    assert [has_capability(number) for number in range(41)] == [bool(mask >> number & 1) for number in range(41)]
