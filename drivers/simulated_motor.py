@@ -11,10 +11,11 @@ import tty
 from typing import Protocol
 
 from drivers.motor import VelocityCommand
-from drivers.simulated_base import LONGEST_ADVANCE_S, STEP_S, Pose, SimulatedBase
+from drivers.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.simulated_line import SimulatedLine
 
 READ_LIMIT_BYTES = 4096
+LONGEST_ABSENCE_S = 0.05  # a twin that got no processor for longer stands still with its clocks: nobody was silent
 
 
 class SimulatedController(Protocol):
@@ -106,7 +107,7 @@ class SimulatedMotor:
         while True:
             readable, _, _ = select.select([self._device, self._wake_read], [], [], STEP_S)
             now_s = time.monotonic()
-            self.state.advance(min(now_s - last_s, LONGEST_ADVANCE_S))
+            self.state.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
             last_s = now_s
             if self._wake_read in readable:
                 return
