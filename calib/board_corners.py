@@ -20,6 +20,7 @@ MAX_ODD = 0.6
 MIN_CROSSING_RAD = np.deg2rad(18)
 MAX_PER_LEVEL = 4000
 SAME_PX = 2.0
+REMAP_COLUMNS = 1024  # cv2.remap takes pictures, not lists
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +74,9 @@ def look_at(image: Grey, pixels: Array, ring_px: float | Array) -> Corners:
 def sample(image: Grey, pixels: Array) -> Array:
     """Grey values (...) of pixels (..., 2), bilinear, the border repeated."""
     flat = pixels.reshape(-1, 2).astype(np.float32)
-    width = 1024
-    padded = np.zeros((-(-len(flat) // width) * width, 2), np.float32)
+    padded = np.zeros((max(1, -(-len(flat) // REMAP_COLUMNS)) * REMAP_COLUMNS, 2), np.float32)
     padded[:len(flat)] = flat
-    u, v = padded.T.reshape(2, -1, width)
+    u, v = padded.T.reshape(2, -1, REMAP_COLUMNS)
     values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values.ravel()[:len(flat)].reshape(pixels.shape[:-1]), float)
 

@@ -61,17 +61,24 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
     seen = (0, 0)
     blurred = smoothed(image, BLUR_PX)
     for look in _looks(image) if thorough else islice(_looks(image), 1):
-        for grid in _grids(look):
+        for looked_at in _grids(look):
+            grid = grow(blurred, looked_at)
             view = _view(image, grid, board, name)
-            if view is not None:
+            if view is not None and not _larger(seen, board):
                 return Search(view)
             seen = max(seen, largest_board(grid), key=lambda sides: sides[0] * sides[1])
     for grid in _by_opencv(image, board) if thorough else ():
         view = _view(image, grow(blurred, grid), board, name)
-        if view is not None:
+        if view is not None and not _larger(seen, board):
             return Search(view)
     hint = min(seen) >= MIN_HINT_SIDE and seen[0] * seen[1] >= MIN_HINT_CORNERS
     return Search(None, seen if hint else (0, 0))
+
+
+def _larger(seen: tuple[int, int], board: Board) -> bool:
+    """Whether a grid that was seen has room for the board and more: then the board would be a part of another."""
+    asked = sorted((board.columns, board.rows))
+    return sorted(seen) != asked and all(side >= least for side, least in zip(sorted(seen), asked, strict=True))
 
 
 def _looks(image: Image) -> Iterator[_Look]:

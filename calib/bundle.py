@@ -19,12 +19,13 @@ Make = Callable[[Array], OmniCamera]
 MAX_STEPS = 60
 # Rounds with the kernel's width measured anew.
 KERNEL_ROUNDS = 3
-HUBER = 1.345
+# Of the deviation of one coordinate: a normal residual is longer once in 23 times.
+HUBER = 2.5
 MIN_SIGMA_PX = 0.02
 # What a corner costs whose ray the model has lost: more than any that it has.
 LOST_PX = 300.0
-# The residuals' size is as good as still when a step saves less than this part of it.
-STILL = 1e-9
+# Done when a step that was hardly damped, so that it reached along the flattest valley, saves less than this part.
+STILL, UNDAMPED = 1e-9, 1e-7
 # Numeric derivatives: parameters are scaled so that one unit moves the picture by about a pixel; points by their depth.
 STEP = 1e-4
 
@@ -136,7 +137,7 @@ def _diagonals(C: Array) -> Array:
 
 
 def _descend(state: _State, kernel_px: float) -> _State:
-    damping, cost = 1e-3, state.cost(kernel_px)
+    damping, cost = 1e-4, state.cost(kernel_px)
     normal = _normal(state, kernel_px)
     for _ in range(MAX_STEPS):
         trial = state.moved(*normal.step(damping))
@@ -146,9 +147,10 @@ def _descend(state: _State, kernel_px: float) -> _State:
             if damping > 1e8:
                 break
             continue
-        state, damping, saved, cost = trial, max(1e-9, damping / 5), cost - new_cost, new_cost
-        if saved < STILL * cost:
+        state, saved, cost = trial, cost - new_cost, new_cost
+        if saved < STILL * cost and damping < UNDAMPED:
             break
+        damping = max(1e-9, damping / 10)
         normal = _normal(state, kernel_px)
     return state
 
@@ -196,7 +198,7 @@ def _by_point(camera: OmniCamera, points: Array) -> Array:
 
 def _adjusted(state: _State, kernel_px: float) -> Adjusted:
     residual, weight = _weighed(state.residuals, kernel_px)
-    freedom = 2 * int((weight > 0).sum()) - state.parameters.size - 6 * len(residual)
-    variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1)
+    freedom = 2 * float(weight.sum()) - state.parameters.size - 6 * len(residual)
+    variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
     covariance = variance * _normal(state, kernel_px).covariance()
     return Adjusted(state.parameters, state.poses, state.residuals, covariance)

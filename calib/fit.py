@@ -15,7 +15,7 @@ from calib.bundle import Adjusted, Observed
 from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
 from calib.ocam import OcamCamera, View
-from calib.ocam_fit import DEGREE, fit_ocam, ocam_maker, ocam_values
+from calib.ocam_fit import DEGREE, fit_ocam, ocam_maker, ocam_values, raise_degree
 from calib.ocam_linear import solve_linear
 from calib.unified_fit import TERMS, fit_unified, unified_maker, unified_values
 
@@ -29,7 +29,7 @@ MAX_REJECTIONS = 10
 # A term is taken in when it takes this part off the error. What gains less may as well stand for a mirror that is not
 # quite central, and bends rays by tenths of a degree to do so.
 WORTH = 0.1
-DEGREES = (DEGREE, 5, 6)
+HIGHER_DEGREES = (5, 6)
 # What gives rise to a warning: few of so many directions, or a parameter known no better than this.
 SECTORS, MIN_SECTORS = 12, 9
 MAX_SCALE_DEVIATION, MAX_CENTER_DEVIATION_PX = 0.005, 1.0
@@ -120,15 +120,16 @@ def _require(count: int, what: str, rejected: Sequence[Rejected] = ()) -> None:
 
 def _plausible(views: list[BoardView], board: Board, size: tuple[int, int],
                view: View) -> tuple[list[BoardView], list[Rejected]]:
-    """The views without those that the linear solution already finds far off."""
-    errors = solve_linear(_observed(views, board), size, DEGREE, view).errors_rad
-    bad = errors > max(BAD_LINEAR_RATIO * float(np.median(errors)), BAD_LINEAR_RAD)
-    rejected = [Rejected(seen.name, f"its corners lie {np.rad2deg(error):.1f} deg off any board, the others "
-                         f"{np.rad2deg(np.median(errors)):.2f}")
-                for seen, error, off in zip(views, errors, bad, strict=True) if off]
-    good = [seen for seen, off in zip(views, bad, strict=True) if not off]
-    _require(len(good), "views that agree", rejected)
-    return good, rejected
+    """The views without those that the linear solution finds far off: the worst goes first, as it spoils the others."""
+    good, rejected = list(views), list[Rejected]()
+    while True:
+        _require(len(good), "views that agree", rejected)
+        errors = solve_linear(_observed(good, board), size, DEGREE, view).errors_rad
+        worst, usual = int(np.argmax(errors)), float(np.median(errors))
+        if errors[worst] <= max(BAD_LINEAR_RATIO * min(usual, BAD_LINEAR_RAD), BAD_LINEAR_RAD):
+            return good, rejected
+        rejected.append(Rejected(good.pop(worst).name, f"its corners lie {np.rad2deg(errors[worst]):.1f} deg or more "
+                                 f"off any board, the others {np.rad2deg(usual):.2f}"))
 
 
 def _bad_views(fit: Adjusted) -> NDArray[np.bool_]:
@@ -146,12 +147,17 @@ def _too_far(view: BoardView, fit: Adjusted, k: int) -> Rejected:
 
 def _ocam(observed: Observed, size: tuple[int, int], view: View) -> _Solved:
     """The ocam camera of the lowest degree that no higher one beats by much."""
-    best, degree = fit_ocam(observed, size, view), DEGREE
-    for higher in DEGREES[1:]:
-        trial = fit_ocam(observed, size, view, higher)
-        if _worth(best, trial):
-            best, degree = trial, higher
-    return _Solved(ocam_maker(size, view, degree)(best.parameters), best, tuple(ocam_values(best, size, degree)))
+    best = trial = _solved_ocam(fit_ocam(observed, size, view), DEGREE, (size, view))
+    for degree in HIGHER_DEGREES:
+        assert isinstance(trial.camera, OcamCamera)
+        trial = _solved_ocam(raise_degree(trial.fit, observed, trial.camera), degree, (size, view))
+        best = trial if _worth(best.fit, trial.fit) else best
+    return best
+
+
+def _solved_ocam(fit: Adjusted, degree: int, seen: tuple[tuple[int, int], View]) -> _Solved:
+    size, view = seen
+    return _Solved(ocam_maker(size, view, degree)(fit.parameters), fit, tuple(ocam_values(fit, size, degree)))
 
 
 def _omni(observed: Observed, ocam: _Solved) -> _Solved:

@@ -6,21 +6,32 @@ import numpy as np
 
 from calib.bundle import Adjusted, Make, Observed, adjust
 from calib.camera import Array
+from calib.errors import CalibError
 from calib.ocam import OcamCamera, View
 from calib.ocam_linear import powers, solve_linear
 
 DEGREE = 4
 
 
-def fit_ocam(observed: Observed, size: tuple[int, int], view: View = "mirror", degree: int = DEGREE) -> Adjusted:
-    """The adjusted camera, whose parameters ocam_maker and ocam_values read; size (width, height) [px].
+def fit_ocam(observed: Observed, size: tuple[int, int], view: View = "mirror") -> Adjusted:
+    """The adjusted camera of degree DEGREE, read by ocam_maker and ocam_values; size (width, height) [px].
 
     Parameters, all in pixels at the scale of half the picture: a0, a2 ... ; centre row, column; c - 1, and d = e, as a
-    turn of the picture about its centre cannot be told from one of the camera.
+    turn of the picture about its centre cannot be told from one of the camera. CalibError where nothing fits.
     """
-    linear = solve_linear(observed, size, degree, view)
+    linear = solve_linear(observed, size, DEGREE, view)
+    if linear.coefficients[0] >= 0:
+        raise CalibError("calibrate: no mirror or lens shows boards as in these views; leave out those whose corners "
+                         "are wrong, and check --corners")
     start = np.concatenate([linear.coefficients, linear.center, (0.0, 0.0)])
-    return adjust(ocam_maker(size, view, degree), start, linear.T_cam_board, observed)
+    return adjust(ocam_maker(size, view, DEGREE), start, linear.T_cam_board, observed)
+
+
+def raise_degree(fit: Adjusted, observed: Observed, camera: OcamCamera) -> Adjusted:
+    """The fit of a camera with one more power of rho."""
+    start = np.concatenate([fit.parameters[:-4], [0.0], fit.parameters[-4:]])
+    degree = len(fit.parameters) - 4 + 1
+    return adjust(ocam_maker(camera.size, camera.view, degree), start, fit.T_cam_board, observed)
 
 
 def ocam_maker(size: tuple[int, int], view: View, degree: int = DEGREE) -> Make:
