@@ -15,8 +15,9 @@ from drivers.errors import BrokenFrame
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 
-# cv_bridge's names for pictures whose colours nobody declared; OpenCV's order is bgr
-_SAME_AS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16"}
+# cv_bridge's names for pictures whose colours nobody declared, OpenCV's order being bgr; image_encodings.hpp's for YUV
+_SAME_AS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16",
+            "yuv422_yuy2": "yuyv", "yuv422": "uyvy"}
 _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 
 

@@ -7,6 +7,7 @@ from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
 from drivers.differential_drive import DifferentialDrive
+from drivers.log_folder import Rotation
 from drivers.motor_protocols import PROTOCOLS
 from drivers.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from omnid.core.command_limits import CommandLimits
@@ -119,7 +120,8 @@ class MappingConfig:
     voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
     log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
     max_sigma_m: float = knob(0.15, "points less certain than this stay out of the map, m", low=0.001, high=100)
-    min_frames: int = knob(2, "frames that must have seen a voxel before it is written", low=1, high=1000)
+    min_frames: int = knob(5, "frames that must have seen a voxel before it is written; fewer in a short run", low=1,
+                           high=1000)
     path_poses: int = knob(100_000, "poses kept for the plan view; beyond, every second is forgotten", low=100,
                            high=10_000_000)
 
@@ -149,10 +151,27 @@ class MotorConfig:
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
-    """What `--record` writes."""
+    """What `omnid run`, `omnid record` and `--record` write."""
 
+    enabled: bool = knob(False, "omnid run records what the cameras see and what is made of it")
+    folder: str = knob("recordings", "where the recordings are kept; one that is missing is made")
+    file_mb: int = knob(500, "a new file is begun after so many MB", low=1, high=1_000_000)
+    file_s: float = knob(600.0, "or after so many seconds", low=1, high=86_400)
+    keep_files: int = knob(1000, "files kept; the oldest are deleted", low=1, high=100_000)
+    keep_mb: int = knob(20_000, "MB of all files together; the oldest are deleted", low=2, high=1_000_000_000)
+    free_mb: int = knob(1000, "MB left on the disk to others; where there is less, nothing is recorded", low=0,
+                        high=1_000_000)
+    sync_s: float = knob(3.0, "the files are brought to the disk this often, s: what a power cut may cost", low=0.1,
+                         high=3600)
+    queue: int = knob(20, "messages of each kind that may wait for the disk; the oldest are dropped and counted",
+                      low=1, high=1000)
     cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
                              high=10_000_000)
+
+    def rotation(self) -> Rotation:
+        """The same for the driver of the files."""
+        return Rotation(self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6, self.free_mb * 10**6,
+                        self.sync_s)
 
 
 @dataclass(frozen=True, slots=True)

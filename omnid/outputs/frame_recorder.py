@@ -1,0 +1,82 @@
+"""What the robot sees and does, written down while it happens: pictures as they came, poses, commands, maps, states."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final, TypeAlias
+
+from drivers.frame import Frame
+from drivers.rotating_log import RecordingState, RotatingLog
+from omnid.errors import OmnidError
+from omnid.messages import Odometry
+from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports
+from omnid.transport.image_codec import image_cdr, image_topic
+
+Recorded: TypeAlias = Frame | Outgoing
+_WAITING: Final = 64  # of what other threads add
+
+
+class FrameRecorder:
+    """A sink for a live run. Give it an inbox that forgets (policy NEWEST): no stage waits for a disk.
+
+    offset_ns: from the stamps of the messages to Unix time; the encoder has the same. Without an encoder it takes
+    frames only. Never raises; `state` counts what was lost beyond its inbox, `unfit` what could not be encoded.
+    """
+
+    def __init__(self, log: RotatingLog, robot: str, encode: Encoder | None = None, *, offset_ns: int = 0) -> None:
+        self._log, self._robot, self._encode, self._offset_ns = log, robot, encode, offset_ns
+        self._states = StateReports()
+        self._added: deque[tuple[Encoded, int]] = deque(maxlen=_WAITING)
+        self._files = 0
+        self.unfit = 0
+
+    @property
+    def state(self) -> RecordingState:
+        """How the recording is."""
+        return self._log.state
+
+    def process(self, message: Recorded) -> None:
+        """Records what there is to say about a message."""
+        stamp_ns = message.stamp_ns + self._offset_ns
+        try:
+            self._write(self._encoded(message, stamp_ns), stamp_ns)
+        except OmnidError:  # a stamp that is no time
+            self.unfit += 1
+        while self._added:
+            said, at_ns = self._added.popleft()
+            self._write([said], at_ns)
+
+    def add(self, said: Encoded, stamp_ns: int) -> None:
+        """Records a message that is ready, at its Unix time, with the next one that is processed; from any thread."""
+        self._added.append((said, stamp_ns))
+
+    def finish(self) -> None:
+        """Makes the last file whole."""
+        self.close()
+
+    def close(self) -> None:
+        """Makes the last file whole; a second call does nothing."""
+        self._log.close()
+
+    def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[Encoded]:
+        if isinstance(message, Frame):
+            return [Encoded(image_topic(message), *image_cdr(message, stamp_ns))]
+        if self._encode is None:
+            return []
+        said = list(self._encode(message))
+        if isinstance(message, Odometry):
+            said += self._state(replace(message, stamp_ns=stamp_ns))
+        return said
+
+    def _state(self, odometry: Odometry) -> Iterable[Encoded]:
+        """The state of the odometry when it changes, and once in every file."""
+        if self._files != self.state.files:
+            self._files, self._states = self.state.files, StateReports()
+        return self._states(odometry)
+
+    def _write(self, messages: Iterable[Encoded], stamp_ns: int) -> None:
+        for topic, schema, payload in messages:
+            name = topic if topic.startswith("/") else f"/{self._robot}/{topic}"
+            self._log.write(name, schema, payload, stamp_ns)

@@ -1,0 +1,65 @@
+"""Frames as the picture messages of ROS 2, under names that its own tools and `omnid replay` know.
+
+Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as drivers.ros_image reads it:
+pictures are nearly all of a recording, and this copies each of them once.
+"""
+
+from __future__ import annotations
+
+from struct import pack
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frame import Frame
+from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
+from omnid.errors import OmnidError
+from omnid.transport.codec import MAX_SECONDS, NS_PER_S
+
+COMPRESSED: Final = ("jpeg", "png")
+# drivers.frame's name -> that of sensor_msgs/image_encodings.hpp, where it is another
+_ROS_NAMES: Final = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
+_PIXEL_BYTES: Final = {"mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2}
+
+
+def image_topic(frame: Frame) -> str:
+    """The frame's topic below the robot's, such as lower/image_raw/compressed."""
+    return f"{frame.camera}/image_raw" + ("/compressed" if frame.encoding in COMPRESSED else "")
+
+
+def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
+    """Schema and CDR bytes of a frame, undecoded, with another stamp [ns of Unix time]; its frame_id is the camera.
+
+    OmnidError where the stamp is no time of ROS.
+    """
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    if not 0 <= seconds <= MAX_SECONDS:
+        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
+    header = _aligned(pack("<iI", seconds, nanoseconds) + _string(frame.camera))
+    data = np.frombuffer(frame.data, np.uint8)
+    if frame.encoding in COMPRESSED:
+        return COMPRESSED_IMAGE, _message(_aligned(header + _string(frame.encoding)), data)
+    step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)
+    size, name = pack("<II", frame.height, frame.width), _ROS_NAMES.get(frame.encoding, frame.encoding)
+    layout = _aligned(size + _string(name) + bytes([frame.bigendian])) + pack("<I", step)
+    return IMAGE, _message(header + layout, data[: step * _rows(frame)])
+
+
+def _rows(frame: Frame) -> int:
+    """How many rows a whole picture has; a driver's buffer may be longer, which ROS does not take."""
+    return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # colours in rows of their own
+
+
+def _message(head: bytes, data: NDArray[Any]) -> bytes:
+    """head is a multiple of 4 bytes long."""
+    return b"".join((b"\0\1\0\0", head, pack("<I", data.size), data.data))
+
+
+def _string(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return pack("<I", len(data)) + data
+
+
+def _aligned(block: bytes) -> bytes:
+    return block + bytes(-len(block) % 4)
