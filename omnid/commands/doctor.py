@@ -1,0 +1,56 @@
+"""`omnid doctor`: whether everything is there that the daemon needs, and what to do about what is not."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:
+    from omnid.config import Config
+    from omnid.doctor.finding import Finding
+
+ROOT = Path("/")  # where sys, dev and proc are
+LOGS = Path("/var/lib/omnid")
+BYTES_PER_PIXEL = 0.3  # of a JPEG of a textured picture, on the safe side
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `doctor` to the command line."""
+    parser = subparsers.add_parser("doctor", help="check cameras, USB, motor, rig, clock, rights, bus and disk")
+    parser.add_argument("--logs", type=Path, default=LOGS, metavar="FOLDER", help=f"where logs will go ({LOGS})")
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prints a line for each check; 1 if something is wrong."""
+    from omnid.config import Config
+    from omnid.doctor.finding import verdict
+    from omnid.settings import load
+
+    found: list[Finding] = []
+    for finding in examine(load(Config, args.config, args.overrides), args.logs):
+        print(finding, flush=True)
+        found.append(finding)
+    print(verdict(found))
+    return int(any(finding.level == "wrong" for finding in found))
+
+
+def examine(config: Config, logs: Path) -> Iterator[Finding]:
+    """All checks, the quick ones first."""
+    from omnid.doctor import cameras, devices, machine, wiring
+
+    eyes, wanted = config.cameras, config.realtime
+    yield from machine.programs()
+    yield from cameras.cameras({name: eyes.settings(name) for name in ("lower", "upper")}, ROOT)
+    yield from wiring.rig(Path(eyes.rig), (eyes.width_px, eyes.height_px))
+    yield from wiring.motor(config.motor.port, ROOT)
+    yield devices.memberships()
+    yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
+    yield from machine.clock()
+    yield machine.disk(logs, 2 * eyes.width_px * eyes.height_px * BYTES_PER_PIXEL * (eyes.rate_hz or 30.0))
+    yield from wiring.bus(config.bus.listen, config.bus.connect)

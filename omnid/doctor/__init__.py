@@ -1,0 +1,1 @@
+"""What `omnid doctor` looks at; every check takes plain values and gives findings."""

@@ -1,0 +1,147 @@
+"""The cameras: there, two of them, with the modes that are asked for, and room for their pictures on USB.
+
+A high-speed USB 2 bus carries 480 Mbit/s, of which all streams together get 80 %, and one stream 3 packets of 1024
+bytes per microframe of 125 us (USB 2.0, 5.6.3 and 5.6.4).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from drivers.errors import DriverError
+from drivers.v4l2_devices import CaptureDevice, capture_devices
+from drivers.v4l2_modes import choose
+from drivers.v4l2_settings import V4l2Settings
+from omnid.doctor.devices import access, holders, is_ours
+from omnid.doctor.finding import Finding
+
+HIGH_SPEED_MBPS: Final = 480.0
+BUS_MBPS: Final = 0.8 * HIGH_SPEED_MBPS
+STREAM_MBPS: Final = 3 * 1024 * 8 * 8000 * 1e-6
+BYTES_PER_PIXEL: Final = {"GREY": 1.0, "NV12": 1.5, "YUYV": 2.0, "UYVY": 2.0}  # all planes; others are compressed
+_USUAL_RATE_HZ: Final = 30.0
+_OTHER_PORT = "plug one into a port of another USB controller, see `lsusb -t`"
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What a camera will send, and where to."""
+
+    name: str
+    pixel_format: str
+    rate_mbps: float  # 0: compressed, so not known
+    bus: str  # number of the USB bus, "" if it is none
+    bus_mbps: float  # speed of the camera on it
+
+
+def cameras(wanted: Mapping[str, V4l2Settings], root: Path = Path("/")) -> Iterator[Finding]:
+    """A finding for each camera, and one for each USB bus that carries any. `root` holds sys, dev and proc."""
+    known = capture_devices(root)
+    streams: list[Stream] = []
+    for name, settings in wanted.items():
+        device = _found(settings, known, root)
+        yield from _camera(name, settings, device, root)
+        if device is not None and (stream := _stream(name, settings, device, root)):
+            streams.append(stream)
+    nodes = {_resolved(settings.device, root) for settings in wanted.values()}
+    if len(nodes) < len(wanted):
+        yield Finding("wrong", "cameras", "all lead to one device", "give each its own, see `omnid cameras`")
+    yield from buses(streams)
+
+
+def buses(streams: list[Stream]) -> Iterator[Finding]:
+    """Whether what the cameras send fits through each USB bus."""
+    by_bus: defaultdict[str, list[Stream]] = defaultdict(list)
+    for stream in streams:
+        by_bus[stream.bus].append(stream)
+    for bus, sharing in sorted(by_bus.items()):
+        yield _bus(f"usb bus {bus}", sharing) if bus else Finding("ok", "usb", f"{_names(sharing)}: not on USB")
+
+
+def _bus(subject: str, sharing: list[Stream]) -> Finding:
+    slow = [stream for stream in sharing if stream.bus_mbps <= HIGH_SPEED_MBPS]
+    needed_mbps = sum(stream.rate_mbps for stream in slow)
+    for stream in slow:
+        if stream.rate_mbps > STREAM_MBPS:
+            return Finding("wrong", subject, f"{stream.name} would send {stream.rate_mbps:.0f} Mbit/s, one camera can "
+                           f"send {STREAM_MBPS:.0f} over USB 2", "lower cameras.rate_hz or the size, or take MJPG")
+    if needed_mbps > BUS_MBPS:
+        return Finding("wrong", subject, f"{_names(slow)} would send {needed_mbps:.0f} Mbit/s over one USB 2 bus, "
+                       f"which carries {BUS_MBPS:.0f}", f"{_OTHER_PORT}, or lower cameras.rate_hz")
+    if len(slow) > 1 and not all(stream.rate_mbps for stream in slow):
+        return Finding("warning", subject, f"{_names(slow)} share a USB 2 bus, on which many cameras reserve more than "
+                       "their compressed pictures need", f"if one does not start (no space left): {_OTHER_PORT}")
+    sent = f"{needed_mbps:.0f} of {BUS_MBPS:.0f} Mbit/s" if needed_mbps else f"{sharing[0].bus_mbps:.0f} Mbit/s"
+    return Finding("ok", subject, f"{_names(sharing)}: {sent}")
+
+
+def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, root: Path) -> Iterator[Finding]:
+    """That one camera can be used as it is asked to be, or all that speaks against it."""
+    subject, path = f"camera {name}", root / settings.device.lstrip("/")
+    if not path.exists():
+        yield Finding("wrong", subject, f"{settings.device} is not there",
+                      "plug it in; `omnid cameras` lists what is there and the udev rule for this name")
+    elif device is None:
+        yield Finding("wrong", subject, f"{settings.device} is no camera", "choose one of `omnid cameras`")
+    else:
+        against = [*access(subject, path), *_troubles(subject, settings, device)]
+        others = [holder for holder in holders(path, root) if not is_ours(holder)]
+        if others:
+            against.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}", "end it"))
+        yield from against or [Finding("ok", subject, f"{device.name} at {device.node}, {_picture(settings, device)}")]
+
+
+def _troubles(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:
+    if device.problem:
+        yield Finding("wrong", subject, device.problem)
+        return
+    try:
+        _format(settings, device)
+    except DriverError as error:
+        yield Finding("wrong", subject, str(error), "change [cameras] in the configuration")
+
+
+def _format(settings: V4l2Settings, device: CaptureDevice) -> str:
+    size = settings.width_px, settings.height_px
+    return choose(device.modes, settings.pixel_format, size, settings.rate_hz)
+
+
+def _picture(settings: V4l2Settings, device: CaptureDevice) -> str:
+    rate = f" at {settings.rate_hz:g} Hz" if settings.rate_hz else ""
+    return f"{_format(settings, device)} {settings.width_px}x{settings.height_px}{rate}"
+
+
+def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path) -> Stream | None:
+    """What the camera will send; None where it cannot send what is asked for."""
+    try:
+        pixel_format = _format(settings, device)
+    except DriverError:
+        return None
+    bits = settings.width_px * settings.height_px * BYTES_PER_PIXEL.get(pixel_format, 0.0) * 8
+    return Stream(name, pixel_format, bits * (settings.rate_hz or _USUAL_RATE_HZ) * 1e-6, *_usb(device, root))
+
+
+def _usb(device: CaptureDevice, root: Path) -> tuple[str, float]:
+    """Number of the USB bus and speed of the camera on it, Mbit/s; ("", 0) where it is on none."""
+    port = (root / "sys/class/video4linux" / Path(device.node).name / "device").resolve()
+    for folder in (port, *port.parents):
+        if (folder / "busnum").is_file():
+            return (folder / "busnum").read_text().strip(), float((folder / "speed").read_text())
+    return "", 0.0
+
+
+def _found(settings: V4l2Settings, known: list[CaptureDevice], root: Path) -> CaptureDevice | None:
+    asked = _resolved(settings.device, root)
+    return next((device for device in known if _resolved(device.node, root) == asked), None)
+
+
+def _resolved(device: str, root: Path) -> Path:
+    return (root / device.lstrip("/")).resolve()
+
+
+def _names(streams: list[Stream]) -> str:
+    return " and ".join(f"{stream.name} ({stream.pixel_format})" for stream in streams)

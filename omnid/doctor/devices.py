@@ -1,0 +1,75 @@
+"""Who may open a device, and who has."""
+
+from __future__ import annotations
+
+import grp
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from omnid.doctor.finding import Finding
+
+GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
+OURSELVES: Final = "omnid"
+_MAX_PROCESSES: Final = 100_000
+
+
+def access(subject: str, device: Path) -> Iterator[Finding]:
+    """Whether we may open the device, and whether the service may; nothing where all is well."""
+    found = device.stat()
+    group = _group(found.st_gid)
+    if not os.access(device, os.R_OK | os.W_OK):
+        yield Finding("wrong", subject, f"no permission for {device} of group {group}",
+                      f"`sudo usermod -aG {group} $USER`, then log in again")
+    if group not in GROUPS and found.st_mode & 0o006 != 0o006:
+        yield Finding("warning", subject, f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
+                      f"`systemctl edit omnid`: [Service], SupplementaryGroups={group}")
+
+
+def memberships(names: Sequence[str] = GROUPS) -> Finding:
+    """Whether whoever asks is in the groups of cameras and serial ports."""
+    missing = [name for name in names if _gid(name) not in {*os.getgroups(), os.getegid()}]
+    if os.geteuid() == 0:
+        return Finding("ok", "groups", "root may open all devices")
+    if missing:
+        return Finding("warning", "groups", f"you are not in {' and '.join(missing)}; the service is",
+                       f"`sudo usermod -aG {','.join(missing)} $USER`, then log in again")
+    return Finding("ok", "groups", f"you are in {' and '.join(names)}")
+
+
+def holders(device: Path, root: Path = Path("/")) -> list[str]:
+    """The other processes that have the device open, as "name (pid 12)"; without root only one's own are seen."""
+    target, found = device.resolve(), []
+    processes = [entry for entry in (root / "proc").glob("[0-9]*") if entry.name != str(os.getpid())]
+    for process in processes[:_MAX_PROCESSES]:
+        with suppress(OSError):  # it ended, or it is not ours to ask
+            if any(_leads_to(entry, target) for entry in (process / "fd").iterdir()):
+                found.append(f"{(process / 'comm').read_text('utf-8', 'replace').strip()} (pid {process.name})")
+    return found
+
+
+def is_ours(holder: str) -> bool:
+    """Whether a holder is the daemon."""
+    return holder.startswith(OURSELVES)
+
+
+def _leads_to(entry: Path, target: Path) -> bool:
+    with suppress(OSError):
+        return os.readlink(entry) == str(target)
+    return False
+
+
+def _group(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _gid(name: str) -> int | None:
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        return None

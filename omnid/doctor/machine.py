@@ -1,0 +1,105 @@
+"""The machine: its clocks, the rights to real time, the disk, the programs omnid is built on."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+from omnid.doctor.finding import Finding
+from omnid.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
+
+PARTS: Final = {"numpy": "numpy", "opencv-python-headless": "cv2", "eclipse-zenoh": "zenoh", "mcap": "mcap",
+                "rosbags": "rosbags", "pyserial": "serial", "filterpy": "filterpy"}  # package: module
+BUILT_S: Final = 1_735_689_600  # the start of 2025: no clock that is right shows less
+_UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
+_TIMEX_BYTES: Final = 1024  # more than struct timex has anywhere
+_SLOW_CLOCKS: Final = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
+_LEAST_BYTES: Final = 1 << 30
+_LEAST_S: Final = 600.0
+
+
+def clock(now_s: float | None = None, synchronised: bool | None = None, root: Path = Path("/")) -> Iterator[Finding]:
+    """Whether the time of day is right and kept so, and whether asking for the time is quick."""
+    now_s = time.time() if now_s is None else now_s
+    synchronised = is_synchronised() if synchronised is None else synchronised
+    shown = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
+    if now_s < BUILT_S:
+        yield Finding("wrong", "clock", f"it is not {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`")
+    elif not synchronised:
+        yield Finding("warning", "clock", f"{shown}, nobody keeps it right: logs of several machines will not match",
+                      "`timedatectl set-ntp true`, or install chrony")
+    else:
+        yield Finding("ok", "clock", f"{shown}, synchronised")
+    source = _word(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
+    if source in _SLOW_CLOCKS:
+        yield Finding("warning", "monotonic", f"the kernel reads time from {source}, which takes microseconds",
+                      "see `dmesg | grep -i clocksource` for why it left the processor's own")
+    else:
+        yield Finding("ok", "monotonic", f"CLOCK_MONOTONIC from {source or 'an unnamed source'}")
+
+
+def is_synchronised() -> bool:
+    """Whether the kernel is told the right time by somebody, be it chrony, ntpd or systemd-timesyncd."""
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # all zeros: only asks
+    return state not in (-1, _UNSYNCHRONISED)
+
+
+def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
+    """Whether whoever asks may have the real-time priority, and may lock memory."""
+    highest = highest_priority()
+    if priority > highest:
+        yield Finding("warning", "real time", f"priority {priority} is refused, {highest} is the highest here; the "
+                      "unit has LimitRTPRIO", priority_advice(priority))
+    else:
+        yield Finding("ok", "real time", f"priorities up to {highest} are allowed")
+    if lock_memory and not may_lock():
+        yield Finding("warning", "memory", "here it cannot be locked; the unit has LimitMEMLOCK", LOCK_ADVICE)
+    else:
+        yield Finding("ok", "memory", "it can be locked" if may_lock() else "it is not to be locked")
+
+
+def disk(folder: Path, bytes_per_s: float) -> Finding:
+    """Whether a log can be written in the folder, or in what is there of its path, and for how long."""
+    place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(place).free
+    lasts_s = free / max(bytes_per_s, 1.0)
+    found = f"{free / 1e9:.1f} GB free at {place}, {lasts_s / 3600:.1f} h of recording"
+    if free < _LEAST_BYTES or lasts_s < _LEAST_S:
+        return Finding("warning", "disk", found, "delete old logs, or record elsewhere")
+    if not os.access(place, os.W_OK):
+        return Finding("warning", "disk", f"{place} cannot be written by you; the service writes in /var/lib/omnid",
+                       "record elsewhere, or with sudo")
+    return Finding("ok", "disk", found)
+
+
+def programs() -> Iterator[Finding]:
+    """What omnid is built on, each with its version; what is missing or cannot be loaded."""
+    loaded: list[str] = []
+    for package, module in PARTS.items():
+        try:
+            import_module(module)
+            loaded.append(f"{module} {_version(package)}")
+        except ImportError as error:
+            yield Finding("wrong", "programs", f"{package}: {error}", f"/opt/omnid/bin/pip install {package}")
+    yield Finding("ok", "programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
+
+
+def _version(package: str) -> str:
+    with suppress(PackageNotFoundError):
+        return version(package)
+    return "(of another package)"  # OpenCV has four, and distributions their own
+
+
+def _word(path: Path) -> str:
+    with suppress(OSError):
+        return path.read_text("utf-8", "replace").strip()[:40]
+    return ""
