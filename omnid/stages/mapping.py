@@ -15,6 +15,9 @@ from omnid.messages import MapUpdate, Odometry
 
 Array = NDArray[np.float64]
 
+LEAST_FRAMES = 2  # that must have seen a voxel, however short the run,
+SHORT_RUN = 10  # and one more for so many frames of the run, up to what is asked for
+
 
 class Path:
     """Where the rig was, in bounded memory: every second point is forgotten when it is full."""
@@ -49,6 +52,7 @@ class Mapping:
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
         self._path = Path(config.path_poses)
         self._newest: tuple[int, int] | None = None
+        self._frames = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -58,6 +62,7 @@ class Mapping:
     def process(self, odometry: Odometry) -> MapUpdate | None:
         """Takes the points of a pair, and gives the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
+        self._frames += 1
         self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
         if odometry.state == TRACKING:
             depth = odometry.depth
@@ -74,4 +79,6 @@ class Mapping:
         return [] if self._newest is None else [self._update(*self._newest)]
 
     def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
-        return MapUpdate(seq, stamp_ns, self._map.points(self._config.min_frames), self._path.xy())
+        """What enough frames agree about: false matches are seldom made twice in the same place."""
+        enough = min(self._config.min_frames, max(LEAST_FRAMES, self._frames // SHORT_RUN))
+        return MapUpdate(seq, stamp_ns, self._map.points(enough), self._path.xy())

@@ -21,8 +21,8 @@ from omnid.core.trajectory import read_tum
 from omnid.graph import Graph, Stream
 from omnid.messages import Depth, FramePair, Odometry, Panoramas
 from omnid.outputs.tally import Tally
+from omnid.pace import Pace
 from omnid.pipeline import Ends, wire
-from omnid.realtime import Pace
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.guidance import Guidance
