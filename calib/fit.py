@@ -133,15 +133,15 @@ def _plausible(views: list[BoardView], board: Board, size: tuple[int, int],
 
 
 def _bad_views(fit: Adjusted) -> NDArray[np.bool_]:
-    """Which views (K,) are off by much more than the others; the worst third of them at most."""
-    errors = np.nanmean(fit.errors_px, axis=1)
+    """Which views (K,) are off by much more than the others, by most of their corners; the worst third at most."""
+    errors = np.nanmedian(fit.errors_px, axis=1)
     bad = errors > max(BAD_RATIO * float(np.median(errors)), BAD_PX)
     bad[np.argsort(-errors)[max(1, len(errors) // 3):]] = False
     return np.asarray(bad)
 
 
 def _too_far(view: BoardView, fit: Adjusted, k: int) -> Rejected:
-    errors = np.nanmean(fit.errors_px, axis=1)
+    errors = np.nanmedian(fit.errors_px, axis=1)
     return Rejected(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 

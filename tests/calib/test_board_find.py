@@ -1,0 +1,132 @@
+"""Boards in rendered mirror pictures: found in noise, shadow and haze, to a fraction of a pixel, and never invented."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.board import Board
+from calib.board_find import find_board
+from calib.camera import Array, Mask
+from calib.errors import CalibError
+from calib.ocam import OcamCamera
+from calib.unified import UnifiedCamera
+from tests.scenes.boards import Studio, around
+from tests.scenes.sensor import Sensor
+
+BOARD = Board(6, 5, 0.03)
+CAMERA = UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480))
+MASK = Mask((241.3, 237.8), 40.0, 232.0)
+STUDIO = Studio.of(BOARD, CAMERA, MASK)
+
+
+def poses(count: int, seed: int = 0, distance_m: tuple[float, float] = (0.15, 0.28)) -> list[Array]:
+    return around(CAMERA, BOARD, MASK, count, seed=seed, distance_m=distance_m)
+
+
+def errors_px(found: Array, truth: Array) -> Array:
+    """Distances to the truth, of the way round and the flip that fit: a flat board does not tell."""
+    grid = truth.reshape(BOARD.rows, BOARD.columns, 2)
+    ways = [way.reshape(-1, 2) for way in (grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1])]
+    distances = [np.linalg.norm(found - way, axis=1) for way in ways]
+    return min(distances, key=lambda way: float(np.nanmax(way)))
+
+
+@pytest.mark.parametrize(("sensor", "contrast", "shadow", "limit_px"), [
+    (Sensor(), (25.0, 225.0), 1.0, 0.08),
+    (Sensor(noise_sigma=6.0), (25.0, 225.0), 1.0, 0.5),
+    (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 1.0, 0.5),
+    (Sensor(), (25.0, 225.0), 0.3, 0.5),
+])
+def test_boards_are_found_all_around(sensor: Sensor, contrast: tuple[float, float], shadow: float,
+                                     limit_px: float) -> None:
+    for seed, T in enumerate(poses(3)):
+        shot = STUDIO.photograph(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
+        view = find_board(shot.picture, BOARD, "x").view
+        assert view is not None and view.confidence > 0.7, seed
+        off = errors_px(view.pixels, shot.corners)
+        assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
+
+
+def test_squares_of_six_pixels_are_enough() -> None:
+    T = poses(1, distance_m=(0.55, 0.6))[0]
+    shot = STUDIO.photograph(T)
+    sides = np.linalg.norm(np.diff(shot.corners.reshape(5, 6, 2), axis=1), axis=2)
+    assert 4 < np.median(sides) < 8
+    view = find_board(shot.picture, BOARD).view
+    assert view is not None
+    assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.3
+
+
+def test_a_board_through_a_fisheye_lens_is_found() -> None:
+    camera = OcamCamera((-180.0, 0.0, 1.2e-3), (238.0, 241.0), (1.0, 0.0, 0.0), (480, 480), "direct")
+    mask = Mask(camera.center, 0.0, 232.0)
+    T = around(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
+    shot = Studio.of(BOARD, camera, mask).photograph(T)
+    view = find_board(shot.picture, BOARD).view
+    assert view is not None
+    assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.2
+
+
+def test_the_order_is_a_grid_that_turns_clockwise_and_starts_at_a_dark_square() -> None:
+    for seed, T in enumerate(poses(3, seed=4)):
+        shot = STUDIO.photograph(T, seed=seed)
+        view = find_board(shot.picture, BOARD).view
+        assert view is not None
+        grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
+        along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+        assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
+        first, second = (grid[:2, i:i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
+        assert shot.picture[first[1], first[0]] < shot.picture[second[1], second[0]]
+        flipped = find_board(np.ascontiguousarray(shot.picture[:, ::-1]), BOARD).view
+        assert flipped is not None  # whichever way the optics flip the picture
+
+
+def test_a_hidden_corner_is_left_out_and_the_rest_is_kept() -> None:
+    shot = STUDIO.photograph(poses(1)[0])
+    picture = shot.picture.copy()
+    u, v = shot.corners[14].round().astype(int)
+    cv2.circle(picture, (int(u), int(v)), 4, 128, -1)
+    view = find_board(picture, BOARD).view
+    assert view is not None
+    off = errors_px(view.pixels, shot.corners)
+    assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
+
+
+@pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
+def test_another_count_is_not_found_and_the_right_one_is_told(asked: tuple[int, int]) -> None:
+    shot = STUDIO.photograph(poses(1, seed=2)[0])
+    search = find_board(shot.picture, Board(*asked, 0.03))
+    assert search.view is None
+    assert sorted(search.seen) == [5, 6]
+
+
+def test_no_board_is_found_where_there_is_none() -> None:
+    rng = np.random.default_rng(3)
+    noise = rng.integers(0, 255, (300, 300)).astype(np.uint8)
+    stripes = np.where(np.arange(300) // 10 % 2, 40, 200).astype(np.uint8)
+    dots = np.where(np.hypot(*(np.indices((300, 300)) % 30 - 15)) < 9, 30, 220).astype(np.uint8)
+    brickwork = np.where((np.indices((300, 300))[1] + 10 * (np.indices((300, 300))[0] // 12 % 2)) % 20 < 2, 30, 200)
+    pictures: list[NDArray[np.uint8]] = [noise, np.tile(stripes, (300, 1)), dots, brickwork.astype(np.uint8),
+                                         np.zeros((50, 40), np.uint8)]
+    for number, picture in enumerate(pictures):
+        search = find_board(picture, Board(4, 3, 0.03))
+        assert search.view is None, number
+
+
+def test_all_ten_real_pictures(shared_data: Path) -> None:
+    for number in range(10):
+        picture = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
+        view = find_board(picture.astype(np.uint8), Board(6, 7, 0.03)).view
+        assert view is not None and np.isfinite(view.pixels).all() and view.confidence > 0.95, number
+
+
+@pytest.mark.parametrize(("columns", "rows", "square_m"), [(2, 5, 0.03), (6, 61, 0.03), (6, 5, 0.0), (6, 5, -0.03),
+                                                           (6, 5, float("nan"))])
+def test_an_impossible_board_is_refused(columns: int, rows: int, square_m: float) -> None:
+    with pytest.raises(CalibError, match="board: expected"):
+        Board(columns, rows, square_m)

@@ -1,0 +1,110 @@
+"""`omnid calibrate camera`: from rendered pictures to camera.toml, report and mask; bad input is one clear line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.board import Board
+from calib.camera import Mask
+from calib.camera_file import read_camera
+from calib.ocam import OcamCamera
+from calib.unified import UnifiedCamera
+from omnid.cli import main
+from tests.scenes.boards import Studio, around
+
+BOARD = Board(6, 5, 0.03)
+CAMERA = UnifiedCamera(0.9, (-110.0, 110.5), (178.3, 181.1), (360, 362))
+MASK = Mask(CAMERA.center, 30.0, 172.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight pictures of a board, all around."""
+    made = tmp_path_factory.mktemp("pictures")
+    studio = Studio.of(BOARD, CAMERA, MASK)
+    for seed, T in enumerate(around(CAMERA, BOARD, MASK, 8, distance_m=(0.14, 0.25))):
+        cv2.imwrite(str(made / f"p{seed}.png"), studio.photograph(T, seed=seed).picture)
+    return made
+
+
+def run(*words: object, corners: str = "6x5") -> int:
+    return main(["calibrate", "camera", *map(str, words), "--corners", corners, "--square-mm", "30", "--quiet"])
+
+
+def test_pictures_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path,
+                                                    capsys: pytest.CaptureFixture[str]) -> None:
+    out, report, mask = (tmp_path / name for name in ("camera.toml", "report.html", "mask.png"))
+    assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
+    line = capsys.readouterr().out
+    assert line.count("\n") == 1 and "of 8 views" in line and "mean reprojection error 0.0" in line
+    read = read_camera(out)
+    assert isinstance(read.camera, OcamCamera) and read.camera.view == "mirror"
+    assert read.camera.center == pytest.approx(CAMERA.center, abs=0.3)
+    assert read.mask is not None and read.mask.outer_px == pytest.approx(MASK.outer_px, abs=3)
+    assert read.mask.inner_px == pytest.approx(MASK.inner_px, abs=4)
+    page = report.read_text()
+    assert page.count("data:image/jpeg;base64,") == 10 and "http" not in page
+    assert all(f"p{number}.png" in page for number in range(8)) and "standard deviation" in page
+
+
+def test_patterns_and_the_omni_model_with_a_picture_that_has_no_board(folder: Path, tmp_path: Path,
+                                                                      capsys: pytest.CaptureFixture[str]) -> None:
+    for path in folder.iterdir():
+        shutil.copy(path, tmp_path)
+    cv2.imwrite(str(tmp_path / "p9.png"), np.full((362, 360), 90, np.uint8))
+    assert run(f"{tmp_path}/p*.png", "--model", "omni", "-o", tmp_path / "camera.toml") == 0
+    assert "of 8 views" in capsys.readouterr().out
+    camera = read_camera(tmp_path / "camera.toml").camera
+    assert isinstance(camera, UnifiedCamera) and camera.focal == pytest.approx(CAMERA.focal, rel=2e-3)
+
+
+def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
+    """Words that name bad input."""
+    three = [folder / f"p{number}.png" for number in range(3)]
+    blank, other, text = tmp_path / "blank.png", tmp_path / "other.png", tmp_path / "notes.png"
+    cv2.imwrite(str(blank), np.full((362, 360), 90, np.uint8))
+    cv2.imwrite(str(other), np.full((300, 360), 90, np.uint8))
+    text.write_text("no picture")
+    (tmp_path / "empty").mkdir(exist_ok=True)
+    kinds: dict[str, list[object]] = {"blank": [blank], "three": [*three], "sizes": [*three, other], "text": [text],
+                                      "empty": [tmp_path / "empty"], "none": [tmp_path / "none.png"],
+                                      "topic": [*three, "--topic", "/x"], "log": [tmp_path / "none.mcap"]}
+    return kinds[kind]
+
+
+@pytest.mark.parametrize(("kind", "says"), [
+    ("blank", "no board of 6x5 inner corners in any of 1 pictures; count the inner corners"),
+    ("three", "needs 4 views of the board at least, found 3; take more pictures"),
+    ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
+    ("text", "notes.png: expected a picture"),
+    ("empty", "no picture"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
+])
+def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*bad_folder(tmp_path, folder, kind), "-o", tmp_path / "camera.toml") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert not (tmp_path / "camera.toml").exists()
+
+
+def test_the_wrong_count_is_told_the_right_one(folder: Path, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(folder / "p0.png", folder / "p1.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
+    assert "a grid of 5x6 was seen in 2: try --corners 5x6" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"], ["--corners", "6x5"]])
+def test_bad_options_are_one_line_too(folder: Path, tmp_path: Path, words: list[str],
+                                      capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate", "camera", str(folder), *words, "-o", str(tmp_path / "c.toml")])
+    assert ended.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert main(["calibrate", "camera", str(folder), "--corners", "6x5", "--square-mm", "-3", "-o",
+                 str(tmp_path / "c.toml")]) == 2
+    assert "squares of 0.1 mm to 10 m" in capsys.readouterr().err
