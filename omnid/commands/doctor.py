@@ -42,11 +42,12 @@ def run(args: argparse.Namespace) -> int:
 
 def examine(config: Config, logs: Path) -> Iterator[Finding]:
     """All checks, the quick ones first."""
+    from drivers.v4l2_devices import capture_devices
     from omnid.doctor import cameras, devices, machine, wiring
 
     eyes, wanted = config.cameras, config.realtime
     yield from machine.programs()
-    yield from cameras.cameras({name: eyes.settings(name) for name in ("lower", "upper")}, ROOT)
+    yield from cameras.cameras({name: eyes.settings(name) for name in ("lower", "upper")}, capture_devices(ROOT), ROOT)
     yield from wiring.rig(Path(eyes.rig), (eyes.width_px, eyes.height_px))
     yield from wiring.motor(config.motor.port, ROOT)
     yield devices.memberships()

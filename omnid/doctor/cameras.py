@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import DriverError
-from drivers.v4l2_devices import CaptureDevice, capture_devices
+from drivers.v4l2_devices import CaptureDevice
 from drivers.v4l2_modes import choose
 from drivers.v4l2_settings import V4l2Settings
 from omnid.doctor.devices import access, holders, is_ours
@@ -38,9 +38,13 @@ class Stream:
     bus_mbps: float  # speed of the camera on it
 
 
-def cameras(wanted: Mapping[str, V4l2Settings], root: Path = Path("/")) -> Iterator[Finding]:
-    """A finding for each camera, and one for each USB bus that carries any. `root` holds sys, dev and proc."""
-    known = capture_devices(root)
+def cameras(
+    wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path = Path("/")
+) -> Iterator[Finding]:
+    """A finding for each camera that is wanted, and one for each USB bus; `known` are those that are plugged in.
+
+    root: holds sys, dev and proc.
+    """
     streams: list[Stream] = []
     for name, settings in wanted.items():
         device = _found(settings, known, root)

@@ -25,7 +25,7 @@ def access(subject: str, device: Path) -> Iterator[Finding]:
                       f"`sudo usermod -aG {group} $USER`, then log in again")
     if group not in GROUPS and found.st_mode & 0o006 != 0o006:
         yield Finding("warning", subject, f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
-                      f"`systemctl edit omnid`: [Service], SupplementaryGroups={group}")
+                      "put GROUP=\"video\" or GROUP=\"dialout\" into its udev rule, see 90-omnid.rules")
 
 
 def memberships(names: Sequence[str] = GROUPS) -> Finding:

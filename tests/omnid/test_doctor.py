@@ -1,0 +1,341 @@
+"""The doctor: what is well is ok, and every fault is found and comes with what to do about it."""
+
+from __future__ import annotations
+
+import grp
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from calib.rig_file import read_rig, write_rig
+from drivers.v4l2_devices import CaptureDevice
+from drivers.v4l2_modes import Mode, Sizes
+from drivers.v4l2_settings import V4l2Settings
+from omnid.cli import main
+from omnid.doctor import machine
+from omnid.doctor.cameras import Stream, buses, cameras
+from omnid.doctor.devices import access, holders, memberships
+from omnid.doctor.finding import Finding, verdict
+from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
+from omnid.doctor.wiring import bus, motor, rig
+
+ROOT = Path(__file__).parents[2]
+NOBODY = 65534
+FORMATS = (Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0,)),
+           Mode("MJPG", Sizes(1280, 1280), Sizes(960, 960), (30.0, 15.0)))
+
+
+class Robot:
+    """A tree like /sys and /dev with two cameras, and what they say of themselves."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.known = [self._plug(number) for number in (0, 2)]
+
+    def _plug(self, number: int) -> CaptureDevice:
+        port = self.root / f"sys/devices/usb{number}/1-{number}/1-{number}:1.0"
+        port.mkdir(parents=True)
+        (port.parent / "busnum").write_text("1\n")
+        (port.parent / "speed").write_text("480\n")
+        entry = self.root / f"sys/class/video4linux/video{number}"
+        entry.mkdir(parents=True)
+        (entry / "device").symlink_to(port)
+        node = self.root / f"dev/video{number}"
+        (self.root / "dev/omnid").mkdir(parents=True, exist_ok=True)
+        node.touch()
+        node.chmod(0o666)
+        (self.root / f"dev/omnid/{'upper' if number else 'lower'}").symlink_to(node)
+        return CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "usb", "", "", "", FORMATS)
+
+    def examined(self, lower: str = "/dev/omnid/lower", **how: int | str | float) -> list[Finding]:
+        """What is found of both cameras, set in this way."""
+        wanted = {name: V4l2Settings(device, **{"width_px": 1280, "height_px": 960, **how})  # type: ignore[arg-type]
+                  for name, device in (("lower", lower), ("upper", "/dev/omnid/upper"))}
+        return list(cameras(wanted, self.known, self.root))
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    return Robot(tmp_path)
+
+
+def levels(findings: list[Finding]) -> list[str]:
+    return [finding.level for finding in findings]
+
+
+@contextmanager
+def opened_elsewhere(path: Path | str) -> Iterator[None]:
+    """Another process has the file open."""
+    hold = "import sys; file = open(sys.argv[1], 'rb', buffering=0); print('here', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", hold, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as it:
+        assert it.stdout is not None and it.stdout.readline() == b"here\n"
+        yield
+        it.communicate()
+
+
+def test_cameras_that_can_do_what_is_asked(robot: Robot) -> None:
+    first, second, usb = robot.examined(pixel_format="YUYV", width_px=640, height_px=480)
+    assert str(first) == "ok       camera lower  HD Webcam at /dev/video0, YUYV 640x480 at 30 Hz"
+    assert second.level == "ok" and "/dev/video2" in second.found
+    assert (usb.level, usb.subject) == ("ok", "usb bus 1") and "295 of 384 Mbit/s" in usb.found
+
+
+def test_a_mode_that_is_not_offered(robot: Robot) -> None:
+    found = robot.examined(rate_hz=60.0)
+    assert levels(found) == ["wrong", "wrong"] and "MJPG 1280x960 at 30, 15 Hz" in found[0].found
+    assert "[cameras]" in found[0].mend
+
+
+def test_a_camera_that_is_not_there(robot: Robot) -> None:
+    found = robot.examined(lower="/dev/omnid/lowest")
+    assert found[0].level == "wrong" and "/dev/omnid/lowest is not there" in found[0].found
+    assert "omnid cameras" in found[0].mend and found[1].level == "ok"
+
+
+def test_what_is_no_camera(robot: Robot) -> None:
+    (robot.root / "dev/null").touch()
+    assert "is no camera" in robot.examined(lower="/dev/null")[0].found
+
+
+def test_a_camera_that_does_not_let_itself_be_asked(robot: Robot) -> None:
+    robot.known[0] = CaptureDevice("/dev/video0", "", "", "", "", "", "", (), "is broken; mend it")
+    assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "wrong"
+
+
+def test_one_camera_for_both(robot: Robot) -> None:
+    assert any("all lead to one device" in finding.found for finding in robot.examined(lower="/dev/video2"))
+
+
+def test_a_camera_that_somebody_else_has_open(robot: Robot) -> None:
+    (robot.root / "proc").symlink_to("/proc")
+    with opened_elsewhere(robot.root / "dev/video0"):
+        assert "is open in python" in robot.examined()[0].found
+    assert robot.examined()[0].level == "ok"
+
+
+@pytest.mark.parametrize(
+    ("streams", "level", "words"),
+    [
+        ([Stream("lower", "YUYV", 147.5, "1", 480), Stream("upper", "YUYV", 147.5, "1", 480)], "ok", "295 of 384"),
+        ([Stream("lower", "YUYV", 195, "1", 480), Stream("upper", "YUYV", 195, "1", 480)], "wrong", "390 Mbit/s over"),
+        ([Stream("lower", "YUYV", 590, "1", 480), Stream("upper", "GREY", 9, "1", 480)], "wrong", "would send 590"),
+        ([Stream("lower", "MJPG", 0, "1", 480), Stream("upper", "MJPG", 0, "1", 480)], "warning", "share a USB 2 bus"),
+        ([Stream("lower", "YUYV", 590, "2", 5000), Stream("upper", "YUYV", 590, "2", 5000)], "ok", "5000 Mbit/s"),
+        ([Stream("lower", "GREY", 900, "", 0), Stream("upper", "GREY", 900, "", 0)], "ok", "not on USB"),
+        ([Stream("lower", "MJPG", 0, "1", 480)], "ok", "480 Mbit/s"),
+    ],
+)
+def test_the_room_on_usb(streams: list[Stream], level: str, words: str) -> None:
+    (found,) = buses(streams)
+    assert found.level == level and words in found.found
+    assert (found.level == "ok") == (not found.mend)
+
+
+def test_each_bus_has_its_own_room() -> None:
+    streams = [Stream("lower", "YUYV", 195, "1", 480), Stream("upper", "YUYV", 195, "3", 480)]
+    found = [(finding.level, finding.subject) for finding in buses(streams)]
+    assert found == [("ok", "usb bus 1"), ("ok", "usb bus 3")]
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    """A serial port, as far as a pty is one."""
+    controller, own = os.openpty()
+    yield os.ttyname(own)
+    os.close(own)
+    os.close(controller)
+
+
+def test_a_motor_that_can_be_had(port: str) -> None:
+    os.chmod(port, 0o666)
+    assert [str(finding) for finding in motor(port)] == [f"ok       motor         {port}"]
+
+
+def test_a_port_of_a_group_that_the_service_is_not_in(port: str) -> None:
+    os.chmod(port, 0o660)
+    group = grp.getgrgid(os.stat(port).st_gid).gr_name
+    (found,) = motor(port)
+    assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.mend
+
+
+def test_a_port_that_is_in_use(port: str) -> None:
+    os.chmod(port, 0o666)
+    with opened_elsewhere(port):
+        (found,) = motor(port)
+    assert found.level == "wrong" and "in use by python" in found.found
+    assert levels(list(motor(port))) == ["ok"]
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "words"),
+    [("", "ok", "motor.port is empty"), ("simulated", "ok", "simulated"), ("/dev/ttyNOWHERE", "wrong", "is not there"),
+     ("/etc/passwd", "wrong", "is no serial port")],
+)
+def test_other_motors(name: str, level: str, words: str) -> None:
+    (found,) = motor(name)
+    assert found.level == level and words in found.found
+
+
+def test_a_device_that_is_closed_to_us() -> None:
+    """Asked by a user without rights, in a process of its own."""
+    with tempfile.NamedTemporaryFile(prefix="omnid-doctor-") as file:
+        _closed_then_open(Path(file.name))
+
+
+def _closed_then_open(device: Path) -> None:
+    device.chmod(0)
+    script = (f"import os, json; from pathlib import Path; from omnid.doctor.devices import access\n"
+              f"os.getuid() or os.setuid({NOBODY})\n"
+              f"print(json.dumps([str(finding) for finding in access('motor', Path('{device}'))]))")
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert "no permission" in json.loads(done.stdout)[0] and "usermod" in done.stdout, done.stderr
+    device.chmod(0o666)
+    assert list(access("motor", device)) == []
+
+
+def test_who_has_a_device_open_is_told_by_name() -> None:
+    with open(os.devnull), opened_elsewhere(ROOT / "pyproject.toml"):
+        (holder,) = holders(ROOT / "pyproject.toml")
+    assert holder.startswith("python") and "pid" in holder
+    assert holders(ROOT / "pyproject.toml") == []
+
+
+def test_groups() -> None:
+    assert memberships(()).level == "ok"
+    if os.geteuid():
+        missing = memberships(("no-such-group",))
+        assert missing.level == "warning" and "no-such-group" in missing.mend
+
+
+def test_a_rig_that_fits_its_cameras(scene: Path) -> None:
+    file = scene / "rig.toml"
+    size = read_rig(file).lower.camera.size
+    assert all(finding.level != "wrong" for finding in rig(file, size))
+    wrong = [finding for finding in rig(file, (1280, 960)) if finding.level == "wrong"]
+    assert len(wrong) == 2 and "256x256" in wrong[0].found and "asks for 1280x960" in wrong[0].found
+
+
+def test_a_rig_with_and_without_masks(scene: Path, tmp_path: Path) -> None:
+    bare, masked = tmp_path / "bare.toml", tmp_path / "masked.toml"
+    whole = read_rig(scene / "rig.toml")
+    write_rig(masked, whole)
+    write_rig(bare, replace(whole, lower=replace(whole.lower, mask=None), upper=replace(whole.upper, mask=None)))
+    (found,) = rig(bare, (256, 256))
+    assert found.level == "warning" and "no mask for lower and upper" in found.found
+    (found,) = rig(masked, (256, 256))
+    assert found.level == "ok" and "between the viewpoints" in found.found
+
+
+@pytest.mark.parametrize("text", [None, "", "nonsense = [", "schema = 99"])
+def test_a_rig_that_cannot_be_read(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "rig.toml").write_text(text)
+    (found,) = rig(tmp_path / "rig.toml", (1280, 960))
+    assert found.level == "wrong" and "omnid calibrate" in found.mend
+
+
+@pytest.mark.parametrize(
+    ("now_s", "synchronised", "level"),
+    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "wrong")],
+)
+def test_the_time_of_day(now_s: float, synchronised: bool, level: str, tmp_path: Path) -> None:
+    assert next(clock(now_s, synchronised, tmp_path)).level == level
+    assert is_synchronised() in (True, False)
+
+
+@pytest.mark.parametrize(("source", "level"), [("tsc", "ok"), ("arch_sys_counter", "ok"), ("hpet", "warning")])
+def test_the_source_of_time(source: str, level: str, tmp_path: Path) -> None:
+    folder = tmp_path / "sys/devices/system/clocksource/clocksource0"
+    folder.mkdir(parents=True)
+    (folder / "current_clocksource").write_text(f"{source}\n")
+    found = list(clock(BUILT_S + 1e8, True, tmp_path))[1]
+    assert found.level == level and source in found.found
+
+
+def test_rights_are_those_of_whoever_asks() -> None:
+    script = ("import os, resource; from omnid.doctor.machine import rights\n"
+              "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
+              f"os.getuid() or os.setuid({NOBODY})\n"
+              "print(*rights(20, True), *rights(0, False), sep='\\n')")
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["warning", "warning", "ok", "ok"], done.stderr
+    assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
+
+
+def test_room_for_logs(tmp_path: Path) -> None:
+    assert disk(tmp_path / "not" / "yet", 1.0).found.count(f"free at {tmp_path},") == 1
+    assert disk(tmp_path, 1e15).level == "warning" and "0.0 h of recording" in disk(tmp_path, 1e15).found
+
+
+def test_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    (found,) = programs()
+    assert found.level == "ok" and "cv2" in found.found and "zenoh 1." in found.found
+    monkeypatch.setitem(machine.PARTS, "missing-part", "missing_part")  # type: ignore[attr-defined]
+    assert [finding.level for finding in programs()] == ["wrong", "ok"]
+
+
+def test_a_router_that_answers_and_one_that_does_not() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        here = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        assert [finding.level for finding in bus((), (here,))] == ["ok"]
+    (found,) = bus((), (here,))
+    assert found.level == "warning" and f"{here} does not answer: Connection refused" in found.found
+    assert "lan.conf" in found.mend
+
+
+@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:7447", "unixsock-stream//tmp/x", "nonsense", ""])
+def test_a_router_that_cannot_be_tried(endpoint: str) -> None:
+    (found,) = bus((), (endpoint,))
+    assert found.level == "ok" and "is not tried" in found.found
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/no such host:1", "tcp/127.0.0.1:99999", "tcp/" + "x" * 300 + ":1"])
+def test_a_router_that_cannot_be(endpoint: str) -> None:
+    assert [finding.level for finding in bus((), (endpoint,))] == ["warning"]
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [("tcp/127.0.0.1:7447", True), ("tcp/[::1]:7447", True), ("tcp/localhost:7447", True),
+     ("unixsock-stream//run/x", True), ("tcp/0.0.0.0:7447", False), ("tcp/[::]:7447", False),
+     ("tcp/192.168.1.2:7447", False), ("udp/robot.local:7447", False)],
+)
+def test_who_may_call(endpoint: str, local: bool) -> None:
+    found = [finding for finding in bus((endpoint,), ()) if finding.subject == "bus"]
+    assert (found == []) == local
+
+
+def test_the_command_checks_everything_and_says_so_by_its_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = f"cameras.rig={tmp_path / 'rig.toml'}"
+    assert main(["doctor", "--logs", str(tmp_path), "--set", missing]) == 1
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert {line[:9].strip() for line in lines} <= {"ok", "warning", "wrong"}
+    for subject in ("camera lower", "camera upper", "rig", "motor", "groups", "real time", "memory", "clock", "disk",
+                    "router", "programs"):
+        assert any(line[9:].startswith(subject) for line in lines)
+    assert " wrong, " in last
+
+
+def test_a_configuration_that_is_wrong_is_no_finding(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
+    assert "cameras.width_px" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("found", "line"),
+    [(["ok", "ok"], "all 2 checks are ok"), (["ok", "wrong", "warning"], "1 wrong, 1 to be looked at, 1 ok")],
+)
+def test_the_last_line(found: list[str], line: str) -> None:
+    assert verdict([Finding(level, "", "") for level in found]) == line  # type: ignore[arg-type]
