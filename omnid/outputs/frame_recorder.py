@@ -42,6 +42,8 @@ class FrameRecorder:
         stamp_ns = message.stamp_ns + self._offset_ns
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
+            if isinstance(message, Odometry) and self._encode is not None:
+                self._write(self._state(replace(message, stamp_ns=stamp_ns)), stamp_ns)
         except OmnidError:  # a stamp that is no time
             self.unfit += 1
         while self._added:
@@ -63,12 +65,7 @@ class FrameRecorder:
     def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[Encoded]:
         if isinstance(message, Frame):
             return [Encoded(image_topic(message), *image_cdr(message, stamp_ns))]
-        if self._encode is None:
-            return []
-        said = list(self._encode(message))
-        if isinstance(message, Odometry):
-            said += self._state(replace(message, stamp_ns=stamp_ns))
-        return said
+        return self._encode(message) if self._encode is not None else []
 
     def _state(self, odometry: Odometry) -> Iterable[Encoded]:
         """The state of the odometry when it changes, and once in every file."""

@@ -1,0 +1,137 @@
+"""`omnid log`: what is in a recording, and a whole one out of one that is cut or corrupt."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drivers.mcap_recover import Recovery
+    from drivers.mcap_survey import Survey
+
+WIDEST = 60  # characters of a topic or a type in a column
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `log` to the command line."""
+    parser = subparsers.add_parser("log", help="look into MCAP logs, and make broken ones whole")
+    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
+    info = actions.add_parser("info", help="topics, types, counts, times, attachments; whole or broken")
+    info.add_argument("logs", type=Path, nargs="+", metavar="FILE", help=".mcap or .mcap.part")
+    info.set_defaults(run=run_info)
+    mend = actions.add_parser("recover", help="write what can be read of a cut or corrupt log to a new, whole one")
+    mend.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any maker")
+    mend.add_argument("-o", "--output", type=Path, metavar="OUT", help="default: FILE without .part, or "
+                      "FILE.recovered.mcap; nothing is overwritten")
+    mend.set_defaults(run=run_recover)
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Prints what is in each log; 1 if one is broken, 2 if one is none."""
+    from drivers.errors import DriverError
+    from drivers.mcap_survey import State, survey
+
+    code = 0
+    for number, path in enumerate(args.logs):
+        try:
+            found = survey(path)
+        except DriverError as error:
+            print(f"omnid: {error}", file=sys.stderr)
+            code = 2
+            continue
+        print(*[""] * bool(number), *_described(found), sep="\n")
+        code = max(code, int(found.state is State.BROKEN))
+    return code
+
+
+def run_recover(args: argparse.Namespace) -> int:
+    """Makes a log whole."""
+    from drivers.mcap_recover import recover
+
+    out = args.output or _mended(args.log)
+    print("\n".join(_reported(recover(args.log, out), args.log, out)))
+    return 0
+
+
+def _mended(path: Path) -> Path:
+    from drivers.log_folder import PART, without_part
+
+    return without_part(path) if path.name.endswith(PART) else path.with_name(f"{path.stem}.recovered.mcap")
+
+
+def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
+    yield f"{out}: {found.messages} messages and {found.attachments} attachments saved"
+    if found.whole:
+        yield f"{path} was whole already"
+        return
+    if found.lost:
+        yield f"lost: {found.lost} messages"
+    elif found.lost is None:
+        yield "lost: the log does not say how many messages there were"
+    if found.broken:
+        yield f"skipped: {found.broken} corrupt chunks or records"
+    yield f"{path} could be read up to byte {found.end} of {path.stat().st_size}; it was left as it is"
+
+
+def _described(found: Survey) -> Iterator[str]:
+    yield f"log          {found.path}"
+    yield f"size         {_bytes(found.size)}"
+    yield f"state        {_state(found)}"
+    duration_s = 0.0
+    if found.span_ns is not None:
+        first_ns, last_ns = found.span_ns
+        duration_s = max(0.0, (last_ns - first_ns) / 1e9)
+        yield f"time         {_utc(first_ns)} to {_utc(last_ns)}, {duration_s:.3f} s"
+    yield f"messages     {found.messages}"
+    listed = ", ".join(f"{_shown(name)} ({_bytes(size)})" for name, size in found.attachments.items())
+    yield f"attachments  {listed or 'none'}"
+    if found.topics:
+        yield from _table(found, duration_s)
+
+
+def _state(found: Survey) -> str:
+    from drivers.mcap_survey import State
+
+    advice = f"`omnid log recover {found.path}`"
+    if found.state is State.BROKEN:
+        corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
+        return f"cut or corrupt after byte {found.read} of {found.size}{corrupt}: {advice} saves what is whole"
+    if found.state is State.UNINDEXED:
+        return f"{found.state.value}, so some readers refuse it: {advice} gives it one"
+    return str(found.state.value)
+
+
+def _table(found: Survey, duration_s: float) -> Iterator[str]:
+    rows = [(_shown(name), _shown(kind) or "-", count) for name, (kind, count) in found.topics.items()]
+    wide = min(WIDEST, max(len(name) for name, _, _ in rows))
+    wide_kind = min(WIDEST, max(len(kind) for _, kind, _ in rows))
+    yield ""
+    yield f"{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}"
+    for name, kind, count in rows:
+        rate = f"{(count - 1) / duration_s:.2f}" if count > 1 and duration_s > 0 else "-"
+        yield f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}"
+
+
+def _shown(text: str) -> str:
+    """What a terminal should not print, made visible."""
+    return text if text.isprintable() else ascii(text)
+
+
+def _bytes(size: int) -> str:
+    for unit, factor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= factor:
+            return f"{size / factor:.1f} {unit}"
+    return f"{size} bytes"
+
+
+def _utc(stamp_ns: int) -> str:
+    """The time of day, or the bare seconds where the stamps are no Unix time of this age."""
+    from datetime import UTC, datetime
+
+    seconds, rest_ns = divmod(stamp_ns, 10**9)
+    if seconds > 2**33:
+        return f"{seconds} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 10**6:03}Z"

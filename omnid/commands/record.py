@@ -1,0 +1,61 @@
+"""`omnid record`: the pictures of both cameras into a folder, for a calibration, or to be replayed."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # whoever asks for another command does not load all this
+    from omnid.config import Config
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `record` to the command line."""
+    parser = subparsers.add_parser("record", help="record both cameras to MCAP files until Ctrl-C, and nothing else")
+    parser.add_argument("folder", type=Path, nargs="?", help="where to; default: record.folder of the settings")
+    parser.add_argument("--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it "
+                        "is there")
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Records; 1 where nothing was recorded."""
+    from drivers.frame import Camera
+    from drivers.v4l2_camera import V4l2Camera
+    from omnid.config import Config
+    from omnid.recording import record
+    from omnid.settings import load
+
+    named = {"record.folder": args.folder, "cameras.rig": args.rig}
+    config = load(Config, args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    rig = _rig(config, wanted=args.rig is not None)
+    cameras: tuple[Camera, Camera] = ("lower", "upper")
+    with ExitStack() as closing:
+        sources: dict[Camera, V4l2Camera] = {}
+        for name in cameras:
+            sources[name] = V4l2Camera(config.cameras.settings(name), name, report=_say)
+            closing.callback(sources[name].close)
+        state = record(sources, config, rig, _say).state
+    return 0 if state.messages > state.lost + state.refused else 1
+
+
+def _rig(config: Config, *, wanted: bool) -> str:
+    """The rig's TOML; "" where there is none: the recording may be for its calibration."""
+    from calib.rig_file import read_rig, rig_toml
+
+    path = Path(config.cameras.rig)
+    if not (wanted or path.exists()):
+        _say(4, f"no rig is attached, {path} is missing: replay will ask for one with --rig")
+        return ""
+    return rig_toml(read_rig(path))
+
+
+def _say(severity: int, text: str) -> None:
+    from omnid.journal import say
+
+    say(severity, text)

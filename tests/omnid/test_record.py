@@ -1,0 +1,225 @@
+"""Recordings of live pictures and poses: what other programs read, what a kill costs, what a slow disk costs."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from drivers.frame import Camera, Frame, gray
+from drivers.mcap_reader import LogReader
+from drivers.motor import VelocityCommand
+from omnid.config import Config
+from omnid.core.voxel_map import MapPoints
+from omnid.errors import OmnidError
+from omnid.graph import NEWEST, Graph
+from omnid.messages import MapUpdate, Odometry
+from omnid.outputs.encoded import Encoder, status_report
+from omnid.recording import open_recorder, record
+from omnid.transport.codec import Status
+from omnid.transport.image_codec import image_cdr, image_topic
+from tests.drivers.mcap_logs import STORE, jpeg
+
+ROOT = Path(__file__).parents[2]
+START_NS = 1_700_000_000 * 10**9
+OFFSET_NS = START_NS - 5 * 10**9  # the machine has been up for five seconds
+WIDTH, HEIGHT = 6, 4
+LENGTHS = {"mono8": 1, "mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
+
+
+def frame(seq: int, camera: Camera, encoding: str = "jpeg") -> Frame:
+    stamp_ns = 5 * 10**9 + seq * 33_333_333
+    if encoding == "jpeg":
+        return Frame(seq, stamp_ns, camera, encoding, jpeg(seq))
+    step = WIDTH * LENGTHS[encoding] + 4
+    rows = HEIGHT * 3 // 2 if encoding == "nv12" else HEIGHT
+    data = np.random.default_rng(seq).bytes(step * rows + 100)  # and what a buffer of a driver has at its end
+    return Frame(seq, stamp_ns, camera, encoding, data, WIDTH, HEIGHT, step)
+
+
+def settings(folder: Path, **more: Any) -> Config:
+    config = Config()
+    return replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=1, **more))
+
+
+def recorded(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
+def test_pictures_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, encoding: str) -> None:
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
+    given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
+    for each in given:
+        recorder.process(each)
+    recorder.finish()
+    (path,) = recorded(tmp_path / "log")
+    reader = LogReader(path)
+    ending = "/compressed" if encoding == "jpeg" else ""
+    assert reader.topics == {camera: f"/omnid/{camera}/image_raw{ending}" for camera in ("lower", "upper")}
+    for read, each in zip(reader.frames(), given, strict=True):
+        assert (read.camera, read.stamp_ns, read.encoding) == (each.camera, each.stamp_ns + OFFSET_NS, encoding)
+        assert np.array_equal(gray(read), gray(each))
+
+
+@pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
+def test_picture_messages_are_those_of_ros(encoding: str) -> None:
+    each = frame(7, "upper", encoding)
+    schema, payload = image_cdr(each, START_NS + 5)
+    message: Any = STORE.deserialize_cdr(payload, schema)
+    assert bytes(STORE.serialize_cdr(message, schema)) == payload
+    stamp = message.header.stamp
+    assert (stamp.sec, stamp.nanosec, message.header.frame_id) == (1_700_000_000, 5, "upper")
+    if encoding == "jpeg":
+        assert (message.format, bytes(message.data)) == ("jpeg", each.data)
+        return
+    names = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
+    assert (message.encoding, message.width, message.height) == (names.get(encoding, encoding), WIDTH, HEIGHT)
+    rows = HEIGHT * 3 // 2 if encoding == "nv12" else HEIGHT
+    assert message.step == each.step and bytes(message.data) == bytes(each.data)[: each.step * rows]
+
+
+def test_packed_rows_get_their_step() -> None:
+    packed = Frame(0, 0, "lower", "bgr8", bytes(WIDTH * HEIGHT * 3), WIDTH, HEIGHT)
+    message: Any = STORE.deserialize_cdr(image_cdr(packed, 0)[1], "sensor_msgs/msg/Image")
+    assert message.step == WIDTH * 3 and image_topic(packed) == "lower/image_raw"
+    with pytest.raises(OmnidError, match="-1 ns"):
+        image_cdr(packed, -1)
+
+
+def odometry(seq: int, state: str = "tracking") -> Odometry:
+    return Odometry(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
+                    None)  # type: ignore[arg-type]  # nobody asks for the depth
+
+
+def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None:
+    encode = Encoder(np.eye(4), 100, OFFSET_NS)
+    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode,
+                             offset_ns=OFFSET_NS)
+    points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
+    for n in range(4):
+        recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
+        recorder.process(VelocityCommand(5 * 10**9 + n, 0.1, math.nan, 0.2))
+    recorder.add(status_report(START_NS, [Status("omnid: test", 0, "fine", {})]), START_NS)
+    recorder.process(MapUpdate(0, 5 * 10**9, points, np.zeros((0, 2))))
+    recorder.finish()
+    (path,) = recorded(tmp_path / "log")
+    counts: dict[str, int] = {}
+    with AnyReader([path]) as bag:
+        for connection, stamp_ns, data in bag.messages():
+            counts[connection.topic] = counts.get(connection.topic, 0) + 1
+            message: Any = bag.deserialize(data, connection.msgtype)
+            header = message.transforms[0].header if connection.topic == "/tf" else message.header
+            written_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+            assert START_NS <= written_ns <= START_NS + 3 and stamp_ns == written_ns
+    assert counts == {"/omnid/odom": 4, "/omnid/pose": 4, "/tf": 4, "/omnid/drive": 4, "/omnid/status": 3,
+                      "/omnid/cloud": 1}
+    assert set(attached(path)) == {"omnid.toml", "rig.toml"}
+
+
+def attached(path: Path) -> list[str]:
+    with path.open("rb") as file:
+        return [attachment.name for attachment in make_reader(file).iter_attachments()]
+
+
+def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
+    config = settings(tmp_path / "log", file_s=1.0)
+    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), 0))
+    for n in range(30):
+        recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
+    recorder.finish()
+    files = recorded(tmp_path / "log")
+    assert len(files) == 3
+    for path in files:
+        with path.open("rb") as file:
+            assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/status"])) == 1
+
+
+def test_no_message_ends_the_run(tmp_path: Path) -> None:
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), 0))
+    for stamp_ns in (-1, 2**31 * 10**9, 2**70, START_NS):
+        recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
+        recorder.process(replace(odometry(0), stamp_ns=stamp_ns))
+    recorder.finish()
+    assert recorder.unfit == 6 and recorder.state.messages == 5 and recorder.state.lost == 0
+
+
+class Given:
+    """A source with pictures at hand."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+        self.frames = lambda: iter(self._frames)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_disk_that_stands_still_stops_no_camera(tmp_path: Path) -> None:
+    """The folder's first file is a pipe nobody reads: whoever opens it waits for good, or for us."""
+    config = settings(tmp_path / "log", queue=3)
+    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
+    writing = recorder.process
+    released = time.monotonic() + 0.5
+
+    def slow(message: Any) -> None:
+        while time.monotonic() < released:
+            time.sleep(0.01)
+        writing(message)
+
+    recorder.process = slow  # type: ignore[method-assign]
+    graph = Graph(policy=NEWEST, depth=3)
+    stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
+    seen: list[float] = []
+    passed = graph.stage("camera", Watch(seen), stream)
+    graph.sink("record", recorder, stream)
+    graph.sink("after", Ignored(), passed)
+    graph.run()
+    stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
+    assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
+    assert seen and min(seen) < released  # the others went on meanwhile
+
+
+class Watch:
+    """Notes when messages come by."""
+
+    def __init__(self, seen: list[float]) -> None:
+        self._seen = seen
+
+    def process(self, message: Frame) -> Frame:
+        """Notes the time."""
+        self._seen.append(time.monotonic())
+        return message
+
+
+class Ignored:
+    """An end."""
+
+    def process(self, message: Frame) -> None:
+        """Nothing."""
+
+
+def test_record_takes_both_cameras_and_tells_what_became_of_it(tmp_path: Path) -> None:
+    heard: list[tuple[int, str]] = []
+    now_ns = time.monotonic_ns()
+    sources = {camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
+               for camera in ("lower", "upper")}
+    before = signal.getsignal(signal.SIGTERM)
+    state = record(sources, settings(tmp_path / "log"), "version = 1",  # type: ignore[arg-type]
+                   lambda severity, text: heard.append((severity, text))).state
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert (state.messages, state.lost, state.status) == (20, 0, "closed")
+    assert "20 messages in 1 files" in heard[-1][1]
+    (path,) = recorded(tmp_path / "log")
+    reader = LogReader(path)
+    frames = list(reader.frames())
+    assert len(frames) == 20 and abs(frames[0].stamp_ns - time.time_ns()) < 60 * 10**9
+    assert "rig.toml" in reader.attachments()

@@ -1,0 +1,167 @@
+"""`omnid log` and `omnid record` from the outside: killed recordings made whole, and any bytes survived."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from drivers.mcap_writer import LogWriter
+from tests.drivers.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
+from tests.replay.command import Command
+
+ROOT = Path(__file__).parents[2]
+RECORDS = """
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from drivers.log_camera import LogCamera, Pictures
+from omnid.config import Config
+from omnid.recording import record
+
+log, rig, folder = map(Path, sys.argv[1:])
+config = Config()
+config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
+pictures = Pictures.of(log)
+start_ns = time.monotonic_ns()
+
+class Camera(LogCamera):
+    def frames(self):
+        for frame in super().frames():
+            line = f"{frame.camera} {frame.stamp_ns + time.time_ns() - time.monotonic_ns()}\\n"
+            os.write(1, line.encode())  # whole, whoever else writes
+            yield frame
+
+cameras = {name: Camera(pictures, name, start_ns, pace=3.0) for name in ("lower", "upper")}
+record(cameras, config, rig.read_text(), lambda *_: None)
+"""
+
+
+def recording(scene: Path, folder: Path) -> subprocess.Popen[str]:
+    """A program that records the scene at 30 pictures a second of either camera, and prints their stamps."""
+    command = [sys.executable, "-c", RECORDS, str(scene / "log.mcap"), str(scene / "rig.toml"), str(folder)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+def printed(process: subprocess.Popen[str], count: int) -> list[int]:
+    assert process.stdout is not None
+    return [int(process.stdout.readline().split()[1]) for _ in range(count)]
+
+
+def test_a_kill_costs_at_most_a_second_and_the_rest_is_whole_again(
+    tmp_path: Path, scene: Path, omnid: Command
+) -> None:
+    folder = tmp_path / "log"
+    with recording(scene, folder) as process:
+        stamps = printed(process, 150)  # 2.5 s
+        process.kill()
+        assert process.stdout is not None
+        stamps += [int(line.split()[1]) for line in process.stdout if line.endswith("\n")]
+    (part,) = folder.iterdir()
+    assert part.suffixes == [".mcap", ".part"]
+    assert omnid("log", "info", part).code == 1
+    assert omnid("log", "recover", part).code == 0
+    path = part.with_suffix("")
+    assert omnid("log", "info", path).code == 0
+    with path.open("rb") as file:
+        saved = sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages())
+    with AnyReader([path]) as bag:
+        times = [stamp for _, stamp, _ in bag.messages()]
+    assert len(times) == saved and max(stamps) - max(times) < 10**9
+    shortly_before_ns = max(times) - 216_000_000  # what the cameras gave at the same time may come in any order
+    assert sum(stamp < shortly_before_ns for stamp in times) == sum(stamp < shortly_before_ns for stamp in stamps)
+    replayed = omnid.replay(path, "--inline")
+    assert replayed.code == 0, replayed.err
+    assert replayed.count("pairs") >= saved // 2 - 1 and replayed.count("poses") >= saved // 2 - 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_recording_whole(tmp_path: Path, scene: Path, number: int) -> None:
+    folder = tmp_path / "log"
+    with recording(scene, folder) as process:
+        printed(process, 20)
+        process.send_signal(number)
+        rest = process.communicate(timeout=30)[0]
+    assert process.returncode == 0
+    (path,) = folder.iterdir()
+    with path.open("rb") as file:
+        count = sum(1 for _ in make_reader(file).iter_messages())
+    assert path.suffix == ".mcap" and count == 20 + rest.count("\n")
+
+
+def test_the_command_says_in_one_line_why_it_cannot(omnid: Command, tmp_path: Path) -> None:
+    code, _, err = omnid("record", tmp_path / "log", "--set", "cameras.lower=/dev/no/such")
+    assert code == 2 and re.search(r"/dev/no/such", err) and "Traceback" not in err
+    assert not os.path.exists(tmp_path / "log")
+    assert "rig.toml" in omnid.refused("record", "--rig", tmp_path / "rig.toml")
+
+
+def test_info_tells_what_is_in_a_log(omnid: Command, tmp_path: Path) -> None:
+    noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
+    path = write_log(tmp_path / "log.mcap", [*pairs(11), *noise], [("rig.toml", bytes(2000))])
+    code, out, err = omnid("log", "info", path)
+    assert (code, err) == (0, "")
+    assert re.search(r"state +whole\n", out) and re.search(r"messages +23\n", out)
+    assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:21.001Z, 1.001 s" in out
+    assert "rig.toml (2.0 kB)" in out
+    assert re.search(rf"{LOWER} +sensor_msgs/msg/CompressedImage +11 +9.99\n", out)
+    assert re.search(r"/chatter +std_msgs/msg/String +1 +-\n", out)
+
+
+def test_info_tells_what_is_wrong_and_what_to_do(omnid: Command, tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(11), [("rig.toml", bytes(2000))])
+    bare = write_log(tmp_path / "bare.mcap", pairs(2), **BARE)
+    os.truncate(path, path.stat().st_size - 1)
+    code, out, _ = omnid("log", "info", bare, path)
+    assert code == 1 and f"cut or corrupt after byte {path.read_bytes().index(bytes([15, 4, 0, 0]))}" in out
+    assert f"`omnid log recover {path}`" in out and "rig.toml (2.0 kB)" in out and "without an index" in out
+    code, out, err = omnid("log", "info", tmp_path / "no.mcap", bare)
+    assert code == 2 and "No such file" in err and LOWER in out
+
+
+def test_a_log_that_is_being_written_is_said_to_be(omnid: Command, tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log.mcap") as log:
+        for entry in pairs(20):
+            log.write(*entry)
+        code, out, _ = omnid("log", "info", tmp_path / "log.mcap")
+        assert code == 0 and "being written" in out and "recover" not in out
+        assert "being written" in omnid.refused("log", "recover", tmp_path / "log.mcap")
+
+
+def test_recover_says_what_it_did_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(30), [("rig.toml", b"1")])
+    assert "was whole already" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
+    os.truncate(path, path.stat().st_size - 1)
+    code, out, err = omnid("log", "recover", path)
+    assert (code, err) == (0, "") and "60 messages and 1 attachments saved" in out and "does not say" in out
+    assert omnid("log", "info", tmp_path / "log.recovered.mcap").code == 0
+    assert "it exists and is not overwritten" in omnid.refused("log", "recover", path)
+    assert "No such file" in omnid.refused("log", "recover", tmp_path / "no.mcap")
+
+
+def test_no_bytes_give_a_traceback(omnid: Command, tmp_path: Path) -> None:
+    whole = write_log(tmp_path / "whole.mcap", pairs(5), [("rig.toml", b"1")], chunk_size=700).read_bytes()
+    path, out, chance = tmp_path / "log.mcap", tmp_path / "out.mcap", random.Random(3)
+    codes = set()
+    for _ in range(60):
+        data = bytearray(whole)
+        for _ in range(chance.choice((1, 4))):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
+        out.unlink(missing_ok=True)
+        for words in (("info", path), ("recover", path, "-o", out)):
+            code, said, err = omnid("log", *words)
+            assert code in (0, 1, 2) and err.count("\n") == (code == 2)
+            assert all(line.isprintable() for line in (said + err).splitlines())
+            codes.add((words[0], code))
+    assert codes >= {("info", 0), ("info", 1), ("recover", 0), ("recover", 2)}
