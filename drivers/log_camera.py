@@ -14,31 +14,43 @@ from drivers.mcap_reader import LogReader
 from drivers.v4l2_ledger import CameraState
 
 MOST_BYTES = 1 << 30
+SLOWEST, FASTEST = 0.001, 1000.0  # paces
 NAP_S = 0.02
 LATEST_NS = 100_000_000  # what comes later than that is left out, as by a camera whose buffers are full
+Timed = tuple[tuple[int, Frame], ...]  # in order, each with its time since the log's first frame [ns]
 
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """The frames of both cameras held in memory, each with its time since the first [ns]."""
+    """The frames of both cameras, held in memory."""
 
-    lower: tuple[tuple[int, Frame], ...]
-    upper: tuple[tuple[int, Frame], ...]
+    lower: Timed
+    upper: Timed
 
     @staticmethod
     def of(path: Path, lower: str | None = None, upper: str | None = None) -> Pictures:
-        """The pictures of a log; DriverError where it is none or holds more than MOST_BYTES."""
+        """The pictures of a log, two or more of each camera; DriverError else, and beyond MOST_BYTES."""
         reader = LogReader(path, lower, upper)
         try:
             frames = list(_bounded(reader.frames(), path))
         finally:
             reader.close()
-        if not frames:
-            raise DriverError(f"{path}: no pictures in this log: give one with the frames of two cameras")
-        first_ns = frames[0].stamp_ns
-        timed = [(frame.stamp_ns - first_ns, frame) for frame in frames]
-        return Pictures(tuple(t for t in timed if t[1].camera == "lower"),
-                        tuple(t for t in timed if t[1].camera == "upper"))
+        timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
+        pictures = Pictures(*(tuple(t for t in timed if t[1].camera == name) for name in ("lower", "upper")))
+        if min(len(pictures.lower), len(pictures.upper)) < 2:
+            raise DriverError(f"{path}: {len(pictures.lower)} pictures of the lower and {len(pictures.upper)} of the "
+                              "upper camera: give a log with two or more of each")
+        return pictures
+
+    @property
+    def last_ns(self) -> int:
+        """When the log's last picture was taken."""
+        return max(self.lower[-1][0], self.upper[-1][0])
+
+    @property
+    def pass_ns(self) -> int:
+        """The time from one pass to the next: the log and one period, the same for both cameras."""
+        return self.last_ns + max(1, self.last_ns // (max(len(self.lower), len(self.upper)) - 1))
 
 
 def _bounded(frames: Iterator[Frame], path: Path) -> Iterator[Frame]:
@@ -54,14 +66,18 @@ class LogCamera:
     """One camera of a log, played forwards and backwards for as long as it is read.
 
     epoch_ns: when the log begins, CLOCK_MONOTONIC; both cameras of a log share it. pace: how many times as fast. once:
-    ends with the log. A stamp is the moment at which the picture was due.
+    ends with the log. A stamp is the moment at which the picture was due; what was due before this camera was made is
+    not shown.
     """
 
     def __init__(self, pictures: Pictures, camera: Camera, epoch_ns: int, *, pace: float = 1.0, once: bool = False
                  ) -> None:
-        self._frames = pictures.lower if camera == "lower" else pictures.upper
-        self._last_ns = max(at for both in (pictures.lower, pictures.upper) for at, _ in both[-1:])
+        if not SLOWEST <= pace <= FASTEST:
+            raise DriverError(f"the pace of a log is {pace:g}; give a number from {SLOWEST:g} to {FASTEST:g}; above 1 "
+                              "is faster than it was recorded")
+        self._pictures, self._frames = pictures, pictures.lower if camera == "lower" else pictures.upper
         self._epoch_ns, self._pace, self._once = epoch_ns, pace, once
+        self._made_ns = time.monotonic_ns()
         self._closed = False
         self.state = CameraState(mode="a recorded log")
 
@@ -71,13 +87,14 @@ class LogCamera:
             stamp_ns = self._epoch_ns + round(due_ns / self._pace)
             self._sleep_until(stamp_ns)
             if self._closed:
-                return
-            if time.monotonic_ns() > stamp_ns + LATEST_NS:
-                self.state.drops += 1
-            else:
+                break
+            if time.monotonic_ns() <= stamp_ns + LATEST_NS:
                 self.state.status = "streaming"
                 self.state.frames += 1
                 yield replace(frame, seq=seq, stamp_ns=stamp_ns)
+            else:
+                self.state.drops += stamp_ns > self._made_ns
+        self.state.status = "closed"
 
     def close(self) -> None:
         """Ends frames(); may be called twice, from any thread."""
@@ -85,13 +102,12 @@ class LogCamera:
 
     def _schedule(self) -> Iterator[tuple[int, Frame]]:
         """Every frame with its time since the epoch at pace 1 [ns]; every second pass runs backwards."""
-        last_ns = self._last_ns
-        pass_ns = last_ns + last_ns // max(1, len(self._frames) - 1)
-        for start_ns in count(0, max(1, 2 * pass_ns)) if self._frames else ():
-            yield from ((start_ns + at, frame) for at, frame in self._frames)
+        last_ns, pass_ns = self._pictures.last_ns, self._pictures.pass_ns
+        for start_ns in count(0, 2 * pass_ns):
+            yield from ((start_ns + at_ns, frame) for at_ns, frame in self._frames)
             if self._once:
                 return
-            yield from ((start_ns + pass_ns + last_ns - at, frame) for at, frame in reversed(self._frames))
+            yield from ((start_ns + pass_ns + last_ns - at_ns, frame) for at_ns, frame in reversed(self._frames))
 
     def _sleep_until(self, due_ns: int) -> None:
         while not self._closed and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import chain, islice
 from pathlib import Path
 from types import FrameType
@@ -13,12 +13,14 @@ from typing import Protocol
 
 import cv2
 
+from calib.rig import Rig
 from calib.rig_file import read_rig
-from drivers.frame import Camera, FrameSource
+from drivers.frame import Camera, Frame, FrameSource
 from drivers.simulated_motor import SimulatedMotor
 from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
 from omnid.errors import OmnidError
+from omnid.flow import nothing
 from omnid.graph import NEWEST, Graph
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder, status_report
@@ -51,58 +53,67 @@ Opener = Callable[[Camera], LiveCamera]  # may be asked twice for a camera, once
 
 
 class Live:
-    """One run of the daemon."""
+    """One run of the daemon; rig: None for that of the configuration."""
 
-    def __init__(self, config: Config, open_camera: Opener, say: Say) -> None:
-        self._config, self._open, self._say = config, open_camera, say
+    def __init__(self, config: Config, open_camera: Opener, say: Say, rig: Rig | None = None) -> None:
+        self._config, self._open, self._say, self._rig = config, open_camera, say, rig
         self._graph = Graph(policy=NEWEST, depth=1)
         self._tally, self._latency = Tally(), Latency()
         self.offset_ns = time.time_ns() - time.monotonic_ns()  # from the stamps in here to Unix time
         self.twin: SimulatedMotor | None = None
+        self._running = False
 
     def run(self) -> int:
         """The exit code, 0 after a signal to end."""
         cv2.setNumThreads(self._config.graph.opencv_threads)
-        with ExitStack() as closing:
+        with self._ended_by_signals(), ExitStack() as ends:
             place = self._geometry()
-            self._wire(place, {name: self._opened(name, closing) for name in CAMERAS}, closing)
-            with self._ended_by_signals():
-                self._graph.run()
+            self._wire(place, {name: ends.enter_context(closing(self._open(name))) for name in CAMERAS}, ends)
+            self._running = True
+            self._graph.run()
         return 0
-
-    def _opened(self, name: Camera, closing: ExitStack) -> LiveCamera:
-        camera = self._open(name)
-        closing.callback(camera.close)
-        return camera
 
     def _geometry(self) -> Geometry:
         """The rig; the mirrors' rims are looked for in the first pictures where it has no masks."""
-        rig = read_rig(Path(self._config.cameras.rig))
+        rig = self._rig or read_rig(Path(self._config.cameras.rig))
         if rig.lower.mask is None or rig.upper.mask is None:
-            with ExitStack() as closing:
-                both = (islice(self._opened(name, closing).frames(), LOOKS) for name in CAMERAS)
-                rig = with_rims(rig, chain.from_iterable(zip(*both, strict=False)))
+            with ExitStack() as ends:
+                rig = with_rims(rig, chain.from_iterable(zip(*self._first_pictures(ends), strict=False)))
+            self._tell_of_rims(rig)
         return geometry(rig, self._config.panorama)
 
-    def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], closing: ExitStack) -> None:
+    def _first_pictures(self, ends: ExitStack) -> Iterator[Iterator[Frame]]:
+        for name in CAMERAS:
+            camera = ends.enter_context(closing(self._open(name)))
+            pictures = iter(camera.frames())
+            ends.callback(getattr(pictures, "close", nothing))  # a generator holds the device until it is closed
+            yield islice(pictures, LOOKS)
+
+    def _tell_of_rims(self, rig: Rig) -> None:
+        for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
+            if camera.mask is None:
+                self._say(4, f"no rim was found in the first pictures of the {name} camera, so all of each picture is "
+                          f"used: the rig may say otherwise in [{name}.mask]")
+
+    def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
         encode = Encoder(place.rig.T_base_rig, config.record.cloud_points, self.offset_ns)
-        helm = self._helm(place, closing) if config.motor.port else None
+        helm = self._helm(place, ends) if config.motor.port else None
         bus = Bus(config.bus)
-        closing.callback(bus.close)
+        ends.callback(bus.close)
         pair = LivePair(place.rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
-        ends = Ends(poses={"tally": self._tally, "latency": self._latency}, bus=BusSink(bus, encode), helm=helm,
-                    map_every_s=config.live.cloud_s)
-        wire(graph, graph.stage("pair", pair, *frames), place, config, ends)
+        sinks = Ends(poses={"tally": self._tally, "latency": self._latency}, bus=BusSink(bus, encode), helm=helm,
+                     map_every_s=config.live.cloud_s)
+        wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
         commands = self._commands(bus, helm) if helm else None
         report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
                                       self._tally, self._latency.to_pose, helm, commands, TICKERS))
         graph.ticker("status", config.live.status_s, StatusTick(report, self._publisher(bus)))
 
-    def _helm(self, place: Geometry, closing: ExitStack) -> Helm:
+    def _helm(self, place: Geometry, ends: ExitStack) -> Helm:
         config = self._config
-        driver, self.twin = open_motor(config.motor, closing)
+        driver, self.twin = open_motor(config.motor, ends)
         settings = HelmSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
                                 config.helm.limits)
         return Helm(driver, place.rig.T_base_rig, settings, lambda text: self._say(4, text))
@@ -117,8 +128,8 @@ class Live:
         """What publishes statuses; the bus may be slow, and only the ticker waits for it."""
 
         def publish(statuses: list[Status]) -> None:
-            said = status_report(time.time_ns(), statuses)
-            with suppress(OmnidError):  # the next one comes in a second
+            with suppress(OmnidError):  # the next one comes in a second; a clock may be set to what is no time
+                said = status_report(time.time_ns(), statuses)
                 bus.publish(said.topic, said.payload)
 
         return publish
@@ -126,7 +137,8 @@ class Live:
     @contextmanager
     def _ended_by_signals(self) -> Iterator[None]:
         """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once."""
-        before = {number: signal.signal(number, self._on_signal) for number in STOPPING}
+        heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup has it
+        before = {number: signal.signal(number, self._on_signal) for number in heeded}
         try:
             yield
         finally:
@@ -134,4 +146,6 @@ class Live:
                 signal.signal(number, handler)
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
+        if not self._running:
+            raise SystemExit(0)  # nothing flows yet, the wheels stand; whatever is open is closed on the way
         self._graph.stop()

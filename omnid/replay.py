@@ -13,8 +13,7 @@ from typing import TypeAlias
 
 import cv2
 
-from calib.rig import Rig
-from calib.rig_file import parse_rig, read_rig, rig_toml
+from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
@@ -22,6 +21,7 @@ from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.graph import LOSSLESS, NEWEST, Graph, Stream
+from omnid.log_rig import attached_rig
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
@@ -120,22 +120,13 @@ class Replay:
         return LogReader(self._log, *topics, window=window)
 
     def _geometry(self, reader: LogReader, path: Path | None) -> Geometry:
-        rig = read_rig(path) if path else self._attached_rig(reader)
+        rig = read_rig(path) if path else attached_rig(reader, self._log)
         rimmed = with_rims(rig, reader.frames())
         for name, camera in (("lower", rimmed.lower), ("upper", rimmed.upper)):
             if camera.mask is None:
                 self._warnings.append(f"no rim was found in the first pictures of the {name} camera, so all of each "
                                       f"picture is used: the rig may say otherwise in [{name}.mask]")
         return geometry(rimmed, self._config.panorama)
-
-    def _attached_rig(self, reader: LogReader) -> Rig:
-        attached = reader.attachments().get("rig.toml")
-        if attached is None:
-            raise OmnidError(
-                f"{self._log}: no rig.toml is attached to the log: give one with --rig, made by `omnid calibrate "
-                "import camchain.yaml -o rig.toml`"
-            )
-        return parse_rig(attached, None, f"{self._log}: attached rig.toml")
 
     def _frames(self, reader: LogReader) -> Stream[Frame]:
         if not self._options.realtime:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
+    from calib.rig import Rig
     from omnid.config import Config
     from omnid.live import Opener
 
@@ -18,7 +20,8 @@ if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `run` to the command line."""
     parser = subparsers.add_parser("run", help="the daemon: two live cameras, poses on the bus, commands to the wheels")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: cameras.rig of the settings")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log, "
+                        "without a log cameras.rig of the settings")
     parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
     parser.add_argument("--log", type=Path, metavar="LOG", help="pictures of a log in the place of cameras, to try it "
                         "out: in real time, forwards and backwards until it is stopped")
@@ -37,12 +40,21 @@ def run(args: argparse.Namespace) -> int:
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
     config = load(Config, args.config, [*args.overrides, *shortcuts])
-    cameras = _recorded(args) if args.log else _devices(config)
-    return Live(config, cameras, _say).run()
+    if args.log is None:
+        _refuse_what_needs_a_log(args)
+        return Live(config, _devices(config), _say).run()
+    return Live(config, _recorded(args), _say, None if args.rig else _rig_of(args.log)).run()
 
 
 def _say(severity: int, text: str) -> None:
     print(f"omnid: {text}", file=sys.stderr, flush=True)
+
+
+def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
+    from omnid.errors import OmnidError
+
+    if args.once or args.pace != 1.0:
+        raise OmnidError("--once and --pace are for the pictures of a log: give one with --log, or leave them out")
 
 
 def _devices(config: Config) -> Opener:
@@ -57,3 +69,11 @@ def _recorded(args: argparse.Namespace) -> Opener:
     pictures = Pictures.of(args.log)
     epoch_ns = time.monotonic_ns()
     return lambda camera: LogCamera(pictures, camera, epoch_ns, pace=args.pace, once=args.once)
+
+
+def _rig_of(log: Path) -> Rig:
+    from drivers.mcap_reader import LogReader
+    from omnid.log_rig import attached_rig
+
+    with closing(LogReader(log)) as reader:
+        return attached_rig(reader, log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from omnid.core.ego_motion import LOST
 
@@ -25,23 +26,36 @@ class Situation:
     command_age_s: float  # of a command that came after the last stop
     late_s: float = 0.0
     motor_failed: bool = False  # at the last tick
+    motor_stopped: bool = False  # by the controller itself, before the last tick
     stop_asked: bool = False
     ending: bool = False
 
 
-IDLE = "no command"
+ENDS: Final = "the daemon ends"
+ASKED: Final = "a stop was asked for"
+FAILED: Final = "the motor controller failed"
+STOPPED: Final = "the motor controller had stopped by itself"
+OVERLOADED: Final = "the host is overloaded"
+POSE_STALE: Final = "the pose is stale"
+POSE_LOST: Final = "the pose is lost"
+IDLE: Final = "no command"
+COMMAND_STALE: Final = "the command is stale"
 
 
 def reason_to_stop(now: Situation, deadlines: Deadlines) -> str:
-    """Why the wheels must stand, in a few words; empty where they may turn. A number that is NaN is a reason."""
+    """Why the wheels must stand, in a few words; empty where they may turn.
+
+    A number that is NaN is a reason, and so is an age as far below 0 as it may be above: nothing comes from the future.
+    """
     reasons = (
-        (now.ending, "the daemon ends"),
-        (now.stop_asked, "a stop was asked for"),
-        (now.motor_failed, "the motor controller failed"),
-        (not now.late_s <= deadlines.tick_s, "the host is overloaded"),
-        (not now.pose_age_s <= deadlines.pose_s, "the pose is stale"),
-        (now.pose_state == LOST, "the pose is lost"),
+        (now.ending, ENDS),
+        (now.stop_asked, ASKED),
+        (now.motor_failed, FAILED),
+        (now.motor_stopped, STOPPED),
+        (not now.late_s <= deadlines.tick_s, OVERLOADED),
+        (not abs(now.pose_age_s) <= deadlines.pose_s, POSE_STALE),
+        (now.pose_state == LOST, POSE_LOST),
         (now.command_age_s == float("inf"), IDLE),
-        (not now.command_age_s <= deadlines.command_s, "the command is stale"),
+        (not abs(now.command_age_s) <= deadlines.command_s, COMMAND_STALE),
     )
     return next((reason for holds, reason in reasons if holds), "")

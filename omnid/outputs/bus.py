@@ -11,7 +11,7 @@ class BusSink:
     """Publishes what the encoder makes; give it an inbox that forgets, for the bus may be slow."""
 
     def __init__(self, bus: Bus, encode: Encoder) -> None:
-        self._bus, self._encode, self._states = bus, encode, StateReports()
+        self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
 
     def process(self, message: Outgoing) -> None:
         """Sends what there is to say about a message."""

@@ -33,7 +33,7 @@ class Encoder:
     """
 
     def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int, offset_ns: int = 0) -> None:
-        self._T_base_rig, self._cloud_points, self._offset_ns = T_base_rig, cloud_points, offset_ns
+        self._T_base_rig, self._cloud_points, self.offset_ns = T_base_rig, cloud_points, offset_ns
 
     def __call__(self, message: Outgoing) -> Iterator[Encoded]:
         """All that is said about a message."""
@@ -41,16 +41,16 @@ class Encoder:
             case Odometry():
                 yield from self._poses(message)
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
-                payload = codec.twist_stamped_cdr(stamp_ns + self._offset_ns, "base_link", velocity_mps, yaw_rate_radps)
+                payload = codec.twist_stamped_cdr(stamp_ns + self.offset_ns, "base_link", velocity_mps, yaw_rate_radps)
                 yield Encoded("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
                 points, confidence = _surest(message.points, self._cloud_points)
                 in_odom = se3.apply(self._T_base_rig, points.astype(float))
-                payload = codec.point_cloud_cdr(message.stamp_ns + self._offset_ns, "odom", in_odom, confidence)
+                payload = codec.point_cloud_cdr(message.stamp_ns + self.offset_ns, "odom", in_odom, confidence)
                 yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
-        stamp_ns = odometry.stamp_ns + self._offset_ns
+        stamp_ns = odometry.stamp_ns + self.offset_ns
         T_odom_base, covariance, *velocity = of_base(odometry, self._T_base_rig)
         pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
         yield Encoded("odom", codec.ODOMETRY_SCHEMA, pose)
@@ -61,9 +61,10 @@ class Encoder:
 
 
 class StateReports:
-    """A diagnostic message whenever the state of the odometry changes."""
+    """A diagnostic message whenever the state of the odometry changes; offset_ns: as the Encoder has it."""
 
-    def __init__(self) -> None:
+    def __init__(self, offset_ns: int = 0) -> None:
+        self._offset_ns = offset_ns
         self._last: tuple[str, int] | None = None
 
     def __call__(self, odometry: Odometry) -> Iterator[Encoded]:
@@ -74,7 +75,8 @@ class StateReports:
             level = ("tracking", "degraded", "lost").index(odometry.state)
             values = {"state": odometry.state, "resets": str(odometry.reset_counter),
                       "landmarks": f"{odometry.inliers} of {odometry.tracks}"}
-            yield status_report(odometry.stamp_ns, [codec.Status("omnid: odometry", level, odometry.state, values)])
+            said = codec.Status("omnid: odometry", level, odometry.state, values)
+            yield status_report(odometry.stamp_ns + self._offset_ns, [said])
 
 
 def summary_report(stamp_ns: int, values: dict[str, str]) -> Encoded:

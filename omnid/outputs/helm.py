@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.errors import DriverError
-from drivers.motor import MotorDriver, VelocityCommand
+from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from omnid.core.command_limits import STOP, CommandLimits
-from omnid.core.fail_safe import IDLE, Deadlines, Situation, reason_to_stop
+from omnid.core.ego_motion import LOST
+from omnid.core.fail_safe import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
 from omnid.core.heading import Drive, HeadingHold, HeadingLimits, Setpoint
+from omnid.core.heading_goal import HeadingGoal
 from omnid.flow import Slot, nothing
 from omnid.messages import Odometry
 from omnid.stages.odometry import of_base
@@ -27,6 +29,7 @@ from omnid.telemetry import Histogram
 
 LONGEST_RAMP_S = 3.0  # at the end: whatever has not stood still by then is stopped at once
 TOLD = 16  # commands that may wait for whoever records them
+SURE = ("", IDLE, COMMAND_STALE)  # reasons for which the pose has been found good
 NS = 1e-9
 
 
@@ -37,6 +40,10 @@ class Heading(NamedTuple):
     heading_rad: float  # of the base in odom
     yaw_rate_radps: float
     state: str
+
+    def at(self, now_ns: int) -> float:
+        """The heading now, if the base has gone on turning."""
+        return self.heading_rad + self.yaw_rate_radps * (now_ns - self.stamp_ns) * NS
 
 
 class Arrived(NamedTuple):
@@ -66,45 +73,54 @@ class Helm:
     def __init__(self, driver: MotorDriver, T_base_rig: NDArray[np.float64], settings: HelmSettings,
                  report: Callable[[str], None] = nothing) -> None:
         self._driver, self._T_base_rig, self._settings, self._report = driver, T_base_rig, settings, report
-        self._hold = HeadingHold(settings.hold)
+        self._hold, self._goal = HeadingHold(settings.hold), HeadingGoal()
         self._pose: Slot[Heading] = Slot()
         self._command: Slot[Arrived] = Slot()
-        self._stop_asked = self._ending = self._failed = False
         self._void_ns = time.monotonic_ns()  # commands up to then count no more
-        self._last_tick_ns: int | None = None
+        self._stop_ns = 0  # when a stop was asked for last
+        self._last_ns = self._due_ns = 0  # when the last tick came, and when the next one should
         self._driven_ns = 0  # capture of the newest pose that was driven by
+        self._ending = self._failed = self._stopped = False
         self._sent = STOP
+        self._told: Queue[VelocityCommand | None] = Queue(TOLD)
         self.reason = IDLE
         self.stops: Counter[str] = Counter()  # by reason
-        self._told: Queue[VelocityCommand | None] = Queue(TOLD)
-        self.sent = self.errors = 0
+        self.sent = self.errors = self.expiries = 0
+        self.fault = 0  # the controller's own number
         self.to_wheel = Histogram()  # s from the capture of a pose's pictures to the first command that follows it
         self.lateness = Histogram()  # s by which ticks come too late
 
-    def process(self, odometry: Odometry) -> None:
-        """Takes a pose."""
-        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
-        self._pose.put(Heading(odometry.stamp_ns, float(se3.yaw(T_odom_base)), float(velocity[5]), odometry.state))
+    @property
+    def failed(self) -> bool:
+        """Whether the controller did not take the last command."""
+        return self._failed
 
-    def command(self, setpoint: Setpoint) -> None:
-        """Takes a command that has just arrived, from any thread; the newest wins."""
-        self._command.put(Arrived(time.monotonic_ns(), setpoint))
+    def process(self, odometry: Odometry) -> None:
+        """Takes a pose; one that is not finite is as good as none."""
+        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
+        heading_rad, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[5])
+        state = odometry.state if math.isfinite(heading_rad) and math.isfinite(rate_radps) else LOST
+        self._pose.put(Heading(odometry.stamp_ns, heading_rad, rate_radps, state))
+
+    def command(self, setpoint: Setpoint, arrival_ns: int | None = None) -> None:
+        """Takes a command that arrived then (CLOCK_MONOTONIC), or just now, from any thread; the newest wins."""
+        self._command.put(Arrived(time.monotonic_ns() if arrival_ns is None else arrival_ns, setpoint))
 
     def stop(self) -> None:
         """Stops the wheels at the next tick, whatever else is commanded until then; from any thread."""
-        self._stop_asked = True
+        self._stop_ns = time.monotonic_ns()  # a time, for a flag could be cleared by the tick the moment it is set
 
     def __call__(self) -> None:
         """One tick."""
         now_ns = time.monotonic_ns()
-        dt_s = self._settings.period_s if self._last_tick_ns is None else (now_ns - self._last_tick_ns) * NS
-        self._last_tick_ns = now_ns
-        late_s = max(0.0, dt_s - self._settings.period_s)
-        self.lateness.add(late_s)
-        pose, command = self._pose.get(), self._valid_command()
+        dt_s, late_s = self._rhythm(now_ns)
+        pose, command = self._pose.get(), self._command.get()
         self._judge(self._situation(now_ns, late_s, pose, command), now_ns)
-        wanted, goal_rad = self._wanted(now_ns, dt_s, pose, command)
-        self._send(self._settings.limits.step(wanted, self._sent, dt_s), goal_rad, now_ns)
+        drive, goal_rad = self._steered(now_ns, dt_s, pose, command)
+        if (status := self._send(VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps))) is None:
+            return
+        self._heed(status, drive)
+        self._goal.heard(status.heading_rad, pose.at(now_ns) if pose and self.reason in SURE else None)
         if pose is not None and pose.stamp_ns > self._driven_ns:
             self._driven_ns = pose.stamp_ns
             self.to_wheel.add((time.monotonic_ns() - pose.stamp_ns) * NS)
@@ -123,59 +139,79 @@ class Helm:
         with suppress(Empty):
             while True:
                 self._told.get_nowait()
-        self._told.put(None)
+        with suppress(Full):  # by another that hushes: then there is an end already
+            self._told.put_nowait(None)
 
     def close(self) -> None:
         """Slows down to a stand, then releases the driver; the wheels stand when this returns."""
         self._ending = True
         deadline_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / NS)
-        while self._sent != STOP and not self._failed and time.monotonic_ns() < deadline_ns:
-            self()
-            time.sleep(self._settings.period_s)
-        self._driver.close()
+        try:
+            while self._sent != STOP and not self._failed and time.monotonic_ns() < deadline_ns:
+                self()
+                time.sleep(max(0.0, (self._due_ns - time.monotonic_ns()) * NS))
+        finally:
+            self._driver.close()
 
-    def _valid_command(self) -> Arrived | None:
-        command = self._command.get()
-        return command if command is not None and command.arrival_ns > self._void_ns else None
+    def _rhythm(self, now_ns: int) -> tuple[float, float]:
+        """Seconds since the last tick, and by how much this one comes later than in step with the earliest ones."""
+        period_ns = round(self._settings.period_s * 1e9)  # as the graph's ticker has it
+        dt_ns = now_ns - self._last_ns if self._last_ns else period_ns
+        self._last_ns = now_ns
+        due_ns = min(self._due_ns or now_ns, now_ns)
+        self._due_ns = due_ns + (1 + (now_ns - due_ns) // period_ns) * period_ns
+        self.lateness.add((now_ns - due_ns) * NS)
+        return dt_ns * NS, (now_ns - due_ns) * NS
 
     def _situation(self, now_ns: int, late_s: float, pose: Heading | None, command: Arrived | None) -> Situation:
-        asked, self._stop_asked = self._stop_asked, False
+        valid = command is not None and command.arrival_ns > self._void_ns
         return Situation(
             pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * NS,
             pose_state="" if pose is None else pose.state,
-            command_age_s=math.inf if command is None else (now_ns - command.arrival_ns) * NS,
-            late_s=late_s, motor_failed=self._failed, stop_asked=asked, ending=self._ending)
+            command_age_s=(now_ns - command.arrival_ns) * NS if command is not None and valid else math.inf,
+            late_s=late_s, motor_failed=self._failed, motor_stopped=self._stopped,
+            stop_asked=self._stop_ns > self._void_ns, ending=self._ending)
 
     def _judge(self, situation: Situation, now_ns: int) -> None:
         """Notes why the wheels must stand, if they must; voids the commands so far, and counts what stopped a drive."""
         before, self.reason = self.reason, reason_to_stop(situation, self._settings.deadlines)
         if not self.reason:
             return
-        self._void_ns = now_ns
+        self._void_ns = max(now_ns, self._stop_ns)
         if not before:
             self.stops[self.reason] += 1
             self._report(f"the wheels stop: {self.reason}")
 
-    def _wanted(self, now_ns: int, dt_s: float, pose: Heading | None, command: Arrived | None) -> tuple[Drive, float]:
-        """The drive that the command asks for, and the heading it leads to."""
+    def _steered(self, now_ns: int, dt_s: float, pose: Heading | None, command: Arrived | None) -> tuple[Drive, float]:
+        """The drive within the limits, and the controller's heading that it leads to."""
         if self.reason or pose is None or command is None:
-            return STOP, 0.0
-        heading_rad = pose.heading_rad + pose.yaw_rate_radps * (now_ns - pose.stamp_ns) * NS
+            return self._settings.limits.step(STOP, self._sent, dt_s), self._goal.stay()
+        heading_rad = pose.at(now_ns)
         wanted = self._hold.step(command.setpoint, heading_rad, dt_s, self._sent)
-        goal_rad = command.setpoint.heading_rad
-        return wanted, heading_rad if goal_rad is None else goal_rad
+        drive = self._settings.limits.step(wanted, self._sent, dt_s)
+        return drive, self._goal.towards(command.setpoint, heading_rad, drive.yaw_rate_radps * dt_s)
 
-    def _send(self, drive: Drive, goal_rad: float, now_ns: int) -> None:
-        command = VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps)
+    def _send(self, command: VelocityCommand) -> MotorStatus | None:
+        """The controller's answer; None where it gave none."""
         try:
-            self._driver.send(command)
+            status = self._driver.send(command)
         except DriverError as error:
             if not self._failed:
                 self._report(str(error))
             self._failed, self._sent = True, STOP  # its own watchdog stops a controller that hears nothing
             self.errors += 1
-            return
-        self._failed, self._sent = False, drive
+            return None
+        if self._failed:
+            self._report("the motor controller is back")
+        self._failed = False
         self.sent += 1
         with suppress(Full):
             self._told.put_nowait(command)
+        return status
+
+    def _heed(self, status: MotorStatus, drive: Drive) -> None:
+        """Takes to heart what the controller says: one that has stopped by itself did not obey."""
+        self._stopped = status.watchdog_expired
+        self.expiries += status.watchdog_expired
+        self._sent = STOP if status.watchdog_expired else drive
+        self.fault = status.fault

@@ -13,9 +13,7 @@ class Latency:
 
     def __init__(self) -> None:
         self.to_pose = Histogram()
-        self.newest_ns = 0  # capture of the newest pose
 
     def process(self, odometry: Odometry) -> None:
         """Takes the time."""
-        self.newest_ns = odometry.stamp_ns
         self.to_pose.add((time.monotonic_ns() - odometry.stamp_ns) * 1e-9)

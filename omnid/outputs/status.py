@@ -7,7 +7,9 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
+from drivers.frame import Camera
 from drivers.v4l2_ledger import CameraState
+from omnid.core.fail_safe import ASKED, COMMAND_STALE, FAILED, IDLE
 from omnid.outputs.helm import Helm
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
@@ -17,6 +19,8 @@ from omnid.transport.commands import Commands
 
 OK, WARN, ERROR, STALE = range(4)
 WANDERED_NS = 3_000_000  # of the skew of the cameras: their clocks do not run alike
+SILENT_S = 1.0  # a camera without a picture, or an odometry without a pose, for longer is told
+CALM = ("", IDLE, ASKED, COMMAND_STALE)  # why wheels stand that are as they should be
 STATES = {"tracking": OK, "degraded": WARN, "lost": ERROR}
 
 
@@ -43,7 +47,7 @@ class Watched(NamedTuple):
     """What a live run is asked about."""
 
     telemetry: Telemetry
-    cameras: Mapping[str, CameraState]
+    cameras: Mapping[Camera, CameraState]
     pair: LivePair
     tally: Tally
     to_pose: Histogram
@@ -71,7 +75,7 @@ class StatusReport:
         if newest is None:
             return Status("omnid: odometry", STALE, "no pose yet", {})
         age_s = (time.monotonic_ns() - newest.stamp_ns) * 1e-9
-        stale = age_s > 1.0
+        stale = age_s > SILENT_S
         values = {"rate_hz": f"{self._rates('poses', tally.poses):.1f}", "age_s": f"{age_s:.3f}",
                   "landmarks": f"{newest.inliers} of {newest.tracks}", "resets": str(newest.reset_counter),
                   "length_m": f"{tally.length_m:.2f}", **_times("capture_to_pose", self._watched.to_pose)}
@@ -81,30 +85,52 @@ class StatusReport:
     def _pairing(self) -> Status:
         pair = self._watched.pair
         skew, counts = pair.skew, pair.counts
-        wandered = abs(skew.wandered_ns) > WANDERED_NS
+        fault = self._fault(pair)
         values = {name: str(count) for name, count in counts.items()} | {
             "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "most_skew_ms": f"{skew.most_ns * 1e-6:.3f}",
             "wandered_ms": f"{skew.wandered_ns * 1e-6:.3f}"}
-        said = "the cameras' clocks drift apart: synchronise them" if wandered else "in step"
-        return Status("omnid: pairing", WARN if wandered else OK, said, values)
+        return Status("omnid: pairing", WARN if fault else OK, fault or "in step", values)
+
+    def _fault(self, pair: LivePair) -> str:
+        """What is wrong with the pairing, in the order of what explains the rest; empty where it goes well."""
+        rate_hz, broken_hz = self._rates("pairs", pair.counts["pairs"]), self._rates("broken", pair.counts["broken"])
+        silent = [name for name in self._watched.cameras if self._silent_s(name) > SILENT_S]
+        if silent:
+            return f"no pictures of the {' and the '.join(silent)} camera"
+        if broken_hz > 0:
+            return f"pictures that cannot be decoded, the first: {pair.fault}"
+        if rate_hz == 0:
+            return "the cameras' pictures are further apart in time than pair.tolerance_ms: synchronise them"
+        return "the cameras drift apart in time: synchronise them" if abs(pair.skew.wandered_ns) > WANDERED_NS else ""
+
+    def _silent_s(self, camera: Camera) -> float:
+        """How long ago the camera's newest picture was taken; inf before the first."""
+        newest_ns = self._watched.pair.newest_ns[camera]
+        return (time.monotonic_ns() - newest_ns) * 1e-9 if newest_ns else math.inf
 
     def _cameras(self) -> Iterable[Status]:
         for name, state in self._watched.cameras.items():
             counts = {key: str(getattr(state, key)) for key in
                       ("frames", "drops", "errors", "restamped", "restarts", "losses", "reopens")}
             rate = f"{self._rates(f'{name} frames', state.frames):.1f}"
-            lost = state.status == "lost"
-            yield Status(f"omnid: {name} camera", ERROR if lost else OK, state.problem if lost else state.status,
+            silent_s = self._silent_s(name)
+            said = state.problem if state.status == "lost" else state.status
+            if state.status == "streaming" and silent_s > SILENT_S:
+                said = f"no picture for {silent_s:.1f} s"
+            yield Status(f"omnid: {name} camera", OK if said == state.status else ERROR, said,
                          {"mode": state.mode, "rate_hz": rate, **counts})
 
     def _helm(self, helm: Helm, commands: Commands | None) -> Status:
-        values = {"sent": str(helm.sent), "errors": str(helm.errors)}
-        values |= {f"stopped, {reason}": str(count) for reason, count in helm.stops.items()}
+        reason = helm.reason  # and copies of what another thread may add to meanwhile
+        values = {"sent": str(helm.sent), "errors": str(helm.errors), "expiries": str(helm.expiries),
+                  "fault": str(helm.fault)}
+        values |= {f"stopped, {why}": str(count) for why, count in dict(helm.stops).items()}
         values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
         if commands is not None:
             values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
-            values |= {f"refused, {reason}": str(count) for reason, count in commands.refused.items()}
-        return Status("omnid: wheels", OK, helm.reason or "driving", values)
+            values |= {f"refused, {why}": str(count) for why, count in dict(commands.refused).items()}
+        bad = reason == FAILED or helm.failed or helm.fault
+        return Status("omnid: wheels", ERROR if bad else OK if reason in CALM else WARN, reason or "driving", values)
 
     def _stage(self, stage: StageStats) -> Status:
         missed = "missed" if stage.name in self._watched.tickers else "dropped"

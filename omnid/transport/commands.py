@@ -61,9 +61,12 @@ def _expect_frame(frame: str, expected: str) -> None:
 
 
 class Commands:
-    """Hands good commands on, counts the others by reason; called from the bus's threads, one command at a time."""
+    """Hands good commands on, counts the others by reason; called from the bus's threads.
 
-    def __init__(self, obey: Callable[[Setpoint], None], stop: Callable[[], None], stale_s: float) -> None:
+    obey gets the setpoint and its arrival, ns of CLOCK_MONOTONIC.
+    """
+
+    def __init__(self, obey: Callable[[Setpoint, int], None], stop: Callable[[], None], stale_s: float) -> None:
         self._obey, self._stop, self._stale_s = obey, stop, stale_s
         self._parsers = {"cmd/twist": twist_command, "cmd/heading": heading_command}
         self.accepted = self.stops = 0
@@ -76,6 +79,7 @@ class Commands:
 
     def take(self, key: str, payload: bytes) -> None:
         """One command as it came; never raises."""
+        arrival_ns = time.monotonic_ns()  # before anything else: a stop that comes meanwhile voids it
         if key == "cmd/stop":
             self.stops += 1
             self._stop()
@@ -89,7 +93,7 @@ class Commands:
             self.refused["malformed"] += 1
             return
         self.accepted += 1
-        self._obey(wish.setpoint)
+        self._obey(wish.setpoint, arrival_ns)
 
     def _judged(self, key: str, payload: bytes) -> Wish:
         if len(payload) > LONGEST_PAYLOAD:
