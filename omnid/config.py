@@ -120,7 +120,7 @@ class MappingConfig:
     voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
     log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
     max_sigma_m: float = knob(0.15, "points less certain than this stay out of the map, m", low=0.001, high=100)
-    min_frames: int = knob(5, "frames that must have seen a voxel before it is written; fewer in a short run", low=1,
+    min_frames: int = knob(6, "frames that must have seen a voxel before it is written; fewer in a short run", low=1,
                            high=1000)
     path_poses: int = knob(100_000, "poses kept for the plan view; beyond, every second is forgotten", low=100,
                            high=10_000_000)

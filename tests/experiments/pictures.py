@@ -72,15 +72,15 @@ def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], pat
 
 
 def floor_plan(run: Run, points: Array, path_xy: dict[str, Array], path: Path) -> None:
-    """The map's points (N, 3) in the world and paths (N, 2) over the true floor plan: fig. 10."""
+    """The map's points (N, 3) in the world, black, and paths (N, 2) over the true floor plan, grey: fig. 10."""
     figure = Figure(figsize=(9, 6.8), layout="constrained")
     axes = figure.subplots()
     standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 2.2)]
-    axes.scatter(standing[:, 0], standing[:, 1], s=0.4, c="0.55", linewidths=0)
     for r in filter(_stands, run.scene.rectangles):
-        axes.plot(*r.corners[:2, :2].T, color="black", lw=0.9 if r.name != "box" else 0.6)
-    for (name, xy), (shade, dash) in zip(path_xy.items(), (("0.7", "-"), ("0.0", "--")), strict=True):
-        axes.plot(*xy.T, dash, color=shade, lw=3 if dash == "-" else 1.2, label=name)
+        axes.plot(*r.corners[:2, :2].T, color="0.8", lw=5 if r.name != "box" else 3, zorder=0)
+    axes.scatter(standing[:, 0], standing[:, 1], s=0.5, c="black", linewidths=0)
+    for (name, xy), (shade, dash) in zip(path_xy.items(), (("0.8", "-"), ("0.0", "--")), strict=True):
+        axes.plot(*xy.T, dash, color=shade, lw=5 if dash == "-" else 1.2, label=name)
     axes.plot(*path_xy["truth"][0], "ko", ms=5)
     axes.set(aspect="equal", xlabel="m", ylabel="m")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.06), ncols=2, frameon=False)
