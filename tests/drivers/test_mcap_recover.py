@@ -132,7 +132,7 @@ def chunk_places(path: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("where", [0, 7], ids=["the first chunk, which defines the channels", "another"])
-@pytest.mark.parametrize("offset", [3, 6, 60], ids=["its length", "its length, beyond the file", "its content"])
+@pytest.mark.parametrize("offset", [2, 6, 60], ids=["its length", "its length, beyond the file", "its content"])
 def test_a_corrupt_chunk_costs_only_itself_where_there_is_an_index(tmp_path: Path, where: int, offset: int) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(30), RIG[:1], chunk_size=700), tmp_path / "out.mcap"
     expected, places = messages(path), chunk_places(path)
@@ -178,6 +178,13 @@ def test_nothing_is_overwritten_and_nothing_half_done_is_left(tmp_path: Path) ->
         with pytest.raises(DriverError, match=reason):
             recover(path, out)
     assert kept.read_bytes() == b"mine" and sorted(os.listdir(tmp_path)) == ["kept.mcap", "log.mcap"]
+
+
+def test_a_corrupt_attachment_is_left_out(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2), RIG[:1])
+    path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
+    found = recover(path, tmp_path / "out.mcap")
+    assert (found.messages, found.attachments, found.broken, found.whole) == (4, 0, 1, False)
 
 
 @pytest.fixture

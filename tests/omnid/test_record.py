@@ -23,6 +23,7 @@ from omnid.errors import OmnidError
 from omnid.graph import NEWEST, Graph
 from omnid.messages import MapUpdate, Odometry
 from omnid.outputs.encoded import Encoder, status_report
+from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.recording import open_recorder, record
 from omnid.transport.codec import Status
 from omnid.transport.image_codec import image_cdr, image_topic
@@ -164,47 +165,40 @@ class Given:
 
 
 def test_a_disk_that_stands_still_stops_no_camera(tmp_path: Path) -> None:
-    """The folder's first file is a pipe nobody reads: whoever opens it waits for good, or for us."""
-    config = settings(tmp_path / "log", queue=3)
-    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
-    writing = recorder.process
-    released = time.monotonic() + 0.5
-
-    def slow(message: Any) -> None:
-        while time.monotonic() < released:
-            time.sleep(0.01)
-        writing(message)
-
-    recorder.process = slow  # type: ignore[method-assign]
-    graph = Graph(policy=NEWEST, depth=3)
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
+    late = Late(recorder)
+    graph, seen = Graph(policy=NEWEST, depth=3), Seen()
     stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
-    seen: list[float] = []
-    passed = graph.stage("camera", Watch(seen), stream)
-    graph.sink("record", recorder, stream)
-    graph.sink("after", Ignored(), passed)
+    graph.sink("record", late, stream)
+    graph.sink("odometry", seen, stream)
     graph.run()
     stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
     assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
-    assert seen and min(seen) < released  # the others went on meanwhile
+    assert min(seen.times_s) < late.until_s  # the others went on meanwhile
 
 
-class Watch:
-    """Notes when messages come by."""
+class Late:
+    """A recorder whose disk stands still for half a second."""
 
-    def __init__(self, seen: list[float]) -> None:
-        self._seen = seen
-
-    def process(self, message: Frame) -> Frame:
-        """Notes the time."""
-        self._seen.append(time.monotonic())
-        return message
-
-
-class Ignored:
-    """An end."""
+    def __init__(self, recorder: FrameRecorder) -> None:
+        self._recorder, self.until_s = recorder, time.monotonic() + 0.5
+        self.finish = recorder.finish
 
     def process(self, message: Frame) -> None:
-        """Nothing."""
+        """Records, some time."""
+        time.sleep(max(0.0, self.until_s - time.monotonic()))
+        self._recorder.process(message)
+
+
+class Seen:
+    """An end that notes when something comes."""
+
+    def __init__(self) -> None:
+        self.times_s: list[float] = []
+
+    def process(self, message: Frame) -> None:
+        """Notes it."""
+        self.times_s.append(time.monotonic())
 
 
 def test_record_takes_both_cameras_and_tells_what_became_of_it(tmp_path: Path) -> None:
