@@ -14,14 +14,12 @@ if TYPE_CHECKING:
     from omnid.doctor.finding import Finding
 
 ROOT = Path("/")  # where sys, dev and proc are
-LOGS = Path("/var/lib/omnid")
 BYTES_PER_PIXEL = 0.3  # of a JPEG of a textured picture, on the safe side
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `doctor` to the command line."""
     parser = subparsers.add_parser("doctor", help="check cameras, USB, motor, rig, clock, rights, bus and disk")
-    parser.add_argument("--logs", type=Path, default=LOGS, metavar="FOLDER", help=f"where logs will go ({LOGS})")
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -33,14 +31,14 @@ def run(args: argparse.Namespace) -> int:
     from omnid.settings import load
 
     found: list[Finding] = []
-    for finding in examine(load(Config, args.config, args.overrides), args.logs):
+    for finding in examine(load(Config, args.config, args.overrides)):
         print(finding, flush=True)
         found.append(finding)
     print(verdict(found))
     return int(any(finding.level == "wrong" for finding in found))
 
 
-def examine(config: Config, logs: Path) -> Iterator[Finding]:
+def examine(config: Config) -> Iterator[Finding]:
     """All checks, the quick ones first."""
     from drivers.v4l2_devices import capture_devices
     from omnid.doctor import cameras, devices, machine, wiring
@@ -53,5 +51,6 @@ def examine(config: Config, logs: Path) -> Iterator[Finding]:
     yield devices.memberships()
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield from machine.clock()
-    yield machine.disk(logs, 2 * eyes.width_px * eyes.height_px * BYTES_PER_PIXEL * (eyes.rate_hz or 30.0))
+    rate = 2 * eyes.width_px * eyes.height_px * BYTES_PER_PIXEL * (eyes.rate_hz or 30.0)
+    yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
     yield from wiring.bus(config.bus.listen, config.bus.connect)

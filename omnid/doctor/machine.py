@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import platform
 import shutil
 import time
@@ -14,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from omnid.config import RecordConfig
 from omnid.doctor.finding import Finding
 from omnid.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 
@@ -23,8 +23,7 @@ BUILT_S: Final = 1_735_689_600  # the start of 2025: no clock that is right show
 _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
 _TIMEX_BYTES: Final = 1024  # more than struct timex has anywhere
 _SLOW_CLOCKS: Final = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
-_LEAST_BYTES: Final = 1 << 30
-_LEAST_S: Final = 600.0
+STATE: Final = Path("/var/lib/omnid")  # the unit's StateDirectory, in which it works
 
 
 def clock(now_s: float | None = None, synchronised: bool | None = None, root: Path = Path("/")) -> Iterator[Finding]:
@@ -67,18 +66,20 @@ def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
         yield Finding("ok", "memory", "it can be locked" if may_lock() else "it is not to be locked")
 
 
-def disk(folder: Path, bytes_per_s: float) -> Finding:
-    """Whether a log can be written in the folder, or in what is there of its path, and for how long."""
-    place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:
+    """Whether recordings fit into the folder, or onto the disk where it will be, for how long, and may go there."""
+    place = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(place).free
-    lasts_s = free / max(bytes_per_s, 1.0)
-    found = f"{free / 1e9:.1f} GB free at {place}, {lasts_s / 3600:.1f} h of recording"
-    if free < _LEAST_BYTES or lasts_s < _LEAST_S:
-        return Finding("warning", "disk", found, "delete old logs, or record elsewhere")
-    if not os.access(place, os.W_OK):
-        return Finding("warning", "disk", f"{place} cannot be written by you; the service writes in /var/lib/omnid",
-                       "record elsewhere, or with sudo")
-    return Finding("ok", "disk", found)
+    room = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
+    if room <= 0:
+        yield Finding("wrong" if config.enabled else "warning", "disk", f"{free / 1e9:.1f} GB free at {place}: nothing "
+                      f"is recorded below record.free_mb = {config.free_mb}", "delete something, or record elsewhere")
+    else:
+        yield Finding("ok", "disk", f"{free / 1e9:.1f} GB free at {place}: the newest {room / 1e9:.1f} GB, about "
+                      f"{room / bytes_per_s / 3600:.1f} h, are kept of what is recorded")
+    if not folder.is_relative_to(STATE):
+        yield Finding("warning", "disk", f"the service may write in {STATE} only, record.folder is {folder}",
+                      f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}")
 
 
 def programs() -> Iterator[Finding]:

@@ -21,6 +21,7 @@ from drivers.v4l2_devices import CaptureDevice
 from drivers.v4l2_modes import Mode, Sizes
 from drivers.v4l2_settings import V4l2Settings
 from omnid.cli import main
+from omnid.config import RecordConfig
 from omnid.doctor import machine
 from omnid.doctor.cameras import Stream, buses, cameras
 from omnid.doctor.devices import access, holders, memberships
@@ -272,9 +273,21 @@ def test_rights_are_those_of_whoever_asks() -> None:
     assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
-def test_room_for_logs(tmp_path: Path) -> None:
-    assert disk(tmp_path / "not" / "yet", 1.0).found.count(f"free at {tmp_path},") == 1
-    assert disk(tmp_path, 1e15).level == "warning" and "0.0 h of recording" in disk(tmp_path, 1e15).found
+def test_room_for_recordings() -> None:
+    (found,) = disk(machine.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
+    assert found.level == "ok" and f"free at {machine.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
+    full = 10**9
+    (found,) = disk(machine.STATE, RecordConfig(free_mb=full), 1e6)
+    assert found.level == "warning" and f"record.free_mb = {full}" in found.found
+    (found,) = disk(machine.STATE, RecordConfig(enabled=True, free_mb=full), 1e6)
+    assert found.level == "wrong"
+
+
+def test_a_folder_that_the_service_may_not_write_to(tmp_path: Path) -> None:
+    *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
+    assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.mend
+    unit = (ROOT / "systemd" / "omnid.service").read_text()
+    assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
 
 
 def test_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +332,7 @@ def test_the_command_checks_everything_and_says_so_by_its_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing = f"cameras.rig={tmp_path / 'rig.toml'}"
-    assert main(["doctor", "--logs", str(tmp_path), "--set", missing]) == 1
+    assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "wrong"}
     for subject in ("camera lower", "camera upper", "rig", "motor", "groups", "real time", "memory", "clock", "disk",
