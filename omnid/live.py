@@ -11,10 +11,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
-import cv2
-
 from calib.rig import Rig
-from calib.rig_file import read_rig
+from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Camera, Frame, FrameSource
 from drivers.simulated_motor import SimulatedMotor
 from drivers.v4l2_ledger import CameraState
@@ -22,14 +20,20 @@ from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.flow import nothing
 from omnid.graph import NEWEST, Graph
+from omnid.journal import WARNING
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder, status_report
+from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.outputs.helm import Helm, HelmSettings
 from omnid.outputs.latency import Latency
 from omnid.outputs.motor import open_motor
 from omnid.outputs.status import StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
+from omnid.realtime import ThreadStart, prepare, priorities
+from omnid.recording import open_recorder
+from omnid.service import Service, show_stacks_at_the_end
+from omnid.service import Status as StatusLine
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
 from omnid.transport.bus import Bus
@@ -57,7 +61,8 @@ class Live:
 
     def __init__(self, config: Config, open_camera: Opener, say: Say, rig: Rig | None = None) -> None:
         self._config, self._open, self._say, self._rig = config, open_camera, say, rig
-        self._graph = Graph(policy=NEWEST, depth=1)
+        on_thread = ThreadStart(priorities(config.realtime, "motor", *CAMERAS), say)
+        self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
         self._tally, self._latency = Tally(), Latency()
         self.offset_ns = time.time_ns() - time.monotonic_ns()  # from the stamps in here to Unix time
         self.twin: SimulatedMotor | None = None
@@ -65,10 +70,12 @@ class Live:
 
     def run(self) -> int:
         """The exit code, 0 after a signal to end."""
-        cv2.setNumThreads(self._config.graph.opencv_threads)
+        show_stacks_at_the_end()
         with self._ended_by_signals(), ExitStack() as ends:
             place = self._geometry()
             self._wire(place, {name: ends.enter_context(closing(self._open(name))) for name in CAMERAS}, ends)
+            for refused in prepare(self._config.realtime, self._config.graph.opencv_threads):
+                self._say(WARNING, refused)
             self._running = True
             self._graph.run()
         return 0
@@ -92,8 +99,8 @@ class Live:
     def _tell_of_rims(self, rig: Rig) -> None:
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
             if camera.mask is None:
-                self._say(4, f"no rim was found in the first pictures of the {name} camera, so all of each picture is "
-                          f"used: the rig may say otherwise in [{name}.mask]")
+                self._say(WARNING, f"no rim was found in the first pictures of the {name} camera, so all of each picture "
+                          f"is used: the rig may say otherwise in [{name}.mask]")
 
     def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
@@ -103,20 +110,30 @@ class Live:
         ends.callback(bus.close)
         pair = LivePair(place.rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
+        recorder = self._recorder(place, encode, ends) if config.record.enabled else None
         sinks = Ends(poses={"tally": self._tally, "latency": self._latency}, bus=BusSink(bus, encode), helm=helm,
-                     map_every_s=config.live.cloud_s)
+                     map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
+                     record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
         commands = self._commands(bus, helm) if helm else None
         report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
                                       self._tally, self._latency.to_pose, helm, commands, TICKERS))
-        graph.ticker("status", config.live.status_s, StatusTick(report, self._publisher(bus)))
+        wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder)])]
+        graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
+        service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)
+        graph.ticker("watchdog", service.period_s, service)
 
     def _helm(self, place: Geometry, ends: ExitStack) -> Helm:
         config = self._config
         driver, self.twin = open_motor(config.motor, ends)
         settings = HelmSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
                                 config.helm.limits)
-        return Helm(driver, place.rig.T_base_rig, settings, lambda text: self._say(4, text))
+        return Helm(driver, place.rig.T_base_rig, settings, lambda text: self._say(WARNING, text))
+
+    def _recorder(self, place: Geometry, encode: Encoder, ends: ExitStack) -> FrameRecorder:
+        recorder = open_recorder(self._config, rig_toml(place.rig), self._say, encode=encode, offset_ns=self.offset_ns)
+        ends.callback(recorder.close)
+        return recorder
 
     def _commands(self, bus: Bus, helm: Helm) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
@@ -149,3 +166,14 @@ class Live:
         if not self._running:
             raise SystemExit(0)  # nothing flows yet, the wheels stand; whatever is open is closed on the way
         self._graph.stop()
+
+
+def _keeper(recorder: FrameRecorder) -> Callable[[list[Status]], None]:
+    """What records statuses."""
+
+    def keep(statuses: list[Status]) -> None:
+        now_ns = time.time_ns()
+        with suppress(OmnidError):  # a clock may be set to what is no time
+            recorder.add(status_report(now_ns, statuses), now_ns)
+
+    return keep

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.graph import NEWEST, Graph, Sink, Stream
@@ -26,11 +27,13 @@ class Ends:
 
     poses: dict[str, Sink[Odometry]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
-    recorder: Sink[Outgoing] | None = None
+    recorder: Sink[Any] | None = None  # of all that is said, and of the pictures
     bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
     helm: Helm | None = None  # of a live robot: it decides by itself, at its own rate
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
+    pictures: tuple[Stream[Frame], ...] = ()  # that are recorded as well
+    record_depth: int | None = None  # messages of each kind that may wait for the recorder
 
 
 class Watched(NamedTuple):
@@ -56,7 +59,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     for name, sink in ends.poses.items():
         graph.sink(name, sink, odometry)
     if ends.recorder:
-        graph.sink("record", ends.recorder, *spoken)
+        graph.sink("record", ends.recorder, *ends.pictures, *spoken, depth=ends.record_depth)
     if ends.bus:
         graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
     return Watched(stereo, mapping)

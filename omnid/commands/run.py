@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -34,6 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Runs until it is told to end."""
     from omnid.config import Config
+    from omnid.journal import say
     from omnid.live import Live
     from omnid.settings import load
 
@@ -42,12 +42,8 @@ def run(args: argparse.Namespace) -> int:
     config = load(Config, args.config, [*args.overrides, *shortcuts])
     if args.log is None:
         _refuse_what_needs_a_log(args)
-        return Live(config, _devices(config), _say).run()
-    return Live(config, _recorded(args), _say, None if args.rig else _rig_of(args.log)).run()
-
-
-def _say(severity: int, text: str) -> None:
-    print(f"omnid: {text}", file=sys.stderr, flush=True)
+        return Live(config, _devices(config), say).run()
+    return Live(config, _recorded(args), say, None if args.rig else _rig_of(args.log)).run()
 
 
 def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
@@ -59,8 +55,9 @@ def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
 
 def _devices(config: Config) -> Opener:
     from drivers.v4l2_camera import V4l2Camera
+    from omnid.journal import say
 
-    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, report=_say)
+    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, report=say)
 
 
 def _recorded(args: argparse.Namespace) -> Opener:
