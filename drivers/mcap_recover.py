@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import os
-import struct
-import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
+from mcap.records import ChunkIndex, Header
 from mcap.writer import CompressionType, Writer
 
 from drivers.errors import DriverError
 from drivers.file_lock import hold, is_held
+from drivers.mcap_copy import Copy
 from drivers.mcap_index import has_footer, read_summary, summary_section
 from drivers.mcap_records import (
     MAGIC,
@@ -25,18 +24,13 @@ from drivers.mcap_records import (
     LogFile,
     Record,
     RecordError,
-    Source,
     content,
     parsing,
     records,
-    unpack_chunk,
 )
 
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _COMPRESSIONS = {b"lz4": CompressionType.LZ4, b"zstd": CompressionType.ZSTD}
 _CHUNK_BYTES: Final = 2**20
-_MAX_DEFINITIONS: Final = 4096
-_MAX_DEFINITION_BYTES: Final = 64 * 2**20  # of all together
 _LOOKED_AT: Final = 10_000  # records at the start, for the first chunk
 
 
@@ -99,7 +93,7 @@ def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
     header = _header(file)
     writer = Writer(target, _CHUNK_BYTES, _compression(file))
     writer.start(header.profile, header.library)
-    copy, trail = _Copy(writer), _Trail(file)
+    copy, trail = Copy(writer), _Trail(file)
     copy.define(file)
     for record in trail.records():
         if record.opcode == Opcode.CHUNK:
@@ -186,98 +180,3 @@ def _indexed_chunks(file: LogFile) -> list[int]:
                 with suppress(RecordError, *PARSE_ERRORS):
                     places.append(int(ChunkIndex.read(parsing(content(section, record))).chunk_start_offset))
     return sorted(places)
-
-
-class _Copy:
-    """Puts records into a writer, with channels and schemas under new numbers; counts what cannot be read as broken."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-        self._ids: dict[tuple[int, int], int] = {}  # (opcode, number in the log) -> number in the copy
-        self._definitions: dict[tuple[int, int], bytes] = {}
-        self._definition_bytes = 0
-        self.messages = self.attachments = self.broken = 0
-        self._takers: dict[int, Callable[[memoryview], None]] = {
-            Opcode.SCHEMA: self._schema,
-            Opcode.CHANNEL: self._channel,
-            Opcode.MESSAGE: self._message,
-            Opcode.ATTACHMENT: self._attachment,
-            Opcode.METADATA: self._metadata,
-        }
-
-    def define(self, file: LogFile) -> None:
-        """Takes channels and schemas from the summary, for the chunk that defines them may be lost."""
-        section = summary_section(file)
-        if section is not None:
-            for record in records(section, 0, section.size):
-                if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self.single(section, record)
-
-    def chunk(self, file: LogFile, record: Record) -> None:
-        """Takes what is in a chunk."""
-        try:
-            chunk = unpack_chunk(content(file, record))
-        except RecordError:
-            self.broken += 1
-            return
-        end = 0
-        for inner in records(chunk, 0, chunk.size):
-            end = inner.at + inner.size
-            self.single(chunk, inner)
-        self.broken += end != chunk.size
-
-    def single(self, source: Source, record: Record) -> None:
-        """Takes one record; what belongs to an index is made anew."""
-        take = self._takers.get(record.opcode)
-        if take is None:
-            return
-        try:
-            take(content(source, record))
-        except (RecordError, *PARSE_ERRORS):
-            self.broken += 1
-
-    def _schema(self, body: memoryview) -> None:
-        schema = Schema.read(parsing(body))
-        if self._is_new(Opcode.SCHEMA, schema.id, body):
-            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-            self._ids[Opcode.SCHEMA, schema.id] = number
-
-    def _channel(self, body: memoryview) -> None:
-        channel = Channel.read(parsing(body))
-        schema = self._ids.get((Opcode.SCHEMA, channel.schema_id)) if channel.schema_id else 0
-        if schema is None:
-            raise RecordError("a channel of an unknown schema")
-        if self._is_new(Opcode.CHANNEL, channel.id, body):
-            arguments = channel.topic, channel.message_encoding, schema, channel.metadata
-            self._ids[Opcode.CHANNEL, channel.id] = self._writer.register_channel(*arguments)
-
-    def _is_new(self, opcode: int, number: int, body: memoryview) -> bool:
-        """Whether a definition is not yet there; RecordError where there are too many."""
-        definition = bytes(body)
-        if self._definitions.get((opcode, number)) == definition:
-            return False
-        self._definition_bytes += len(body)
-        if len(self._ids) >= _MAX_DEFINITIONS or self._definition_bytes > _MAX_DEFINITION_BYTES:
-            raise RecordError("more channels and schemas than any robot has")
-        self._definitions[opcode, number] = definition
-        return True
-
-    def _message(self, body: memoryview) -> None:
-        channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(body)
-        number = self._ids.get((Opcode.CHANNEL, channel))
-        if number is None:
-            raise RecordError("a message of an unknown channel")
-        self._writer.add_message(number, log_time_ns, bytes(body[_MESSAGE.size :]), publish_time_ns, sequence)
-        self.messages += 1
-
-    def _attachment(self, body: memoryview) -> None:
-        crc = int.from_bytes(body[-4:], "little")
-        if crc and zlib.crc32(body[:-4]) != crc:
-            raise RecordError("an attachment does not match its CRC")
-        found = Attachment.read(parsing(body))
-        self._writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
-        self.attachments += 1
-
-    def _metadata(self, body: memoryview) -> None:
-        found = Metadata.read(parsing(body))
-        self._writer.add_metadata(found.name, found.metadata)

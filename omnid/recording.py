@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.settings import dump
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-PERIOD_S = 5.0  # between two lines about how it goes
+PERIOD_S = 15.0  # between two lines about how it goes
 
 
 def open_recorder(
@@ -63,7 +63,10 @@ def told(recorder: FrameRecorder, graph: Graph) -> str:
 @contextmanager
 def _ended_by_signals(graph: Graph) -> Iterator[None]:
     """The first signal ends the run whole, a second one at once."""
-    stop: Callable[..., None] = lambda *_: graph.stop()  # noqa: E731 - a def would need names for what it ignores
+
+    def stop(*_: object) -> None:
+        graph.stop()
+
     before = {number: signal.signal(number, stop) for number in STOPPING}
     try:
         yield

@@ -82,7 +82,8 @@ def test_a_kill_costs_at_most_a_second_and_the_rest_is_whole_again(
     assert sum(stamp < shortly_before_ns for stamp in times) == sum(stamp < shortly_before_ns for stamp in stamps)
     replayed = omnid.replay(path, "--inline")
     assert replayed.code == 0, replayed.err
-    assert replayed.count("pairs") >= saved // 2 - 1 and replayed.count("poses") >= saved // 2 - 1
+    alone = replayed.count("unpaired_lower") + replayed.count("unpaired_upper")  # the busy machine was too late for it
+    assert 2 * replayed.count("pairs") + alone == saved and replayed.count("poses") == replayed.count("pairs") > 50
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
