@@ -30,7 +30,12 @@ class HeadingGoal:
             self._offset_rad = wrap_angle(counted_rad - heading_rad)
 
     def towards(self, setpoint: Setpoint, heading_rad: float, turn_rad: float) -> float:
-        """The controller's heading that a setpoint leads to from heading_rad in odom, turn_rad further than before."""
+        """The controller's heading that a setpoint leads to from heading_rad in odom, turn_rad further than before.
+
+        Numbers that are not finite lead nowhere: it stays.
+        """
+        if not all(map(math.isfinite, (setpoint.heading_rad or 0.0, heading_rad, turn_rad))):
+            return self.stay()
         if setpoint.heading_rad is not None:
             self._turning_rad = None
             return wrap_angle(setpoint.heading_rad + self._offset_rad)

@@ -71,12 +71,13 @@ class Helm:
     """
 
     def __init__(self, driver: MotorDriver, T_base_rig: NDArray[np.float64], settings: HelmSettings,
-                 report: Callable[[str], None] = nothing) -> None:
+                 report: Callable[[str], None] = nothing, *, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._driver, self._T_base_rig, self._settings, self._report = driver, T_base_rig, settings, report
+        self._clock_ns = clock_ns  # that of the pictures' stamps
         self._hold, self._goal = HeadingHold(settings.hold), HeadingGoal()
         self._pose: Slot[Heading] = Slot()
         self._command: Slot[Arrived] = Slot()
-        self._void_ns = time.monotonic_ns()  # commands up to then count no more
+        self._void_ns = self._clock_ns()  # commands up to then count no more
         self._stop_ns = 0  # when a stop was asked for last
         self._last_ns = self._due_ns = 0  # when the last tick came, and when the next one should
         self._driven_ns = 0  # capture of the newest pose that was driven by
@@ -104,15 +105,15 @@ class Helm:
 
     def command(self, setpoint: Setpoint, arrival_ns: int | None = None) -> None:
         """Takes a command that arrived then (CLOCK_MONOTONIC), or just now, from any thread; the newest wins."""
-        self._command.put(Arrived(time.monotonic_ns() if arrival_ns is None else arrival_ns, setpoint))
+        self._command.put(Arrived(self._clock_ns() if arrival_ns is None else arrival_ns, setpoint))
 
     def stop(self) -> None:
         """Stops the wheels at the next tick, whatever else is commanded until then; from any thread."""
-        self._stop_ns = time.monotonic_ns()  # a time, for a flag could be cleared by the tick the moment it is set
+        self._stop_ns = self._clock_ns()  # a time, for a flag could be cleared by the tick the moment it is set
 
     def __call__(self) -> None:
         """One tick."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock_ns()
         dt_s, late_s = self._rhythm(now_ns)
         pose, command = self._pose.get(), self._command.get()
         self._judge(self._situation(now_ns, late_s, pose, command), now_ns)
@@ -123,7 +124,7 @@ class Helm:
         self._goal.heard(status.heading_rad, pose.at(now_ns) if pose and self.reason in SURE else None)
         if pose is not None and pose.stamp_ns > self._driven_ns:
             self._driven_ns = pose.stamp_ns
-            self.to_wheel.add((time.monotonic_ns() - pose.stamp_ns) * NS)
+            self.to_wheel.add((self._clock_ns() - pose.stamp_ns) * NS)
 
     def finish(self) -> None:
         """There will be no more poses."""
@@ -145,11 +146,11 @@ class Helm:
     def close(self) -> None:
         """Slows down to a stand, then releases the driver; the wheels stand when this returns."""
         self._ending = True
-        deadline_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / NS)
+        deadline_ns = self._clock_ns() + round(LONGEST_RAMP_S / NS)
         try:
-            while self._sent != STOP and not self._failed and time.monotonic_ns() < deadline_ns:
+            while self._sent != STOP and not self._failed and self._clock_ns() < deadline_ns:
                 self()
-                time.sleep(max(0.0, (self._due_ns - time.monotonic_ns()) * NS))
+                time.sleep(max(0.0, (self._due_ns - self._clock_ns()) * NS))
         finally:
             self._driver.close()
 

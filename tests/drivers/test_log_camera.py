@@ -1,0 +1,114 @@
+"""A log in the place of two cameras: in time, in step however long it runs, and nothing kept back."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import islice, pairwise
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.frame import Camera, Frame
+from drivers.log_camera import LATEST_NS, LogCamera, Pictures
+from drivers.mcap_reader import LogReader
+from tests.conftest import PAIRS
+from tests.replay.edited import Picture, pictures, save
+
+FAST = 50.0
+PATIENCE_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def recorded(scene: Path) -> Pictures:
+    return Pictures.of(scene / "log.mcap")
+
+
+def stamps(recorded: Pictures, camera: Camera, count: int) -> list[int]:
+    """The schedule of a camera at pace 1, without waiting for it."""
+    return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, 0)._schedule(), count)]
+
+
+def test_the_pictures_are_those_of_the_log(scene: Path, recorded: Pictures) -> None:
+    epoch_ns = time.monotonic_ns()
+    seen: list[Frame] = list(LogCamera(recorded, "upper", epoch_ns, pace=FAST, once=True).frames())
+    reader = LogReader(scene / "log.mcap")
+    expected = [frame for frame in reader.frames() if frame.camera == "upper"]
+    reader.close()
+    assert [frame.seq for frame in seen] == list(range(PAIRS))
+    assert [bytes(frame.data) for frame in seen] == [bytes(frame.data) for frame in expected]
+    for frame, original in zip(seen, expected, strict=True):
+        since_ns = (original.stamp_ns - min(expected[0].stamp_ns, reader_first(scene))) / FAST
+        assert frame.stamp_ns == pytest.approx(epoch_ns + since_ns, abs=1)
+
+
+def reader_first(scene: Path) -> int:
+    return pictures(scene / "log.mcap")[0].stamp_ns
+
+
+def test_no_frame_comes_before_its_stamp(recorded: Pictures) -> None:
+    camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
+    for frame in islice(camera.frames(), 2 * PAIRS + 5):
+        assert frame.stamp_ns <= time.monotonic_ns() and frame.camera == "lower"
+    assert camera.state.status == "streaming" and camera.state.frames + camera.state.drops >= 2 * PAIRS + 5
+
+
+def test_forwards_and_backwards_in_even_steps(recorded: Pictures) -> None:
+    passes = 6
+    lower, upper = (stamps(recorded, name, passes * PAIRS) for name in ("lower", "upper"))  # type: ignore[arg-type]
+    steps_ns = [b - a for a, b in pairwise(lower)]
+    assert min(steps_ns) > 80e6 and max(steps_ns) < 120e6
+    apart_ns = [abs(a - b) for a, b in zip(lower, upper, strict=True)]
+    assert max(apart_ns) < 5e6, "both cameras turn at once"
+
+
+def test_cameras_stay_in_step_though_one_has_lost_pictures(tmp_path: Path, scene: Path) -> None:
+    taken = [p for p in pictures(scene / "log.mcap") if not (p.camera == "upper" and p.pair in (3, 4, 5, 6, 7))]
+    holed = Pictures.of(save(tmp_path / "holed.mcap", taken))
+    lower, upper = stamps(holed, "lower", 20 * PAIRS), stamps(holed, "upper", 20 * (PAIRS - 5))
+    assert abs(lower[-1] - upper[-1]) < 5e6
+    nearest_ns = [min(abs(at_ns - other_ns) for other_ns in lower) for at_ns in upper[:300]]
+    assert max(nearest_ns) < 5e6
+
+
+def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: Pictures) -> None:
+    camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
+    frames = camera.frames()
+    first = next(frames)
+    time.sleep(0.4)
+    later = next(frames)
+    assert later.stamp_ns >= first.stamp_ns + 0.4e9 - LATEST_NS
+    assert camera.state.drops == later.seq - first.seq - 1 > 0
+
+
+def test_what_was_due_before_the_camera_was_made_is_not_a_drop(recorded: Pictures) -> None:
+    camera = LogCamera(recorded, "lower", time.monotonic_ns() - 10**9, pace=FAST)
+    first = next(camera.frames())
+    assert first.seq > 10 and camera.state.drops == 0
+
+
+def test_close_ends_a_wait(recorded: Pictures) -> None:
+    camera = LogCamera(recorded, "lower", time.monotonic_ns() + 10**12)
+    seen: list[Frame] = []
+    thread = threading.Thread(target=lambda: seen.extend(camera.frames()))
+    thread.start()
+    camera.close()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive() and seen == [] and camera.state.status == "closed"
+    camera.close()
+
+
+@pytest.mark.parametrize("pace", [0.0, -1.0, float("nan"), float("inf"), 1e-300])
+def test_a_pace_that_is_none_is_refused(recorded: Pictures, pace: float) -> None:
+    with pytest.raises(DriverError, match="pace"):
+        LogCamera(recorded, "lower", 0, pace=pace)
+
+
+def test_logs_that_show_nothing_are_refused(tmp_path: Path, scene: Path) -> None:
+    taken: list[Picture] = pictures(scene / "log.mcap")
+    few = [p for p in taken if p.camera == "lower" or p.pair == 0]
+    with pytest.raises(DriverError, match="24 pictures of the lower and 1 of the upper"):
+        Pictures.of(save(tmp_path / "few.mcap", few))
+    with pytest.raises(DriverError):
+        Pictures.of(tmp_path / "none.mcap")

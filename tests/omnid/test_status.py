@@ -1,0 +1,202 @@
+"""What a live daemon says of itself, part by part."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.rig import Rig
+from drivers.frame import Camera, Frame
+from drivers.motor import MotorStatus, VelocityCommand
+from drivers.v4l2_ledger import CameraState
+from omnid.config import PairConfig
+from omnid.core.heading import Setpoint
+from omnid.messages import Odometry
+from omnid.outputs.helm import Helm, HelmSettings
+from omnid.outputs.latency import Latency
+from omnid.outputs.status import ERROR, OK, SILENT_S, STALE, WARN, StatusReport, StatusTick, Watched
+from omnid.outputs.tally import Tally
+from omnid.stages.live_pair import LivePair
+from omnid.telemetry import StageStats, Telemetry
+from omnid.transport.codec import Status, diagnostics_cdr
+from omnid.transport.commands import Commands
+from tests.scenes import build
+
+SIZE = 256
+JPEG = cv2.imencode(".jpg", np.full((SIZE, SIZE), 90, np.uint8))[1].tobytes()
+
+
+class Wheels:
+    """A controller that takes everything."""
+
+    fault = 0
+
+    def send(self, command: VelocityCommand) -> MotorStatus:
+        """Taken."""
+        return MotorStatus(0.0, 0.0, 0.0, False, self.fault, 12.0)
+
+    def close(self) -> None:
+        """Done."""
+
+
+class Daemon:
+    """The parts that are asked."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.telemetry, self.tally, self.latency = Telemetry(), Tally(), Latency()
+        self.stages = [self.telemetry.add(StageStats(name)) for name in ("stereo", "motor")]
+        self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
+        self.pair = LivePair(rig, PairConfig())
+        self.wheels = Wheels()
+        self.helm = Helm(self.wheels, np.eye(4), HelmSettings(0.05))
+        self.commands = Commands(self.helm.command, self.helm.stop, 0.5)
+        self.report = StatusReport(Watched(self.telemetry, self.cameras, self.pair, self.tally, self.latency.to_pose,
+                                           self.helm, self.commands, frozenset({"motor"})))
+
+    def asked(self) -> dict[str, Status]:
+        """All that is said, by name, after it has proved fit for the wire."""
+        statuses = self.report()
+        diagnostics_cdr(time.time_ns(), statuses)
+        return {status.name.removeprefix("omnid: "): status for status in statuses}
+
+    def shoot(self, *cameras: Camera, age_s: float = 0.0, data: bytes = JPEG) -> None:
+        for camera in cameras:
+            self.cameras[camera].status = "streaming"
+            self.cameras[camera].frames += 1
+            self.pair.process(Frame(0, time.monotonic_ns() - round(age_s * 1e9), camera, "jpeg", data))
+
+    def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
+        depth: Any = None
+        odometry = Odometry(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
+                            np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
+        self.tally.process(odometry)
+        self.latency.process(odometry)
+        self.helm.process(odometry)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return build("two_walls", seed=3, size=SIZE, pairs=2).rig
+
+
+@pytest.fixture
+def daemon(rig: Rig) -> Daemon:
+    return Daemon(rig)
+
+
+def test_a_daemon_that_has_seen_nothing(daemon: Daemon) -> None:
+    said = daemon.asked()
+    assert (said["odometry"].level, said["odometry"].message) == (STALE, "no pose yet")
+    assert said["pairing"].message == "no pictures of the lower and the upper camera"
+    assert said["wheels"].message == "no command" and said["wheels"].level == OK
+    assert said["stage stereo"].values["dropped"] == "0" and said["stage motor"].values["missed"] == "0"
+
+
+@pytest.mark.parametrize(("state", "level"), [("tracking", OK), ("degraded", WARN), ("lost", ERROR)])
+def test_states_of_the_odometry(daemon: Daemon, state: str, level: int) -> None:
+    daemon.pose(state)
+    said = daemon.asked()["odometry"]
+    assert (said.level, said.message) == (level, state) and said.values["landmarks"] == "80 of 99"
+    assert 0.0 <= float(said.values["capture_to_pose_max_ms"]) < 1e5
+
+
+def test_an_old_pose_is_stale_whatever_its_state(daemon: Daemon) -> None:
+    daemon.pose(age_s=SILENT_S + 0.5)
+    said = daemon.asked()["odometry"]
+    assert said.level == STALE and said.message.startswith("no pose for 1.5")
+
+
+def test_cameras_in_step(daemon: Daemon) -> None:
+    daemon.asked()
+    daemon.shoot("lower", "upper")
+    said = daemon.asked()
+    pairing = said["pairing"]
+    assert (pairing.level, pairing.message, pairing.values["pairs"]) == (OK, "in step", "1")
+    assert {said[f"{name} camera"].level for name in ("lower", "upper")} == {OK}
+    assert said["lower camera"].message == "streaming" and float(said["lower camera"].values["rate_hz"]) > 0
+
+
+def test_a_camera_that_says_nothing_is_named(daemon: Daemon) -> None:
+    daemon.shoot("lower")
+    daemon.shoot("upper", age_s=SILENT_S + 2)
+    said = daemon.asked()
+    assert (said["pairing"].level, said["pairing"].message) == (WARN, "no pictures of the upper camera")
+    assert said["upper camera"].level == ERROR and said["upper camera"].message.startswith("no picture for 3.0")
+    assert said["lower camera"].level == OK
+
+
+def test_a_lost_camera_tells_why(daemon: Daemon) -> None:
+    daemon.shoot("lower", "upper")
+    daemon.cameras["lower"].status, daemon.cameras["lower"].problem = "lost", "it was unplugged"
+    said = daemon.asked()["lower camera"]
+    assert (said.level, said.message) == (ERROR, "it was unplugged")
+
+
+def test_pictures_that_never_meet_and_pictures_that_are_none(daemon: Daemon) -> None:
+    daemon.asked()
+    daemon.shoot("lower")
+    daemon.shoot("upper", age_s=0.3)
+    assert "pair.tolerance_ms" in daemon.asked()["pairing"].message
+    daemon.shoot("lower", "upper", data=b"no picture")
+    said = daemon.asked()["pairing"]
+    assert said.level == WARN and "cannot be decoded" in said.message and said.values["broken"] == "2"
+
+
+def test_wheels(daemon: Daemon) -> None:
+    daemon.pose()
+    daemon.helm.command(Setpoint(0.2, None))
+    daemon.helm()
+    said = daemon.asked()["wheels"]
+    assert (said.level, said.message) == (OK, "driving") and said.values["sent"] == "1"
+    assert "capture_to_wheel_p50_ms" in said.values and "tick_late_p99_ms" in said.values
+    daemon.pose("lost")
+    daemon.helm()
+    said = daemon.asked()["wheels"]
+    assert (said.level, said.message) == (WARN, "the pose is lost") and said.values["stopped, the pose is lost"] == "1"
+    daemon.wheels.fault = 7
+    daemon.helm()
+    said = daemon.asked()["wheels"]
+    assert said.level == ERROR and said.values["fault"] == "7"
+
+
+def test_refused_commands_are_told_by_reason(daemon: Daemon) -> None:
+    for payload in (b"", b"x" * 5000):
+        daemon.commands.take("cmd/twist", payload)
+    values = daemon.asked()["wheels"].values
+    assert values["refused, malformed"] == values["refused, too long"] == "1" and values["commands"] == "0"
+
+
+def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
+    """New reasons appear while the old ones are told."""
+    halt = threading.Event()
+
+    def meddle() -> None:
+        number = 0
+        while not halt.is_set():
+            number = (number + 1) % 300
+            if not number:
+                daemon.helm.stops.clear()
+                daemon.commands.refused.clear()
+            daemon.helm.stops[f"reason {number}"] += 1
+            daemon.commands.refused[f"reason {number}"] += 1
+
+    thread = threading.Thread(target=meddle)
+    thread.start()
+    try:
+        for _ in range(300):
+            daemon.report()
+    finally:
+        halt.set()
+        thread.join()
+
+
+def test_the_tick_hands_the_report_to_everybody(daemon: Daemon) -> None:
+    heard: list[list[Status]] = []
+    StatusTick(daemon.report, heard.append, heard.append)()
+    assert len(heard) == 2 and heard[0] is heard[1] and heard[0][0].name == "omnid: odometry"
