@@ -99,8 +99,8 @@ class Live:
     def _tell_of_rims(self, rig: Rig) -> None:
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
             if camera.mask is None:
-                self._say(WARNING, f"no rim was found in the first pictures of the {name} camera, so all of each picture "
-                          f"is used: the rig may say otherwise in [{name}.mask]")
+                self._say(WARNING, f"no rim was found in the first pictures of the {name} camera, so all of each "
+                          f"picture is used: the rig may say otherwise in [{name}.mask]")
 
     def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
