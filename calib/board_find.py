@@ -19,10 +19,11 @@ from calib.board_corners import Grey, find_corners, look_at, smoothed
 from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
 from calib.board_order import as_grid, in_order, largest_board, place
 from calib.board_refine import refine
-from calib.board_shape import unevenness
+from calib.board_shape import is_printed, unevenness
 from calib.camera import Array
 
 Image = NDArray[np.uint8]
+MIN_SIDE_PX = 32
 BLUR_PX = 0.7
 # Of a picture's grids so many are grown and tried.
 TRIED_GRIDS = 4
@@ -59,6 +60,8 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
     Not thorough: one look, some 0.1 s for a megapixel, for frames of which there are plenty.
     """
     seen = (0, 0)
+    if min(image.shape) < MIN_SIDE_PX:
+        return Search(None)
     blurred = smoothed(image, BLUR_PX)
     for look in _looks(image) if thorough else islice(_looks(image), 1):
         for looked_at in _grids(look):
@@ -156,7 +159,7 @@ def _view(image: Image, grid: Grid, board: Board, name: str) -> BoardView | None
     ordered = in_order(blurred, placed, board)
     good = _without_strays(blurred, refine(image, ordered))
     part = float(np.isfinite(good[..., 0]).mean())
-    if part < MIN_GOOD:
+    if part < MIN_GOOD or not is_printed(blurred, good):
         return None
     return BoardView(name, good.reshape(-1, 2), part * (1 - float(np.nanmean(unevenness(good)))))
 

@@ -49,15 +49,16 @@ def _pairs(pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Indices a, b (M,) of near candidates and their distances [px]."""
     near = min(NEAREST, len(pixels) - 1)
     firsts, seconds, lengths = [], [], []
+    norm = (pixels**2).sum(axis=1)
     for start in range(0, len(pixels), 512):
-        block = pixels[start:start + 512].astype(np.float32)
-        squared = ((block[:, None] - pixels[None].astype(np.float32)) ** 2).sum(axis=2)
+        block = pixels[start:start + 512]
+        squared = np.maximum(norm[start:start + 512, None] + norm - 2 * block @ pixels.T, 0.0)
         squared[np.arange(len(block)), start + np.arange(len(block))] = np.inf
         chosen = np.argpartition(squared, near - 1, axis=1)[:, :near]
         firsts.append(np.repeat(start + np.arange(len(block)), near))
         seconds.append(chosen.ravel())
         lengths.append(np.sqrt(np.take_along_axis(squared, chosen, axis=1)).ravel())
-    return np.concatenate(firsts), np.concatenate(seconds), np.concatenate(lengths).astype(float)
+    return np.concatenate(firsts), np.concatenate(seconds), np.concatenate(lengths)
 
 
 def _arms(corners: Corners, a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

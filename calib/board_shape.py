@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from calib.board_corners import Grey, sample
 from calib.camera import Array
 
 # Neighbours in a square of this half side shape the mapping; it has six terms and a corner may lack some of them.
 NEIGHBOURS = 2
 MIN_NEIGHBOURS = 6
+# Of a print every square is plain: within its middle part grey levels spread by less than this part of the step to the
+# squares beside it, and so many of those steps go the right way, and are no less than a part of the usual one (the edge
+# of a shadow spoils some). Bricks and letters make a few squares by chance: a board of so few corners has to be clean.
+MIDDLE = np.linspace(0.3, 0.7, 5)
+MIN_STEP = 0.25
+MAX_SPREAD, MIN_STEPS = 0.22, 0.6
+FEW_CORNERS, FEW_MAX_SPREAD, FEW_MIN_STEPS = 20, 0.08, 0.9
 
 
 def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Array | None:
@@ -56,3 +64,28 @@ def folds(corners: Array) -> bool:
     along, down = np.diff(corners, axis=1)[:-1], np.diff(corners, axis=0)[:, :-1]
     turning = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
     return bool((turning[np.isfinite(turning)] <= 0).any())
+
+
+def is_printed(image: Grey, corners: Array) -> bool:
+    """Whether the squares between corners (rows, columns, 2) are plain, and dark and light by turns."""
+    level, spread = _squares(image, corners)
+    sign = np.where(np.indices(level.shape).sum(axis=0) % 2 == 0, -1.0, 1.0)
+    down, along = (level[:-1] - level[1:]) * sign[:-1], (level[:, :-1] - level[:, 1:]) * sign[:, :-1]
+    steps = np.concatenate([down.ravel(), along.ravel()])
+    steps = steps[np.isfinite(steps)]
+    if not steps.size:
+        return False
+    usual = float(np.median(steps))
+    alternate = float((steps * np.sign(usual) > MIN_STEP * abs(usual)).mean())
+    few = corners.shape[0] * corners.shape[1] < FEW_CORNERS
+    least, most = (FEW_MIN_STEPS, FEW_MAX_SPREAD) if few else (MIN_STEPS, MAX_SPREAD)
+    return bool(alternate >= least and np.nanmedian(spread) < most * abs(usual))
+
+
+def _squares(image: Grey, corners: Array) -> tuple[Array, Array]:
+    """Mean grey and its standard deviation in the middle of every square (rows - 1, columns - 1); NaN: unknown."""
+    a, b, c, d = (corners[:-1, :-1, None], corners[:-1, 1:, None], corners[1:, :-1, None], corners[1:, 1:, None])
+    x, y = (part.ravel()[:, None] for part in np.meshgrid(MIDDLE, MIDDLE))
+    places = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
+    grey = np.where(np.isfinite(places[..., 0]), sample(image, np.nan_to_num(places)), np.nan)
+    return grey.mean(axis=2), grey.std(axis=2)

@@ -8,12 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from calib.board import Board
 from calib.camera import Mask
 from calib.camera_file import read_camera
 from calib.ocam import OcamCamera
 from calib.unified import UnifiedCamera
+from drivers.mcap_writer import LogWriter
 from omnid.cli import main
 from tests.scenes.boards import Studio, around
 
@@ -61,6 +63,30 @@ def test_patterns_and_the_omni_model_with_a_picture_that_has_no_board(folder: Pa
     assert "of 8 views" in capsys.readouterr().out
     camera = read_camera(tmp_path / "camera.toml").camera
     assert isinstance(camera, UnifiedCamera) and camera.focal == pytest.approx(CAMERA.focal, rel=2e-3)
+
+
+def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
+    """The pictures of a folder as PNG messages on every topic."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = store.types
+    with LogWriter(path) as writer:
+        for number, picture in enumerate(sorted(folder.iterdir())):
+            header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](number + 1, 0), "camera")
+            data = np.frombuffer(picture.read_bytes(), np.uint8)
+            message = kinds["sensor_msgs/msg/CompressedImage"](header, "png", data)
+            cdr = store.serialize_cdr(message, "sensor_msgs/msg/CompressedImage")
+            for topic in topics:
+                writer.write(topic, "sensor_msgs/msg/CompressedImage", bytes(cdr), (number + 1) * 10**9)
+
+
+def test_a_log_gives_the_same_camera_and_asks_for_the_topic(folder: Path, tmp_path: Path,
+                                                            capsys: pytest.CaptureFixture[str]) -> None:
+    log_of(folder, tmp_path / "log.mcap", ("/lower", "/upper"))
+    assert run(tmp_path / "log.mcap", "-o", tmp_path / "camera.toml") == 2
+    assert "expected --topic, to say which camera, found image topics /lower, /upper" in capsys.readouterr().err
+    assert run(tmp_path / "log.mcap", "--topic", "/upper", "--model", "omni", "-o", tmp_path / "camera.toml") == 0
+    assert "of 8 views" in capsys.readouterr().out
+    assert read_camera(tmp_path / "camera.toml").camera.center == pytest.approx(CAMERA.center, abs=0.3)
 
 
 def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
