@@ -48,9 +48,10 @@ def watchdog_s() -> float | None:
 
 
 def show_stacks_at_the_end() -> None:
-    """Has a daemon that is killed for being stuck write on stderr where each of its threads was."""
-    faulthandler.enable()  # SIGABRT, by which systemd's watchdog ends a service
-    faulthandler.register(signal.SIGXCPU, chain=True)  # by which the kernel ends what runs on at real-time priority
+    """Has a daemon that is killed for being stuck write on stderr, if that is a file, where each of its threads was."""
+    with suppress(OSError, ValueError):
+        faulthandler.enable()  # SIGABRT, by which systemd's watchdog ends a service
+        faulthandler.register(signal.SIGXCPU, chain=True)  # by which the kernel ends what runs on at real-time priority
 
 
 def hung(stages: Collection[StageStats], now_ns: int, longest_s: float) -> dict[str, float]:

@@ -18,7 +18,7 @@ import pytest
 
 from omnid.graph import LOSSLESS, NEWEST, Graph
 from omnid.outputs.tally import Tally
-from omnid.service import Service, Status, hung, notify, watchdog_s
+from omnid.service import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
 from omnid.telemetry import StageStats, Telemetry
 
 ROOT = Path(__file__).parents[2]
@@ -263,6 +263,10 @@ def test_the_status_counts_messages_and_deadlines_apart() -> None:
     tally.poses = 10**6
     assert status().startswith("tracking, ")
     assert status().startswith("waiting for pictures, 0.0 poses/s")
+
+
+def test_where_stderr_is_no_file_there_is_nothing_to_show(capsys: pytest.CaptureFixture[str]) -> None:
+    show_stacks_at_the_end()
 
 
 @pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGXCPU], ids=lambda number: number.name)

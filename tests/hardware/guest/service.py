@@ -1,0 +1,143 @@
+"""Run by pytest in the guest, as root: the unit under systemd, with a small daemon in the place of omnid.
+
+The tests build on each other: the service starts, is looked at, gets a network, hangs, is killed, is stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SYSTEMD = Path("/opt/omnid/systemd")
+DROP_INS = Path("/etc/systemd/system/omnid.service.d")
+REPORT = Path("/var/lib/omnid/report.json")
+LIMIT_S = 90.0
+FIFO, OTHER = os.SCHED_FIFO, os.SCHED_OTHER
+DAEMON = """[Service]
+ExecStart=
+ExecStart=/usr/bin/python3 -m tests.hardware.guest.small_daemon
+Environment=PYTHONPATH=/opt/omnid
+WatchdogSec=6
+"""
+
+
+def run(*command: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.strip()
+
+
+def show(what: str) -> str:
+    return run("systemctl", "show", "omnid", "-p", what, "--value")
+
+
+def until(what: Callable[[], object]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not what():
+        assert time.monotonic() < end_s, run("journalctl", "-u", "omnid", "--no-pager", "-n", "60")
+        time.sleep(0.3)
+
+
+def reported() -> dict[str, Any]:
+    """What the daemon that runs now has found."""
+    def is_there() -> bool:
+        return REPORT.exists() and json.loads(REPORT.read_text())["pid"] == int(show("MainPID"))
+
+    until(is_there)
+    return dict(json.loads(REPORT.read_text()))
+
+
+def restarted(pid: int) -> None:
+    """Waits for another daemon in the place of this one."""
+    until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
+
+
+def said() -> list[tuple[int, str]]:
+    """Priority and text of all that is in the journal of the unit."""
+    lines = run("journalctl", "-u", "omnid", "--no-pager", "-o", "json").splitlines()
+    return [(int(entry["PRIORITY"]), entry["MESSAGE"]) for entry in map(json.loads, lines)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def unit() -> Iterator[None]:
+    """The unit as the README installs it; the machine has a second address, at which it listens too."""
+    run("modprobe", "vivid", "n_devs=1", "node_types=0x1")
+    run("busybox", "ip", "link", "set", "lo", "up")
+    run("busybox", "ip", "addr", "add", "192.168.1.5/24", "dev", "lo")
+    run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", "omnid")
+    run("chmod", "-R", "a+rX", "/opt/omnid")
+    Path("/etc/omnid").mkdir()
+    shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
+    DROP_INS.mkdir()
+    (DROP_INS / "daemon.conf").write_text(DAEMON)
+    run("systemctl", "daemon-reload")
+    with socket.create_server(("0.0.0.0", 7000), backlog=100):
+        yield
+
+
+def test_it_is_ready_when_it_says_so() -> None:
+    run("systemctl", "start", "omnid")  # waits for READY=1
+    assert show("ActiveState") == "active" and show("StatusText").startswith("waiting for pictures")
+
+
+def test_its_threads_have_names_and_only_two_have_priority() -> None:
+    threads = {name: tuple(found) for name, found in reported()["threads"].items()}
+    assert threads["motor"] == (FIFO, 20) and threads["lower"] == (FIFO, 10)
+    assert {"picture", "bus", "watchdog"} <= threads.keys()
+    assert {found for name, found in threads.items() if name not in ("motor", "lower")} == {(OTHER, 0)}
+
+
+def test_its_memory_is_locked() -> None:
+    assert reported()["locked_kb"] > 100_000
+
+
+def test_only_its_own_folders_can_be_written() -> None:
+    assert {path: found == "done" for path, found in reported()["written"].items()} == {
+        "/etc/omnid": False, "/opt/omnid": False, "/var/lib": False, "/var/lib/omnid": True, "/run/omnid": True}
+
+
+def test_cameras_and_serial_ports_are_open_to_it_and_nothing_else() -> None:
+    assert {path: found == "done" for path, found in reported()["opened"].items()} == {
+        "/dev/ttyS1": True, "/dev/video0": True, "/dev/vda": False, "/dev/kmsg": False}
+
+
+def test_this_machine_is_all_its_network_unless_more_is_allowed() -> None:
+    found = reported()
+    assert found["reached"]["127.0.0.1"] == "done" and found["reached"]["192.168.1.5"] != "done"
+    shutil.copy(SYSTEMD / "lan.conf", DROP_INS)
+    run("systemctl", "daemon-reload")
+    run("systemctl", "restart", "omnid")
+    assert reported()["reached"] == {"127.0.0.1": "done", "192.168.1.5": "done"}
+
+
+def test_a_hung_stage_is_told_of_and_the_daemon_restarted() -> None:
+    pid = reported()["pid"]
+    Path("/run/omnid/hang").touch()
+    restarted(pid)
+    lines = said()
+    assert any(priority == 3 and text.startswith("stage 'picture' is hung") for priority, text in lines)
+    assert any("in where_it_hangs" in text for _, text in lines)
+    assert any(text == "omnid.service: Failed with result 'watchdog'." for _, text in lines)
+
+
+def test_a_daemon_that_is_killed_comes_back() -> None:
+    pid = reported()["pid"]
+    os.kill(pid, signal.SIGKILL)
+    restarted(pid)
+    assert int(show("NRestarts")) == 2
+
+
+def test_it_ends_when_it_is_told_to() -> None:
+    reported()
+    run("systemctl", "stop", "omnid")
+    assert (show("ActiveState"), show("Result")) == ("inactive", "success")
