@@ -1,0 +1,232 @@
+"""Both ends of a live daemon, for real: an operator on the bus, and a controller that notes what it is told."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+
+from drivers.simulated_line import SimulatedLine
+from drivers.simulated_motor import SimulatedMotor
+from omnid.transport import codec
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 60.0  # bounds a wait on a loaded machine; nothing is measured against it
+COMMANDS_S = 0.05  # between two commands of the operator
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def wait_until(happens: Callable[[], object], what: str = "it", patience_s: float = PATIENCE_S) -> None:
+    """Returns once it happens; AssertionError after the patience."""
+    deadline_s = time.monotonic() + patience_s
+    while not happens():
+        assert time.monotonic() < deadline_s, f"{what} did not happen within {patience_s:g} s"
+        time.sleep(0.02)
+
+
+def free_port() -> int:
+    """A port on this machine that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def answers(port: int) -> bool:
+    """Whether somebody listens on the port."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+class Told(NamedTuple):
+    """What the controller had been told by then."""
+
+    at_s: float
+    wheels_mps: tuple[float, float]
+
+
+class NotedLine(SimulatedLine):
+    """The twin's controller, with notes; bounded by the length of a test."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[Told] = []
+
+    def feed(self, data: bytes) -> bytes:
+        """The answers; what is told by now is noted."""
+        answer = super().feed(data)
+        self.notes.append(Told(time.monotonic(), (self.base.told_mps[0], self.base.told_mps[1])))
+        return answer
+
+    def moved_since(self, at_s: float) -> bool:
+        """Whether a wheel was told to turn after that time."""
+        return any(note.at_s > at_s and any(note.wheels_mps) for note in list(self.notes))
+
+
+class Base:
+    """A robot's base behind a name that stays; it can be unplugged and plugged in again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.line = NotedLine()
+        self.port = folder / "motor"
+        self.twin = SimulatedMotor(self.line)
+        self.port.symlink_to(self.twin.port)
+
+    @property
+    def drives(self) -> bool:
+        """Whether the wheels are told to turn now."""
+        return any(self.line.base.told_mps)
+
+    def unplug(self) -> None:
+        """The port is gone."""
+        self.port.unlink()
+        self.twin.close()
+
+    def plug_in(self) -> None:
+        """Another pty under the same name; the controller has started anew."""
+        self.line = NotedLine()
+        self.twin = SimulatedMotor(self.line)
+        self.port.symlink_to(self.twin.port)
+
+    def close(self) -> None:
+        """Lets go of the pty."""
+        self.twin.close()
+
+
+class Operator:
+    """A zenoh peer beside the daemon: hears poses and states, sends commands at 20 Hz once it is told to."""
+
+    def __init__(self, port: int) -> None:
+        config = zenoh.Config()
+        settings = {"mode": "peer", "connect/endpoints": [f"tcp/127.0.0.1:{port}"], "listen/endpoints": [],
+                    "scouting/multicast/enabled": False}
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        self.poses: list[codec.OdometryRecord] = []
+        self.states: dict[str, Any] = {}  # newest diagnostic status by name
+        self.said: set[tuple[str, str]] = set()  # part and message, all there were
+        self._session = zenoh.open(config)
+        self._session.declare_subscriber("omnid/odom", self._pose)
+        self._session.declare_subscriber("omnid/status", self._state)
+        self._wish: tuple[float, float] | None = None
+        self._leaving = threading.Event()
+        self._thread = threading.Thread(target=self._send_on, name="operator")
+        self._thread.start()
+
+    def drive(self, velocity_mps: float = 0.3, heading_rad: float = 0.0) -> None:
+        """Sends this from now on."""
+        self._wish = velocity_mps, heading_rad
+
+    def cease(self) -> None:
+        """Sends no more."""
+        self._wish = None
+
+    def send(self, key: str, payload: bytes) -> None:
+        """Sends anything once."""
+        self._session.put(f"omnid/{key}", payload)
+
+    def message(self, part: str) -> str:
+        """What the daemon last said about a part."""
+        status = self.states.get(f"omnid: {part}")
+        return "" if status is None else status.message
+
+    def values(self, part: str) -> dict[str, str]:
+        """The values it last gave for a part."""
+        status = self.states.get(f"omnid: {part}")
+        return {} if status is None else {pair.key: pair.value for pair in status.values}
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._leaving.set()
+        self._thread.join()
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _send_on(self) -> None:
+        while not self._leaving.wait(COMMANDS_S):
+            wish = self._wish
+            if wish is not None:
+                self.send("cmd/heading", codec.heading_cdr(time.time_ns(), *wish))
+
+    def _pose(self, sample: zenoh.Sample) -> None:
+        self.poses.append(codec.odometry_from_cdr(sample.payload.to_bytes()))
+
+    def _state(self, sample: zenoh.Sample) -> None:
+        message: Any = STORE.deserialize_cdr(sample.payload.to_bytes(), codec.DIAGNOSTICS_SCHEMA)
+        for status in message.status:
+            if len(message.status) > 1:  # else it only tells that the state of the odometry has changed
+                self.states[status.name] = status
+            self.said.add((status.name.removeprefix("omnid: "), status.message))
+
+
+class Daemon:
+    """A running daemon, heard by its operator; `tell` reaches the standard input of tests.replay.faulty."""
+
+    def __init__(self, process: subprocess.Popen[str], port: int) -> None:
+        self.process, self.port = process, port
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self.process.poll() is None
+
+    def tell(self, line: str) -> None:
+        """One line for its standard input."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """The exit code and what was said on stderr, after a signal."""
+        self.process.send_signal(number)
+        _, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, err
+
+
+def command_line(scene: Path, port: int, motor: Path | None, *words: object, module: str = "omnid") -> list[str]:
+    """`omnid run` on the pictures of a scene."""
+    run = [] if module != "omnid" else ["run"]
+    log = ["--log", scene / "log.mcap", "--rig", scene / "rig.toml"]
+    wheels = [] if motor is None else ["--motor", motor]
+    settings = [f'bus.listen=["tcp/127.0.0.1:{port}"]', "live.status_s=0.2", "live.cloud_s=0.5"]
+    sets = [word for setting in settings for word in ("--set", setting)]
+    return [sys.executable, "-m", module, *map(str, [*run, *log, *wheels, *sets, *words])]
+
+
+@contextmanager
+def started(command: list[str], port: int) -> Iterator[Daemon]:
+    """A daemon, ended at the latest with the block."""
+    pipe = subprocess.PIPE
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
+        try:
+            yield Daemon(process, port)
+        finally:
+            process.kill()
+
+
+@contextmanager
+def robot(scene: Path, folder: Path, *words: object, module: str = "omnid") -> Iterator[tuple[Daemon, Operator, Base]]:
+    """A daemon that has given its first pose, its operator, and the base, which stands."""
+    port = free_port()
+    with ExitStack() as ends:
+        base = Base(folder)
+        ends.callback(base.close)
+        command = command_line(scene, port, base.port, *words, module=module)
+        daemon = ends.enter_context(started(command, port))
+        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
+        assert daemon.alive, daemon.process.communicate()[1]
+        operator = Operator(port)
+        ends.callback(operator.close)
+        wait_until(lambda: operator.poses and operator.states, "a pose")
+        yield daemon, operator, base

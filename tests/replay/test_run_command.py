@@ -1,0 +1,145 @@
+"""`omnid run` as a program: poses flow, wheels obey, and it ends as it should."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omnid.core.trajectory import read_tum
+from tests.replay.command import Command
+from tests.replay.live import PATIENCE_S, ROOT, answers, free_port, robot, started, wait_until
+
+SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
+
+
+
+def test_poses_flow_wheels_obey_and_sigterm_ends_it(tmp_path: Path, scene: Path) -> None:
+    with robot(scene, tmp_path) as (daemon, operator, base):
+        time.sleep(0.5)
+        assert not base.line.moved_since(0.0), "nobody has asked"
+        operator.drive(0.3)
+        wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
+        operator.cease()
+        wait_until(lambda: not base.drives, "the stop")
+        stopped_s = time.monotonic()
+        count = len(operator.poses)
+        wait_until(lambda: len(operator.poses) > count + 5, "more poses")
+        assert not base.line.moved_since(stopped_s), "nobody has asked again"
+        wait_until(lambda: operator.message("wheels") == "no command", "the word that no command comes")
+        operator.drive(0.3)
+        wait_until(lambda: base.drives, "motion again")
+        operator.send("cmd/stop", b"")
+        wait_until(lambda: operator.values("wheels").get("stops") == "1", "the stop's count")
+        operator.drive(0.2)
+        wait_until(lambda: base.line.base.velocity_mps > 0.15, "motion after the stop")
+        code, err = daemon.end()
+        assert code == 0 and "Traceback" not in err, err
+        assert not base.drives and base.line.base.errors == 0
+        last = base.line.notes[-20:]
+        assert any(0.0 < note.wheels_mps[0] < 0.19 for note in last), "it slowed down before the end"
+    assert all(line.startswith("omnid: ") for line in err.splitlines())
+
+
+def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
+    """The path of the log, forwards and backwards: never further from the start than its end."""
+    truth = read_tum(scene / "truth.txt")
+    longest_m = max(float(np.linalg.norm(T[:3, 3] - truth.T[0][:3, 3])) for T in truth.T)
+    with robot(scene, tmp_path) as (_, operator, _):
+        wait_until(lambda: len(operator.poses) >= 15, "fifteen poses")
+        now_s = time.time()
+        away_m = [float(np.linalg.norm(record.T_odom_base[:3, 3])) for record in operator.poses]
+        assert max(away_m) < longest_m * 1.1 and longest_m > 0.2
+        assert abs(operator.poses[-1].stamp_ns * 1e-9 - now_s) < PATIENCE_S, "stamps on the wire are Unix time"
+        steps_ns = np.diff([record.stamp_ns for record in operator.poses])
+        assert (steps_ns > 0).all()
+
+
+def test_one_camera_gone_and_back(tmp_path: Path, scene: Path) -> None:
+    with robot(scene, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
+        operator.drive()
+        wait_until(lambda: base.drives, "motion")
+        daemon.tell("upper mute")
+        wait_until(lambda: operator.message("pairing") == "no pictures of the upper camera", "the word which is gone")
+        wait_until(lambda: operator.message("odometry").startswith("no pose for"), "stale odometry")
+        wait_until(lambda: not base.drives, "the stop")
+        assert operator.message("upper camera").startswith("no picture for")
+        assert operator.message("lower camera") == "streaming"
+        daemon.tell("upper ok")
+        wait_until(lambda: base.drives, "motion without anybody's help")
+        wait_until(lambda: operator.message("pairing") == "in step", "cameras in step")
+        assert daemon.end()[0] == 0
+
+
+def test_the_rig_of_the_log_itself_and_an_end_with_the_log() -> None:
+    port = free_port()
+    command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--once", "--pace", "5",
+               "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+    with started(command, port) as daemon:
+        _, err = daemon.process.communicate(timeout=PATIENCE_S)
+    assert daemon.process.returncode == 0 and "Traceback" not in err, err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_signals_at_any_time_end_it_without_a_word(scene: Path, number: int) -> None:
+    """The sooner, the more of it is not yet there."""
+    port = free_port()
+    command = [sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
+               str(scene / "rig.toml"), "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+    with started(command, port) as daemon:
+        wait_until(lambda: answers(port), "the bus")  # opened after cameras and motor, before anything runs
+        code, err = daemon.end(number)
+    assert code == 0 and err == ""
+
+
+BAD = {
+    "no log": (["--log", "none.mcap"], "none.mcap"),
+    "no rig": (["--log", "{log}"], "no rig.toml is attached"),
+    "a rig that is none": (["--log", "{log}", "--rig", "{log}"], ""),
+    "pace 0": (["--log", "{log}", "--rig", "{rig}", "--pace", "0"], "pace"),
+    "pace backwards": (["--log", "{log}", "--rig", "{rig}", "--pace", "-1"], "pace"),
+    "pace nan": (["--log", "{log}", "--rig", "{rig}", "--pace", "nan"], "pace"),
+    "pace word": (["--log", "{log}", "--pace", "fast"], "--pace"),
+    "pace without a log": (["--pace", "2"], "--log"),
+    "once without a log": (["--once"], "--log"),
+    "no motor": (["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing"], "/dev/nothing"),
+    "no camera": (["--rig", "{rig}", "--set", "cameras.lower=/dev/nothing"], "/dev/nothing"),
+    "no such setting": (["--set", "helm.speed=1"], "helm.speed"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_wrong_options_give_one_line(omnid: Command, scene: Path, case: str) -> None:
+    words, expected = BAD[case]
+    paths = {"log": scene / "log.mcap", "rig": scene / "rig.toml"}
+    listen = f'bus.listen=["tcp/127.0.0.1:{free_port()}"]'
+    assert expected in omnid.refused("run", *(word.format(**paths) for word in words), "--set", listen)
+
+
+def test_a_port_that_is_taken_gives_one_line(omnid: Command, scene: Path, taken_port: int) -> None:
+    line = omnid.refused("run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", "simulated",
+                         "--set", f'bus.listen=["tcp/127.0.0.1:{taken_port}"]')
+    assert "bus.listen" in line
+
+
+def test_nohup_is_respected(scene: Path) -> None:
+    """A daemon that was started to outlive its terminal does."""
+    port = free_port()
+    command = ["nohup", sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
+               str(scene / "rig.toml"), "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            wait_until(lambda: answers(port), "the bus")
+            process.send_signal(signal.SIGHUP)
+            time.sleep(0.5)
+            assert process.poll() is None
+            process.terminate()
+            assert process.wait(PATIENCE_S) == 0
+        finally:
+            process.kill()
