@@ -54,13 +54,14 @@ def _guarded(args: argparse.Namespace) -> int:
     from calib.errors import CalibError
     from drivers.errors import DriverError
     from omnid.errors import OmnidError
+    from omnid.journal import ERROR, tell
 
     try:
         code = int(args.run(args))
         sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:
-        print(f"omnid: {' '.join(str(error).split())}", file=sys.stderr)
+        tell(ERROR, str(error))
         return WRONG
     except KeyboardInterrupt:
         return 130
@@ -68,7 +69,7 @@ def _guarded(args: argparse.Namespace) -> int:
         _hush()
         return 141
     except OSError as error:  # what no command has foreseen: a disk that is full, a name that is too long
-        print(f"omnid: {error.filename or 'cannot write'}: {error.strerror or error}", file=sys.stderr)
+        tell(ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _hush()
         return WRONG
 

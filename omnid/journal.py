@@ -19,12 +19,11 @@ from typing import Final, TextIO
 ERROR: Final = 3  # the numbers of syslog and journald (RFC 5424), as the drivers' reports have them
 WARNING: Final = 4
 NOTICE: Final = 5
-INFO: Final = 6
 
 _BURST: Final = 5  # lines of a kind that are written within a period
 _PERIOD_S: Final = 60.0
 _KINDS: Final = 256  # of which is known when they were last written
-_LONGEST: Final = 1000  # characters of a line
+_LONGEST: Final = 4000  # characters of a line
 _NUMBER = re.compile(r"\d+")
 
 
@@ -38,32 +37,34 @@ class _Kind:
 
 
 class Journal(logging.Handler):
-    """Writes lines; any thread may, but no signal handler. As a handler of `logging` it takes what libraries log."""
+    """Writes lines; any thread may, but no signal handler. What libraries log comes here too, from warnings on."""
 
     def __init__(self, stream: TextIO | None = None, clock_s: Callable[[], float] = time.monotonic) -> None:
         """stream: where to, else what sys.stderr is at the time."""
-        super().__init__()
+        super().__init__(logging.WARNING)
         self._stream, self._clock_s = stream, clock_s
         self._kinds: dict[str, _Kind] = {}  # the one that was spoken of last comes last
         self.held_back = 0  # lines in all
 
-    def say(self, priority: int, text: str, key: str = "") -> None:
-        """Writes the text as one line, unless too many of its kind have been.
-
-        key: what makes it one of a kind, else the text without its numbers.
-        """
-        line = "".join(letter if letter.isprintable() else " " for letter in text[:_LONGEST])
+    def say(self, priority: int, text: str) -> None:
+        """Writes the text as one line, unless too many have been that differ in nothing but their numbers."""
         self.acquire()
         try:
-            self._judge(priority, " ".join(line.split()), key)
+            self._judge(priority, _one_line(text))
+        finally:
+            self.release()
+
+    def tell(self, priority: int, text: str) -> None:
+        """Writes the text as one line, whatever has been said."""
+        self.acquire()
+        try:
+            self._write(priority, _one_line(text))
         finally:
             self.release()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Writes a record of `logging`."""
-        priorities = ((logging.ERROR, ERROR), (logging.WARNING, WARNING), (logging.NOTSET, INFO))
-        priority = next(priority for level, priority in priorities if record.levelno >= level)
-        self.say(priority, f"{record.name}: {record.getMessage()}")
+        """Says a record of `logging`."""
+        self.say(ERROR if record.levelno >= logging.ERROR else WARNING, f"{record.name}: {record.getMessage()}")
 
     def flush(self) -> None:
         """Tells how much of each kind has been held back; `logging` calls this at the end of the program."""
@@ -76,8 +77,8 @@ class Journal(logging.Handler):
         finally:
             self.release()
 
-    def _judge(self, priority: int, line: str, key: str) -> None:
-        kind = self._kind(key or _NUMBER.sub("#", line), self._clock_s())
+    def _judge(self, priority: int, line: str) -> None:
+        kind = self._kind(_NUMBER.sub("#", line), self._clock_s())
         if kind.written == _BURST:
             kind.held_back += 1
             self.held_back += 1
@@ -101,6 +102,10 @@ class Journal(logging.Handler):
             stream.flush()
 
 
+def _one_line(text: str) -> str:
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text[:_LONGEST]).split())
+
+
 def _word(priority: int) -> str:
     return "warning: " if priority == WARNING else ""
 
@@ -117,3 +122,5 @@ def _is_journal(stream: TextIO) -> bool:
 
 JOURNAL: Final = Journal()
 say: Final = JOURNAL.say
+tell: Final = JOURNAL.tell
+logging.lastResort = JOURNAL

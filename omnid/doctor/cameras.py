@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -132,9 +133,10 @@ def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path
 def _usb(device: CaptureDevice, root: Path) -> tuple[str, float]:
     """Number of the USB bus and speed of the camera on it, Mbit/s; ("", 0) where it is on none."""
     port = (root / "sys/class/video4linux" / Path(device.node).name / "device").resolve()
-    for folder in (port, *port.parents):
-        if (folder / "busnum").is_file():
-            return (folder / "busnum").read_text().strip(), float((folder / "speed").read_text())
+    with suppress(OSError, ValueError):  # it is being unplugged, or its speed is unknown
+        for folder in (port, *port.parents):
+            if (folder / "busnum").is_file():
+                return (folder / "busnum").read_text().strip(), float((folder / "speed").read_text())
     return "", 0.0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.journal import ERROR, INFO, NOTICE, WARNING, Journal
+from omnid.journal import ERROR, NOTICE, WARNING, Journal
 
 ROOT = Path(__file__).parents[2]
 SPEAK = "from omnid.journal import *; say(WARNING, 'one'); say(ERROR, 'two'); say(NOTICE, 'three')"
@@ -40,10 +39,10 @@ def spoken() -> Spoken:
     return Spoken()
 
 
-def said(environment: dict[str, str], stderr: int) -> int:
+def said(environment: dict[str, str], stderr: int, script: str = SPEAK) -> int:
     """Speaks in a process of its own."""
     clean = {name: value for name, value in os.environ.items() if name != "JOURNAL_STREAM"}
-    return subprocess.run([sys.executable, "-c", SPEAK], cwd=ROOT, env=clean | environment, stderr=stderr).returncode
+    return subprocess.run([sys.executable, "-c", script], cwd=ROOT, env=clean | environment, stderr=stderr).returncode
 
 
 @pytest.fixture
@@ -80,10 +79,19 @@ def test_a_fault_that_repeats_itself_is_written_a_few_times_and_counted(spoken: 
     assert spoken.lines[7:] == ["omnid: warning: frame 1001 is broken"]
 
 
-def test_a_key_makes_lines_of_one_kind(spoken: Spoken) -> None:
-    for word in "abcdefghij":
-        spoken.journal.say(INFO, word, key="letters")
-    assert len(spoken.lines) == 5
+def test_what_ends_the_program_is_written_in_any_case(spoken: Spoken) -> None:
+    for _ in range(20):
+        spoken.journal.tell(ERROR, "no such\nfile")
+    assert spoken.lines == ["omnid: no such file"] * 20
+
+
+def test_the_command_line_says_why_it_ends_with_priority(pipe: tuple[int, int]) -> None:
+    found = os.fstat(pipe[1])
+    environment = os.environ | {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+    done = subprocess.run([sys.executable, "-m", "omnid", "config", "--config", "/nowhere"], cwd=ROOT, env=environment,
+                          stderr=pipe[1])
+    assert done.returncode == 2
+    assert os.read(pipe[0], 1000).startswith(b"<3>cannot read the settings file '/nowhere'")
 
 
 def test_at_the_end_what_was_held_back_is_told_once(spoken: Spoken) -> None:
@@ -114,7 +122,7 @@ def test_what_devices_call_themselves_makes_no_lines_of_its_own(spoken: Spoken, 
 
 def test_a_line_is_of_bounded_length(spoken: Spoken) -> None:
     spoken.journal.say(NOTICE, "x" * 10**6)
-    assert len(spoken.lines[0]) == len("omnid: ") + 1000
+    assert len(spoken.lines[0]) == len("omnid: ") + 4000
 
 
 def test_lines_of_many_threads_stay_whole_and_all_are_counted(spoken: Spoken) -> None:
@@ -139,11 +147,10 @@ def test_nobody_who_reads_is_no_error() -> None:
         assert said({}, full.fileno()) == 0
 
 
-def test_what_libraries_log_has_its_priority(spoken: Spoken, tmp_path: Path) -> None:
-    logger = logging.Logger("library")
-    logger.addHandler(spoken.journal)
-    logger.warning("careful, %d", 7)
-    logger.critical("broken")
-    logger.info("by the way")
-    assert spoken.lines == ["omnid: warning: library: careful, 7", "omnid: library: broken",
-                            "omnid: library: by the way"]
+def test_what_libraries_log_has_its_priority(pipe: tuple[int, int]) -> None:
+    found = os.fstat(pipe[1])
+    environment = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+    script = ("import logging; import omnid.journal; log = logging.getLogger('library'); log.info('by the way')\n"
+              "log.warning('careful, %d', 7); log.critical('broken')")
+    assert said(environment, pipe[1], script) == 0
+    assert os.read(pipe[0], 1000) == b"<4>library: careful, 7\n<3>library: broken\n"
