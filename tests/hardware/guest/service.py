@@ -21,13 +21,14 @@ import pytest
 SYSTEMD = Path("/opt/omnid/systemd")
 DROP_INS = Path("/etc/systemd/system/omnid.service.d")
 REPORT = Path("/var/lib/omnid/report.json")
-LIMIT_S = 90.0
+LIMIT_S = 400.0  # the clock of a guest on a busy host may run several times too fast
 FIFO, OTHER = os.SCHED_FIFO, os.SCHED_OTHER
 DAEMON = """[Service]
 ExecStart=
 ExecStart=/usr/bin/python3 -m tests.hardware.guest.small_daemon
 Environment=PYTHONPATH=/opt/omnid
-WatchdogSec=6
+WatchdogSec=15
+TimeoutStartSec=400
 """
 
 

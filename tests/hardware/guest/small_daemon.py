@@ -132,7 +132,7 @@ def main() -> None:
     graph.sink("bus", Speaker(bus), graph.stage("picture", Picture(), graph.source("lower", numbers)))
     graph.ticker("motor", 0.05, lambda: None)
     graph.ticker("report", 0.1, Reporter())
-    service = Service(graph.telemetry, Status(tally, graph.telemetry, ("motor", "report", "watchdog")), 2.0)
+    service = Service(graph.telemetry, Status(tally, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
     graph.ticker("watchdog", service.period_s, service)
     signal.signal(signal.SIGTERM, lambda *_: graph.stop())
     for line in prepare(config, 1):
