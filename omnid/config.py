@@ -17,7 +17,7 @@ from omnid.core.heading import HeadingLimits
 from omnid.core.klt import Klt
 from omnid.core.stereo_matching import METHODS, Matching
 from omnid.settings import Knob, knob
-from omnid.transport.bus import BusConfig
+from omnid.transport.bus_config import BusConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,11 +296,6 @@ COMMAND: Mapping[str, Knob] = {
     "yaw_rate_radps": _knob("highest yaw rate, rad/s", 0.001, 20),
     "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
 }
-BUS: Mapping[str, Knob] = {
-    "robot": _knob("first part of every key, and of the topics of --record"),
-    "listen": _knob("zenoh endpoints to listen on"),
-    "connect": _knob("zenoh endpoints to connect to"),
-}
 
 
 def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
@@ -312,5 +307,5 @@ def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
 
 
 for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING),
-                      (DifferentialDrive, DRIVE), (BusConfig, BUS), (Deadlines, DEADLINES), (CommandLimits, COMMAND)):
+                      (DifferentialDrive, DRIVE), (Deadlines, DEADLINES), (CommandLimits, COMMAND)):
     _describe(_kind, _knobs)

@@ -19,9 +19,10 @@ from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.flow import nothing
-from omnid.graph import NEWEST, Graph
+from omnid.graph import NEWEST, Graph, Sink
 from omnid.journal import WARNING
-from omnid.outputs.bus import BusSink
+from omnid.messages import Odometry
+from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.outputs.helm import Helm, HelmSettings
@@ -34,6 +35,7 @@ from omnid.realtime import ThreadStart, prepare, priorities
 from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end
 from omnid.service import Status as StatusLine
+from omnid.settings import dump
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
 from omnid.transport.bus import Bus
@@ -43,7 +45,7 @@ from omnid.transport.commands import Commands
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOKS = 60  # pictures of either camera in which the rim is looked for, where the rig has no mask
-TICKERS = frozenset({"motor", "status", "watchdog"})
+TICKERS = frozenset({"motor", "status", "watchdog", "router"})
 Say = Callable[[int, str], None]  # severity as syslog has it, and one line
 
 
@@ -106,12 +108,14 @@ class Live:
         config, graph = self._config, self._graph
         encode = Encoder(place.rig.T_base_rig, config.record.cloud_points, self.offset_ns)
         helm = self._helm(place, ends) if config.motor.port else None
-        bus = Bus(config.bus)
-        ends.callback(bus.close)
+        bus = self._bus(place, ends)
         pair = LivePair(place.rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
         recorder = self._recorder(place, encode, ends) if config.record.enabled else None
-        sinks = Ends(poses={"tally": self._tally, "latency": self._latency}, bus=BusSink(bus, encode), helm=helm,
+        poses: dict[str, Sink[Odometry]] = {"tally": self._tally, "latency": self._latency}
+        if config.bus.panorama_hz:
+            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, self.offset_ns)
+        sinks = Ends(poses=poses, bus=BusSink(bus, encode), helm=helm,
                      map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
                      record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
@@ -122,6 +126,16 @@ class Live:
         graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
         service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)
         graph.ticker("watchdog", service.period_s, service)
+
+    def _bus(self, place: Geometry, ends: ExitStack) -> Bus:
+        """The bus, on which whoever asks is told how this robot is set."""
+        bus = Bus(self._config.bus)
+        ends.callback(bus.close)
+        bus.tell("config", dump(self._config))
+        bus.tell("rig", rig_toml(place.rig))
+        if bus.seeks:
+            self._graph.ticker("router", self._config.bus.retry_s, bus.join)
+        return bus
 
     def _helm(self, place: Geometry, ends: ExitStack) -> Helm:
         config = self._config
@@ -137,8 +151,7 @@ class Live:
 
     def _commands(self, bus: Bus, helm: Helm) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
-        for key in commands.keys:
-            bus.subscribe(key, commands.take)
+        bus.hear(commands.take)
         return commands
 
     def _publisher(self, bus: Bus) -> Callable[[list[Status]], None]:

@@ -39,7 +39,7 @@ from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
-TICKERS = ("progress", "motor")  # what they drop are deadlines, not messages
+TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
@@ -165,6 +165,9 @@ class Replay:
             print(f"omnid: warning: going on without a bus: {error}", file=sys.stderr)
             return None
         closing.callback(bus.close)
+        bus.tell("config", dump(self._config))
+        if bus.seeks:
+            self._graph.ticker("router", self._config.bus.retry_s, bus.join)
         return BusSink(bus, encode)
 
     def _show_progress(self, reader: LogReader) -> None:

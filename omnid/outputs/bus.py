@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
+import cv2
+
+from drivers.frame import Frame
 from omnid.messages import Odometry
 from omnid.outputs.encoded import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
+from omnid.transport.image_codec import image_cdr
+from omnid.transport.note import Note, note_bytes
 
 
 class BusSink:
@@ -15,12 +22,30 @@ class BusSink:
 
     def process(self, message: Outgoing) -> None:
         """Sends what there is to say about a message."""
+        note = note_bytes(_note(message)) if isinstance(message, Odometry) else None
         for topic, _, payload in self._encode(message):
-            self._bus.publish(topic.removeprefix("/"), payload, realtime=topic == "odom")
+            self._bus.publish(topic, payload, note if topic == "odom" else None)
         if isinstance(message, Odometry):
             for topic, _, payload in self._states(message):
                 self._bus.publish(topic, payload)
 
-    def finish(self) -> None:
-        """Hangs up."""
-        self._bus.close()
+
+def _note(odometry: Odometry) -> Note:
+    return Note(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks, time.time_ns())
+
+
+class PanoramaSink:
+    """Publishes the lower camera's panorama as JPEG, rate_hz times a second at most; offset_ns: as the Encoder's."""
+
+    def __init__(self, bus: Bus, rate_hz: float, offset_ns: int = 0) -> None:
+        self._bus, self._period_ns, self._offset_ns = bus, 1e9 / rate_hz, offset_ns
+        self._next_ns = 0.0
+
+    def process(self, odometry: Odometry) -> None:
+        """Sends the picture that a pose was found in, when it is time."""
+        if odometry.stamp_ns < self._next_ns:
+            return
+        self._next_ns = odometry.stamp_ns + self._period_ns
+        _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
+        frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
+        self._bus.publish("panorama", image_cdr(frame, odometry.stamp_ns + self._offset_ns)[1])

@@ -72,11 +72,6 @@ class Commands:
         self.accepted = self.stops = 0
         self.refused: Counter[str] = Counter()
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """What to listen to, below the robot's name."""
-        return (*self._parsers, "cmd/stop")
-
     def take(self, key: str, payload: bytes) -> None:
         """One command as it came; never raises."""
         arrival_ns = time.monotonic_ns()  # before anything else: a stop that comes meanwhile voids it
@@ -96,6 +91,8 @@ class Commands:
         self._obey(wish.setpoint, arrival_ns)
 
     def _judged(self, key: str, payload: bytes) -> Wish:
+        if key not in self._parsers:
+            raise Refused("unknown")
         if len(payload) > LONGEST_PAYLOAD:
             raise Refused("too long")
         wish = self._parsers[key](payload)

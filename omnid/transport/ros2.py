@@ -1,0 +1,85 @@
+"""How ROS 2 finds and reads the topics without ROS being here.
+
+rmw_zenoh (attachment_helpers.cpp, liveliness_utils.cpp of ros2/rmw_zenoh): a data key with the type and its hash, an
+attachment to every sample, liveliness tokens for the node and each of its publishers and subscriptions.
+zenoh-bridge-ros2dds (liveliness_mgt.rs of zenoh-plugin-ros2dds): the plain name as the key and a token, as another
+bridge would declare it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+from rosbags.typesys import Stores, get_typestore
+
+RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
+BRIDGE_RELIABLE_LAST_10: Final = ":1:0:0,10"  # no key, then Cyclone DDS' numbers: reliable, volatile, keep last
+GID_BYTES: Final = 16
+
+
+@cache
+def type_hash(schema: str) -> str:
+    """The hash of a message type such as nav_msgs/msg/Odometry (REP 2016), the same in Humble and what came later."""
+    return str(get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(schema))
+
+
+def dds_type(schema: str) -> str:
+    """nav_msgs/msg/Odometry as DDS names it."""
+    package, kind, name = schema.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def data_key(domain: int, topic: str, schema: str) -> str:
+    """The key of a topic with rmw_zenoh; topic with its leading '/'."""
+    return f"{domain}{topic}/{dds_type(schema)}/{type_hash(schema)}"
+
+
+def attachment(seq: int, source_ns: int, gid: bytes) -> bytes:
+    """What rmw_zenoh expects with each sample: number, time of sending [ns of Unix time] and the publisher's id."""
+    return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid
+
+
+def gid_of(token: str) -> bytes:
+    """The id of the publisher with this token: 16 bytes that no other has."""
+    return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class RmwNode:
+    """A node of ROS 2 as rmw_zenoh's liveliness tokens describe it."""
+
+    domain: int
+    zid: str  # of the session
+    name: str
+
+    @property
+    def token(self) -> str:
+        """That of the node itself."""
+        return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/%/%/{self.name}"
+
+    def publisher(self, entity: int, topic: str, schema: str) -> str:
+        """The token of a publisher; entity: a number of its own."""
+        return self._endpoint("MP", entity, topic, schema)
+
+    def subscription(self, entity: int, topic: str, schema: str) -> str:
+        """The token of a subscription; entity: a number of its own."""
+        return self._endpoint("MS", entity, topic, schema)
+
+    def _endpoint(self, kind: str, entity: int, topic: str, schema: str) -> str:
+        where = f"@ros2_lv/{self.domain}/{self.zid}/0/{entity}/{kind}/%/%/{self.name}"
+        return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{RELIABLE_LAST_10}"
+
+
+def bridge_token(zid: str, kind: str, key: str, schema: str) -> str:
+    """The token by which a bridge learns of a publisher (kind MP) or a subscription (MS) beyond it."""
+    plain = (key.replace("/", "§"), schema.replace("/", "§"))
+    return "/".join((f"@/{zid}/@ros2_lv/{kind}", *plain, BRIDGE_RELIABLE_LAST_10))
+
+
+def node_name(robot: str) -> str:
+    """The name of the node: the robot's, without what it is part of."""
+    return robot.rsplit("/", 1)[-1]
