@@ -26,6 +26,8 @@ from omnid.journal import WARNING, say
 
 CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23
+LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
+                      "realtime.lock_memory = false")
 _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
 _EVERYTHING: Final = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, without which untouched stacks take 400 MB
@@ -125,10 +127,6 @@ def has_capability(number: int) -> bool:
         words = next(line.split() for line in status.splitlines() if line.startswith(b"CapEff:"))
         return bool(int(words[1], 16) >> number & 1)
     return False
-
-
-LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
-                      "realtime.lock_memory = false")
 
 
 def priority_advice(priority: int) -> str:

@@ -20,12 +20,12 @@ def access(subject: str, device: Path) -> Iterator[Finding]:
     """Whether we may open the device, and whether the service may; nothing where all is well."""
     found = device.stat()
     group = _group(found.st_gid)
-    if not os.access(device, os.R_OK | os.W_OK):
-        yield Finding("wrong", subject, f"no permission for {device} of group {group}",
-                      f"`sudo usermod -aG {group} $USER`, then log in again")
     if group not in GROUPS and found.st_mode & 0o006 != 0o006:
         yield Finding("warning", subject, f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
                       "put GROUP=\"video\" or GROUP=\"dialout\" into its udev rule, see 90-omnid.rules")
+    elif not os.access(device, os.R_OK | os.W_OK):
+        yield Finding("wrong", subject, f"no permission for {device} of group {group}",
+                      f"`sudo usermod -aG {group} $USER`, then log in again")
 
 
 def memberships(names: Sequence[str] = GROUPS) -> Finding:
