@@ -126,6 +126,7 @@ class StatusReport:
                   "fault": str(helm.fault)}
         values |= {f"stopped, {why}": str(count) for why, count in dict(helm.stops).items()}
         values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
+        values["tick_late_p999_ms"] = f"{1e3 * helm.lateness.p(0.999):.2f}"
         if commands is not None:
             values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
             values |= {f"refused, {why}": str(count) for why, count in dict(commands.refused).items()}

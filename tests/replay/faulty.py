@@ -2,6 +2,7 @@
 
     upper mute      no more pictures          lower garbage   JPEGs of noise        both black   dark ones
     lower cut       halves of JPEGs           both ok         as they are
+    clock 3600      the time of day is that many seconds ahead
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from drivers.log_camera import LogCamera, Pictures
 from omnid.config import Config
 from omnid.live import Live
 from omnid.settings import load
+
+TIME, TIME_NS = time.time, time.time_ns
 
 
 class SpoiltCamera(LogCamera):
@@ -58,7 +61,16 @@ def obey(faults: dict[str, str]) -> None:
     """Takes the lines."""
     for line in sys.stdin:
         whom, fault = line.split()
+        if whom == "clock":
+            step_clock(int(fault))
+            continue
         faults.update(dict.fromkeys(("lower", "upper") if whom == "both" else (whom,), fault))
+
+
+def step_clock(step_s: int) -> None:
+    """Stands for a step of the system's clock, which is not ours to set."""
+    time.time = lambda: TIME() + step_s
+    time.time_ns = lambda: TIME_NS() + step_s * 10**9
 
 
 def main() -> int:

@@ -1,0 +1,17 @@
+"""No fault ends the daemon or moves the wheels unasked; `python -m tests.replay.faults` prints what became of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.replay.faults import TRIALS, Place
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", TRIALS)
+def test_fault(tmp_path: Path, scene: Path, fault: str) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    assert TRIALS[fault](Place(scene, folder)).process
