@@ -21,6 +21,7 @@ import pytest
 SYSTEMD = Path("/opt/omnid/systemd")
 DROP_INS = Path("/etc/systemd/system/omnid.service.d")
 REPORT = Path("/var/lib/omnid/report.json")
+OPEN = "/etc/omnid", "/opt/omnid", "/dev/vda", "/dev/kmsg"  # to everybody: it is the unit that closes them
 LIMIT_S = 400.0  # the clock of a guest on a busy host may run several times too fast
 FIFO, OTHER = os.SCHED_FIFO, os.SCHED_OTHER
 DAEMON = """[Service]
@@ -78,6 +79,7 @@ def unit() -> Iterator[None]:
     run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", "omnid")
     run("chmod", "-R", "a+rX", "/opt/omnid")
     Path("/etc/omnid").mkdir()
+    run("chmod", "a+rwX", *OPEN)
     shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
     DROP_INS.mkdir()
     (DROP_INS / "daemon.conf").write_text(DAEMON)
