@@ -206,7 +206,7 @@ def twist_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
 
     Any bytes may come: OmnidError unless they are one.
     """
-    message = _message(payload, TWIST_SCHEMA)
+    message = message_from_cdr(payload, TWIST_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
     return (_loose_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
             message.twist.angular.z)
@@ -215,12 +215,12 @@ def twist_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
 def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
     """Stamp [ns], frame, speed [m/s] and heading [rad] of a Vector3Stamped, finite or not; OmnidError unless it is one.
     """
-    message = _message(payload, VECTOR_SCHEMA)
+    message = message_from_cdr(payload, VECTOR_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
     return _loose_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
 
 
-def _message(payload: bytes, schema: str) -> object:
+def message_from_cdr(payload: bytes, schema: str) -> object:
     try:
         return _typestore().deserialize_cdr(bytes(payload), schema)
     except SerdeError as error:
@@ -234,7 +234,7 @@ def _loose_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
 
 def odometry_from_cdr(payload: bytes) -> OdometryRecord:
     """What an Odometry message says; any bytes may come: OmnidError unless they are one with a finite, rigid pose."""
-    message = _message(payload, ODOMETRY_SCHEMA)
+    message = message_from_cdr(payload, ODOMETRY_SCHEMA)
     assert isinstance(message, ros.nav_msgs__msg__Odometry)
     twist = message.twist.twist
     return OdometryRecord(

@@ -25,8 +25,12 @@ _TLS: Final = {
 }
 
 
+class Unreachable(OmnidError):  # noqa: N818 - it may be there in a moment
+    """Nobody answers where a client is to connect to, or not to us."""
+
+
 def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
-    """A session; OmnidError where an endpoint cannot be listened on, or a client has no router yet.
+    """A session; OmnidError where an endpoint cannot be listened on, or nobody answers a client (Unreachable).
 
     guarded: only commands may come in.
     """
@@ -34,14 +38,15 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     try:
         return zenoh.open(prepared)
     except zenoh.ZError as error:
-        raise OmnidError(_failure(config, reason(error))) from error
+        raise _failure(config, reason(error)) from error
 
 
-def _failure(config: BusConfig, why: str) -> str:
+def _failure(config: BusConfig, why: str) -> OmnidError:
     if config.mode == "client":
-        return f"bus cannot reach {', '.join(config.connect)}: {why}; start what listens there or change bus.connect"
+        asked = ", ".join(config.connect)
+        return Unreachable(f"bus cannot reach {asked}: {why}; start what listens there or change bus.connect")
     asked = ", ".join(config.listen)
-    return f"bus cannot listen on {asked}: {why}; stop the other program there or change bus.listen"
+    return OmnidError(f"bus cannot listen on {asked}: {why}; stop the other program there or change bus.listen")
 
 
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:

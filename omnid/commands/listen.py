@@ -1,0 +1,37 @@
+"""`omnid listen`: how a robot is, from here or from anywhere, line by line or as a table that stays in its place."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from omnid.commands.config import add_settings
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `listen` to the command line."""
+    parser = subparsers.add_parser("listen", help="watch a robot: pose, state, rates and latencies, and keep them")
+    parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
+                        "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+    parser.add_argument("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="write all that is heard to a log")
+    parser.add_argument("--seconds", type=float, metavar="N", help="end after so long; default: with Ctrl-C")
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Listens; 1 where not one pose came."""
+    from dataclasses import replace
+
+    from omnid.config import Config
+    from omnid.errors import OmnidError
+    from omnid.listening.follow import listen
+    from omnid.settings import load
+
+    if args.seconds is not None and not 0 < args.seconds < 1e9:
+        raise OmnidError(f"--seconds {args.seconds} is no time to listen for; give seconds above 0, or leave it out")
+    bus = load(Config, args.config, args.overrides).bus
+    bus = replace(bus, robot=args.robot or bus.robot, connect=tuple(args.connect or bus.connect))
+    return listen(bus, args.tum, args.mcap, args.seconds)

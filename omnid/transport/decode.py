@@ -1,0 +1,119 @@
+"""Messages of a robot as those who listen to it want them; any bytes may come.
+
+Arrays in SI units, read-only in spirit; p_a = T_a_b @ p_b.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys.stores import ros2_humble as ros
+
+from calib import se3
+from omnid.errors import OmnidError
+from omnid.transport import codec
+from omnid.transport.codec import NS_PER_S, Status
+from omnid.transport.note import Note, note_from_bytes
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Where the robot's base is, how it moves, and how sure that is."""
+
+    stamp_ns: int  # of Unix time, when the pictures were taken
+    T_odom_base: Array  # (4, 4) m
+    covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
+    velocity: Array  # (6,) m/s, rad/s in the base's axes
+    velocity_covariance: Array  # (6, 6)
+    note: Note  # state, number, landmarks
+    received_ns: int  # of Unix time, by the clock in here
+
+    @property
+    def state(self) -> str:
+        """tracking, degraded or lost; unknown where it is not omnid that sends."""
+        return self.note.state
+
+    @property
+    def x_m(self) -> float:
+        """Forward of where the robot started."""
+        return float(self.T_odom_base[0, 3])
+
+    @property
+    def y_m(self) -> float:
+        """To the left of where the robot started."""
+        return float(self.T_odom_base[1, 3])
+
+    @property
+    def z_m(self) -> float:
+        """Above where the robot started."""
+        return float(self.T_odom_base[2, 3])
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading in odom, counter-clockwise."""
+        return float(se3.yaw(self.T_odom_base))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """How the parts of a robot are: cameras, stages, wheels."""
+
+    stamp_ns: int
+    statuses: tuple[Status, ...]
+
+    def value(self, name: str, key: str) -> str:
+        """What the part of that name, such as "omnid: odometry", says under a key; "" where it does not."""
+        found = (status.values[key] for status in self.statuses if status.name == name and key in status.values)
+        return next(found, "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of the map."""
+
+    stamp_ns: int
+    frame: str
+    points: NDArray[np.float32]  # (N, 3) m
+    confidence: NDArray[np.float32]  # (N,)
+
+
+def pose_from(payload: bytes, note: bytes, received_ns: int | None = None) -> Pose:
+    """The pose in an Odometry message and what goes along with it; OmnidError unless it is one.
+
+    received_ns: when it came, of Unix time; default: now.
+    """
+    received_ns = time.time_ns() if received_ns is None else received_ns
+    record = codec.odometry_from_cdr(payload)
+    return Pose(record.stamp_ns, record.T_odom_base, record.covariance, record.velocity, record.velocity_covariance,
+                note_from_bytes(note) if note else Note(), received_ns)
+
+
+def report_from(payload: bytes, _: bytes = b"") -> Report:
+    """The statuses in a DiagnosticArray; OmnidError unless it is one."""
+    message = codec.message_from_cdr(payload, codec.DIAGNOSTICS_SCHEMA)
+    assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
+    statuses = tuple(Status(entry.name, int(entry.level), entry.message,
+                            {pair.key: pair.value for pair in entry.values}) for entry in message.status)
+    return Report(_stamp_ns(message.header), statuses)
+
+
+def cloud_from(payload: bytes, _: bytes = b"") -> Cloud:
+    """The points in a PointCloud2 of omnid's own layout; OmnidError unless it is one."""
+    message = codec.message_from_cdr(payload, codec.POINT_CLOUD_SCHEMA)
+    assert isinstance(message, ros.sensor_msgs__msg__PointCloud2)
+    step = 4 * len(codec.CLOUD_FIELDS)
+    fields = [(entry.name, entry.offset) for entry in message.fields]
+    own = fields == [(name, 4 * i) for i, name in enumerate(codec.CLOUD_FIELDS)] and not message.is_bigendian
+    if not own or message.point_step != step or message.data.size % step:
+        raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point is none of omnid's")
+    packed = message.data.view("<f4").reshape(-1, len(codec.CLOUD_FIELDS))
+    return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+
+
+def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
