@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,3 +135,18 @@ def rigid(T: Array) -> Array:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def toml_table(text: str | bytes, name: str) -> Table:
+    """The top table of a TOML text; name stands for it in errors."""
+    try:
+        return Table(tomllib.loads(decode(text, name)), name)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise CalibError(f"{name}: not a TOML file: {error}") from error
+
+
+def require_schema(table: Table, version: int) -> None:
+    """Refuse a file of another version."""
+    found = table.values.get("schema")
+    if type(found) is not int or found != version:
+        table.fail("schema", f"version {version}")

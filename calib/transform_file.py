@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from calib.camera import Array
 from calib.errors import CalibError
 from calib.kalibr import load_yaml
 from calib.rig import MIN_BASELINE_M
-from calib.strict import Table, decode, read_bytes
+from calib.strict import Table, decode, read_bytes, toml_table
 
 KEY = "T_lower_upper"
 INVERSE_KEY = "T_upper_lower"
@@ -22,7 +21,7 @@ def read_transform(path: Path) -> Array:
     """T_lower_upper (4, 4) of a file: TOML or YAML with that key (or T_upper_lower), or 16 numbers of T_lower_upper."""
     text = decode(read_bytes(path), str(path))
     if path.suffix == ".toml":
-        return _named(_toml(text, path))
+        return _named(toml_table(text, str(path)))
     if path.suffix in (".yaml", ".yml"):
         return _named(Table(load_yaml(text, str(path)), str(path)))
     words = " ".join(line.partition("#")[0] for line in text.splitlines()).replace(",", " ").split()
@@ -48,13 +47,6 @@ def straight_up(baseline_m: float) -> Array:
     if not (np.isfinite(baseline_m) and baseline_m >= MIN_BASELINE_M):
         raise CalibError(f"--baseline: expected metres, {MIN_BASELINE_M} or more, found {baseline_m}")
     return se3.transform(np.eye(3), (0.0, 0.0, -baseline_m))
-
-
-def _toml(text: str, path: Path) -> Table:
-    try:
-        return Table(tomllib.loads(text), str(path))
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise CalibError(f"{path}: not a TOML file: {error}") from error
 
 
 def _named(table: Table) -> Array:

@@ -36,6 +36,7 @@ def errors_px(found: Array, truth: Array) -> Array:
     return min(distances, key=lambda way: float(np.nanmax(way)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "contrast", "shadow", "limit_px"), [
     (Sensor(), (25.0, 225.0), 1.0, 0.08),
     (Sensor(noise_sigma=6.0), (25.0, 225.0), 1.0, 0.5),
@@ -118,6 +119,7 @@ def test_no_board_is_found_where_there_is_none() -> None:
         assert search.view is None, number
 
 
+@pytest.mark.slow
 def test_all_ten_real_pictures(shared_data: Path) -> None:
     for number in range(10):
         picture = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)

@@ -54,6 +54,7 @@ def test_pictures_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path
     assert all(f"p{number}.png" in page for number in range(8)) and "standard deviation" in page
 
 
+@pytest.mark.slow
 def test_patterns_and_the_omni_model_with_a_picture_that_has_no_board(folder: Path, tmp_path: Path,
                                                                       capsys: pytest.CaptureFixture[str]) -> None:
     for path in folder.iterdir():
@@ -79,6 +80,7 @@ def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
                 writer.write(topic, "sensor_msgs/msg/CompressedImage", bytes(cdr), (number + 1) * 10**9)
 
 
+@pytest.mark.slow
 def test_a_log_gives_the_same_camera_and_asks_for_the_topic(folder: Path, tmp_path: Path,
                                                             capsys: pytest.CaptureFixture[str]) -> None:
     log_of(folder, tmp_path / "log.mcap", ("/lower", "/upper"))

@@ -73,6 +73,7 @@ def test_exact_corners_give_back_the_omni_camera(truth: UnifiedCamera, view: Vie
     assert turned_apart_rad(found, truth) < 1e-5
 
 
+@pytest.mark.slow
 def test_poses_are_the_boards_and_a_mirror_and_a_lens_are_told_by_the_view_asked_for() -> None:
     poses = around(OMNI, BOARD, MASK, 6, distance_m=(0.12, 0.3))
     views = [BoardView(str(k), OMNI.project(se3.apply(T, BOARD.points))) for k, T in enumerate(poses)]
@@ -90,6 +91,7 @@ def test_the_linear_solution_alone_is_close() -> None:
     assert linear.coefficients[0] == pytest.approx(-131.6, rel=0.02)
 
 
+@pytest.mark.slow
 def test_deviations_are_honest() -> None:
     """Errors divided by their stated deviations are about normal, over parameters and repetitions."""
     truth = {"a0": -131.6, "a2": 1.9e-3, "center_row": 380.9, "center_column": 394.2, "c": 0.998, "d = e": 2e-4}
@@ -109,6 +111,7 @@ def spoilt(views: list[BoardView]) -> list[BoardView]:
     return [*views[:2], shaken, *views[3:6], nonsense, *views[7:]]
 
 
+@pytest.mark.slow
 def test_bad_views_are_left_out_and_named() -> None:
     found = calibrate(spoilt(seen_by(OMNI, noise_px=0.1)), BOARD, SIZE, "omni")
     assert sorted(bad.name for bad in found.rejected) == ["view2", "view6"]
@@ -124,6 +127,7 @@ def test_hidden_corners_do_no_harm() -> None:
     assert turned_apart_rad(calibrate(holed, BOARD, SIZE, "omni").camera, OMNI) < 1e-5
 
 
+@pytest.mark.slow
 def test_one_stray_corner_moves_little() -> None:
     views = seen_by(OMNI, noise_px=0.05)
     pixels = views[0].pixels.copy()
@@ -161,6 +165,7 @@ def rendered() -> tuple[Calibration, Calibration]:
     return both[0], both[1]
 
 
+@pytest.mark.slow
 def test_rendered_boards_give_scale_and_centre_as_they_are() -> None:
     ocam, omni = rendered()
     assert isinstance(omni.camera, UnifiedCamera) and isinstance(ocam.camera, OcamCamera)

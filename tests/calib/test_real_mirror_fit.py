@@ -45,6 +45,7 @@ def lifted_apart_deg(ocam: Calibration, omni: Calibration) -> Array:
     return np.asarray(np.rad2deg(np.linalg.norm(one - other, axis=1)))
 
 
+@pytest.mark.slow
 def test_all_boards_are_found_and_both_models_fit_and_agree(shared_data: Path) -> None:
     images = pictures(shared_data)
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
@@ -56,8 +57,8 @@ def test_all_boards_are_found_and_both_models_fit_and_agree(shared_data: Path) -
     assert lifted_apart_deg(ocam, omni).max() < 0.1
 
 
-@pytest.mark.parametrize(("key", "mean_px", "apart_deg"), [("ocam_std", 0.4705, 0.35),
-                                                          ("ocam_subpix", 0.305, 0.2)])
+@pytest.mark.parametrize(("key", "mean_px", "apart_deg"), [
+    pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)])
 def test_the_toolboxs_own_corners_give_its_camera_with_less_error(shared_data: Path, key: str, mean_px: float,
                                                                       apart_deg: float) -> None:
     told, views, errors = reference(shared_data, key)

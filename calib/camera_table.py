@@ -1,0 +1,146 @@
+"""The table of one camera in a `rig.toml` or `camera.toml`, read and written: model, size, intrinsics and mask."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Collection
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera import Mask, OmniCamera
+from calib.errors import CalibError
+from calib.ocam import VIEWS, OcamCamera, View
+from calib.strict import Table, read_bytes
+from calib.unified import UnifiedCamera
+
+EMBEDDED = "data:image/png;base64,"
+OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
+OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
+
+
+def read_camera_table(table: Table, folder: Path | None, others: Collection[str] = ()
+                      ) -> tuple[OmniCamera, Mask | None]:
+    """The camera and the mask of a table, which may have other keys; folder holds the mask's picture if it has one."""
+    model = table.choice("model", ("omni", "ocam"))
+    table.only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
+    camera = _omni(table) if model == "omni" else _ocam(table)
+    return camera, _mask(table, folder) if table.has("mask") else None
+
+
+def _omni(table: Table) -> UnifiedCamera:
+    values = table.table("intrinsics")
+    values.only(OMNI_KEYS)
+    xi, fu, fv, pu, pv = (values.number(key) for key in OMNI_KEYS[:5])
+    k1, k2, p1, p2 = (values.number(key) for key in OMNI_KEYS[5:])
+    size = table.size("size")
+    try:
+        return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
+    except CalibError as error:
+        raise CalibError(f"{table.file}: {values.path}: {error}") from error
+
+
+def _ocam(table: Table) -> OcamCamera:
+    values = table.table("intrinsics")
+    values.only(OCAM_KEYS)
+    row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
+    view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
+    polynomial, size = values.numbers("polynomial"), table.size("size")
+    try:
+        return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
+    except CalibError as error:
+        raise CalibError(f"{table.file}: {values.path}: {error}") from error
+
+
+def _mask(table: Table, folder: Path | None) -> Mask:
+    values = table.table("mask")
+    values.only(("center", "inner_px", "outer_px", "image"))
+    u, v = values.numbers("center", 2)
+    inner = values.number("inner_px") if values.has("inner_px") else 0.0
+    outer = values.number("outer_px") if values.has("outer_px") else float("inf")
+    if not 0 <= inner < outer:
+        values.fail("inner_px", "0 <= inner_px < outer_px")
+    image = _mask_image(values, folder) if values.has("image") else None
+    if image is not None and image.shape[::-1] != table.size("size"):
+        raise CalibError(f"{table.file}: {values.path}.image: expected {table.size('size')} pixels (width, height) "
+                         f"like the camera's pictures, found {image.shape[::-1]}")
+    return Mask((u, v), inner, outer, image)
+
+
+def _mask_image(values: Table, folder: Path | None) -> NDArray[np.uint8]:
+    source = values.text("image")
+    data = _embedded(values, source) if source.startswith(EMBEDDED) else _beside(values, source, folder)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    except cv2.error:
+        image = None
+    return values.fail("image", "a picture") if image is None else image.astype(np.uint8, copy=False)
+
+
+def _embedded(values: Table, source: str) -> bytes:
+    try:
+        return base64.b64decode(source[len(EMBEDDED):], validate=True)
+    except (binascii.Error, ValueError):
+        values.fail("image", "base64 after its prefix")
+
+
+def _beside(values: Table, source: str, folder: Path | None) -> bytes:
+    if folder is None or "\0" in source:
+        values.fail("image", "an embedded picture, as there is no folder to look for a file in")
+    return read_bytes(folder / source)
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """A picture (H, W) uint8 as the bytes of a PNG."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
+    """The head of the table of that name; topic "" where unknown."""
+    lines = ["", f"[{name}]", f'model = "{"ocam" if isinstance(camera, OcamCamera) else "omni"}"',
+             f"size = {[int(pixels) for pixels in camera.size]}"]
+    if isinstance(camera, OcamCamera):
+        lines.append(f'view = "{camera.view}"')
+    if topic:
+        lines.append(f"topic = {string_text(topic)}")
+    return "\n".join(lines) + "\n"
+
+
+def intrinsics_text(name: str, camera: OmniCamera) -> str:
+    """The table of the intrinsics under the table of that name."""
+    if isinstance(camera, UnifiedCamera):
+        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
+        named = [f"{key} = {number_text(value)}" for key, value in zip(OMNI_KEYS, values, strict=True)]
+    elif isinstance(camera, OcamCamera):
+        numbers = (*camera.center_row_column, *camera.affine)
+        named = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
+        named += [f"{key} = {number_text(value)}" for key, value in zip(OCAM_KEYS[1:], numbers, strict=True)]
+    else:
+        raise CalibError(f"rig file: {name}: expected an omni or ocam camera, found {type(camera).__name__}")
+    return "\n".join(["", f"[{name}.intrinsics]", *named]) + "\n"
+
+
+def mask_text(name: str, mask: Mask, image: str) -> str:
+    """The table of the mask likewise; image names its picture, "" embeds it."""
+    lines = ["", f"[{name}.mask]", f"center = [{number_text(mask.center[0])}, {number_text(mask.center[1])}]",
+             f"inner_px = {number_text(mask.inner_px)}"]
+    if np.isfinite(mask.outer_px):
+        lines.append(f"outer_px = {number_text(mask.outer_px)}")
+    if mask.image is not None:
+        embedded = EMBEDDED + base64.b64encode(png(mask.image)).decode()
+        lines.append(f"image = {string_text(image or embedded)}")
+    return "\n".join(lines) + "\n"
+
+
+def number_text(value: float) -> str:
+    """A number as TOML, bit for bit; no minus before zero."""
+    return repr(float(value) + 0.0)
+
+
+def string_text(text: str) -> str:
+    """A string as TOML."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
