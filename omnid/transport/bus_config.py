@@ -36,7 +36,7 @@ class BusConfig:
     tls_listen_key: str = knob("", "private key for those who connect to us, PEM")
     tls_listen_certificate: str = knob("", "certificate for those who connect to us, PEM")
     tls_connect_key: str = knob("", "private key for those we connect to, PEM")
-    tls_connect_certificate: str = knob("", "certificate for those we connect to, PEM")
+    tls_connect_certificate: str = knob("", "certificate for those we connect to, PEM; with one, tls_mutual is on")
     tls_mutual: bool = knob(False, "whoever connects must show a certificate that tls_ca has signed")
     user: str = knob("", "our name for those who ask for one")
     password_file: str = knob("", "file with our password, one line")

@@ -27,6 +27,8 @@ POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
+SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA, TWIST_SCHEMA,
+           VECTOR_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 QUATERNION_TOLERANCE = 1e-3
@@ -73,6 +75,13 @@ class Status:
 def _typestore() -> Typestore:
     """The message definitions, made at first use: the serialisers are compiled then."""
     return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def compile_serialisers() -> None:
+    """Has what writes and reads the messages compiled now: at first use it would hold up all threads, the motor's too.
+    """
+    for schema in SCHEMAS:
+        _typestore().get_msgdef(schema)
 
 
 def _cdr(message: object, schema: str) -> bytes:

@@ -15,13 +15,13 @@ from omnid.transport.bus_config import BusConfig, set_knobs, text_of
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _TRY_MS: Final = 1000  # a client's try to reach its router; it opens no session without
+_URGENT_BATCHES: Final = 16  # zenoh's 2 are full after odom and pose, which are sent at once, and tf would be dropped
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
     "tls_listen_key": "listen_private_key",
     "tls_listen_certificate": "listen_certificate",
     "tls_connect_key": "connect_private_key",
     "tls_connect_certificate": "connect_certificate",
-    "tls_mutual": "enable_mtls",
 }
 
 
@@ -85,9 +85,12 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
         yield "connect/timeout_ms", _TRY_MS, ""
     yield "scouting/multicast/enabled", False, ""
     yield "transport/shared_memory/enabled", False, ""
+    yield "transport/link/tx/queue/size/real_time", _URGENT_BATCHES, ""
     for knob, key in _TLS.items():
         if getattr(config, knob):
             yield f"transport/link/tls/{key}", getattr(config, knob), knob
+    if config.tls_mutual or config.tls_connect_certificate:  # zenoh shows no certificate unless it asks for one as well
+        yield "transport/link/tls/enable_mtls", True, "tls_mutual"
     yield from _users(config)
     if guarded:
         yield "access_control", access_control(config), "command_names" if config.command_names else "command_users"

@@ -5,22 +5,23 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calib import se3
+from omnid.client import Pose, Robot, Unreachable, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-
-DEADLINE_S = 30.0
+from omnid.transport.note import Note, note_bytes
+from tests.omnid.buses import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
+from tests.omnid.buses import SUBSCRIBER as LISTENER
 
 SUBSCRIBER = """
 import json, sys, zenoh
@@ -38,12 +39,6 @@ with zenoh.open(config) as session:
 """
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 @contextlib.contextmanager
 def subscriber(endpoint: str, key: str, count: int) -> Iterator[subprocess.Popen[str]]:
     arguments = [sys.executable, "-c", SUBSCRIBER, endpoint, key, str(count)]
@@ -53,11 +48,6 @@ def subscriber(endpoint: str, key: str, count: int) -> Iterator[subprocess.Popen
             yield process
         finally:
             process.kill()
-
-
-def odometry(i: int) -> bytes:
-    T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1 * i]), [0.25 * i, -1.0, 0.0])
-    return codec.odometry_cdr(10**9 + i, T, np.eye(6) * i, np.arange(6.0), np.eye(6))
 
 
 def publish_until_done(bus: Bus, key: str, process: subprocess.Popen[str]) -> list[str]:
@@ -147,6 +137,69 @@ def test_a_listener_that_hangs_does_not_fail_the_end() -> None:
             bus.close()
         finally:
             process.kill()
+
+
+def test_a_router_that_is_killed_costs_those_nothing_who_listen_directly(tmp_path: Path) -> None:
+    """And those behind it hear again once another has taken its place."""
+    here, there = free_endpoint(), free_endpoint()
+    direct, behind = tmp_path / "direct", tmp_path / "behind"
+    said = count()
+    with contextlib.ExitStack() as ends:
+        router = ends.enter_context(script(ROUTER, there))
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,), retry_s=0.5))))
+        ends.enter_context(script(LISTENER, here, "omnid/odom", str(direct)))
+        ends.enter_context(script(LISTENER, there, "omnid/odom", str(behind)))
+
+        def say() -> int:
+            number = next(said)
+            bus.publish("odom", odometry(number))
+            return number
+
+        wait_until(lambda: say() >= 0 and bool(numbers(direct) and numbers(behind)))
+        router.kill()
+        router.wait()
+        last = [say() for _ in range(100) if time.sleep(0.005) is None][-1]
+        ends.enter_context(script(ROUTER, there))
+        wait_until(lambda: say() >= 0 and numbers(behind)[-1] > last)
+        wait_until(lambda: numbers(direct)[-1] >= last)
+        heard = numbers(direct)
+    assert heard == list(range(heard[0], heard[0] + len(heard)))
+    assert max(np.diff(numbers(behind))) > 50, "the router was away"
+
+
+def test_a_client_waits_for_its_router() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(mode="client", listen=(), connect=(endpoint,)))) as bus:
+        heard: list[str] = []
+        bus.hear(lambda key, _: heard.append(key))
+        bus.tell("config", "robot = 1")
+        bus.join()
+        bus.publish("odom", odometry(1))
+        assert bus.lost == 1
+        with script(ROUTER, endpoint):
+            wait_until(lambda: bus.join() is None and bus.publish("odom", odometry(2)) is None and bus.lost < 20
+                       and bus._session is not None)
+            with Robot(connect=(endpoint,)) as robot:
+                assert robot.ask("config") == "robot = 1"
+                driver = robot.driver()
+                wait_until(lambda: driver.stop() is None and "cmd/stop" in heard)
+                pose = robot.subscribe(Pose).newest()
+                assert pose is not None and pose.stamp_ns == 10**9 + 2
+
+
+def test_who_comes_late_is_told_the_newest_at_once() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        for i in range(3):
+            bus.publish("odom", odometry(i), note_bytes(Note(i, "degraded", 4)))
+        bus.tell("rig", "name = 'rig'")
+        with subscribe(connect=(endpoint,)) as poses, Robot(connect=(endpoint,)) as robot:
+            pose = poses.newest()
+            assert pose is not None and pose.stamp_ns == 10**9 + 2
+            assert (pose.state, pose.note.seq, pose.note.resets) == ("degraded", 2, 4)
+            assert robot.ask("rig") == "name = 'rig'" and robot.ask("nothing") == "" and robot.alive
+    with pytest.raises(Unreachable):
+        Robot(connect=(endpoint,))
 
 
 def test_second_instance_is_told_which_knob() -> None:

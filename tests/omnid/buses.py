@@ -1,0 +1,80 @@
+"""Parts of the tests of the bus: places to listen on, messages, a router and subscribers that know nothing of omnid."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from calib import se3
+from omnid.transport import codec
+
+DEADLINE_S = 30.0
+
+ROUTER = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config):
+    print("ready", flush=True)
+    time.sleep(1000)
+"""
+
+SUBSCRIBER = """
+import json, sys, struct, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    samples = session.declare_subscriber(sys.argv[2], zenoh.handlers.FifoChannel(1000))
+    print("ready", flush=True)
+    with open(sys.argv[3], "w", buffering=1) as file:
+        for s in samples:
+            file.write(f"{struct.unpack_from('<I', bytes(s.payload), 8)[0]}\\n")  # nanoseconds of the header's stamp
+"""
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def odometry(i: int) -> bytes:
+    """A pose of its own for each i; i is in the stamp's nanoseconds."""
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1 * i]), [0.25 * i, -1.0, 0.0])
+    return codec.odometry_cdr(10**9 + i, T, np.eye(6) * i, np.arange(6.0), np.eye(6))
+
+
+@contextlib.contextmanager
+def script(text: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A Python program in a process of its own, once it says that it is ready."""
+    with subprocess.Popen([sys.executable, "-c", text, *arguments], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def numbers(path: Path) -> list[int]:
+    """What a subscriber has written there, so far."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [int(line) for line in lines if line.endswith("\n")]
+
+
+def wait_until(happens: Callable[[], bool], pause_s: float = 0.02) -> None:
+    """Until it has happened; fails after long."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not happens():
+        assert time.monotonic() < deadline_s, "it did not happen"
+        time.sleep(pause_s)
