@@ -39,7 +39,7 @@ from omnid.settings import dump
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
 from omnid.transport.bus import Bus
-from omnid.transport.codec import Status
+from omnid.transport.codec import Status, compile_serialisers
 from omnid.transport.commands import Commands
 
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
@@ -73,6 +73,7 @@ class Live:
     def run(self) -> int:
         """The exit code, 0 after a signal to end."""
         show_stacks_at_the_end()
+        compile_serialisers()
         with self._ended_by_signals(), ExitStack() as ends:
             place = self._geometry()
             self._wire(place, {name: ends.enter_context(closing(self._open(name))) for name in CAMERAS}, ends)

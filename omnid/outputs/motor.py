@@ -16,6 +16,7 @@ from omnid.graph import Slot
 
 SIMULATED = "simulated"
 SILENCE_S = 3.0
+ANSWER_SHARE = 0.8  # of a tick's time may go by until the answer: silence must not make the next tick late
 WATCHDOG_TICKS = 4  # the least that fits in; the driver tells a stop first after a pause of half the watchdog
 
 
@@ -74,7 +75,7 @@ def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[SerialMotor, Si
         twin = SimulatedMotor(TWINS[config.protocol](config.drive))
         closing.callback(twin.close)
     protocol = PROTOCOLS[config.protocol](config.drive)
-    driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud, timeout_s=1 / config.rate_hz,
-                         watchdog_ms=config.watchdog_ms)  # no tick blocks for longer than its period
+    driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud,
+                         timeout_s=ANSWER_SHARE / config.rate_hz, watchdog_ms=config.watchdog_ms)
     closing.callback(driver.close)
     return driver, twin

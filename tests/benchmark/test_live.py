@@ -1,0 +1,120 @@
+"""The live daemon in real time: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`, the soak with `-m slow`.
+
+OMNID_BENCHMARK_S: seconds a measurement (60). OMNID_SOAK_MINUTES: how long the soak takes (2; 10 for the full one).
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from tests.replay.live import Base, Daemon, Operator, answers, free_port, started, wait_until
+
+LOG = Path(str(files("omnid.sample") / "log.mcap"))  # 10 pairs a second of 512x512, its rig attached
+MEASURE_S = float(os.environ.get("OMNID_BENCHMARK_S", "60"))
+SOAK_S = 60 * float(os.environ.get("OMNID_SOAK_MINUTES", "2"))
+LATEST_MS = 20.0  # the motor's tick, 99.9 % of them
+MOTOR_HZ = 50.0
+PERIOD_S = 5.0  # between two looks of the soak
+GROWTH_MB = 8.0  # of the second half over the first: noise of the allocator
+STAGES = ("lower", "upper", "pair", "dewarp", "stereo", "odometry", "mapping", "bus")
+
+
+@contextmanager
+def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, Operator, Base]]:
+    """`omnid run` on the sample log with a twin, an operator who drives, and a state told every second."""
+    port = free_port()
+    with ExitStack() as ends:
+        base = Base(folder)
+        ends.callback(base.close)
+        words = [f'bus.listen=["tcp/127.0.0.1:{port}"]', *settings]
+        command = [sys.executable, "-m", "omnid", "run", "--log", str(LOG), "--pace", str(pace), "--motor",
+                   str(base.port), *(part for word in words for part in ("--set", word))]
+        process = ends.enter_context(started(command, port))
+        wait_until(lambda: answers(port) or not process.alive, "the daemon's voice")
+        operator = Operator(port)
+        ends.callback(operator.close)
+        wait_until(lambda: operator.poses and operator.states, "a pose")
+        operator.drive(0.2)
+        yield process, operator, base
+        code, err = process.end()
+        assert code == 0, err
+        assert "Traceback" not in err
+
+
+@contextmanager
+def hogs(count: int) -> Iterator[None]:
+    """So many processes that do nothing but run."""
+    with ExitStack() as ends:
+        for _ in range(count):
+            hog = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            ends.callback(hog.kill)
+        yield
+
+
+def figures(operator: Operator, load: float) -> dict[str, str]:
+    """What the daemon has measured by now."""
+    odometry, wheels = operator.values("odometry"), operator.values("wheels")
+    told = {f"pose {q}": odometry.get(f"capture_to_pose_{q}_ms", "") for q in ("p50", "p99", "max")}
+    told |= {f"wheel {q}": wheels.get(f"capture_to_wheel_{q}_ms", "") for q in ("p50", "p99", "max")}
+    told |= {f"tick {q}": wheels.get(f"tick_late_{q}_ms", "") for q in ("p50", "p99", "p999", "max")}
+    missed = operator.values("stage motor")["missed"]
+    drops = {name: operator.values(f"stage {name}").get("dropped", "?") for name in STAGES}
+    lost = " ".join(f"{name} {count}" for name, count in drops.items() if count != "0")
+    return told | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed,
+                   "dropped": lost or "0", "load": f"{load:.1f}"}
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("hogged", [False, True], ids=["alone", "hogged"])
+@pytest.mark.parametrize("rate_hz", [10, 30])
+def test_latencies_and_the_motors_deadline(tmp_path: Path, rate_hz: int, hogged: bool) -> None:
+    with hogs((os.cpu_count() or 1) if hogged else 0), \
+            daemon(tmp_path, rate_hz / 10, f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base):
+        time.sleep(MEASURE_S)
+        found = figures(operator, os.getloadavg()[0])
+        assert base.line.base.errors == 0
+    print(f"\n{rate_hz} Hz, {'a busy process per core' if hogged else 'nothing beside it'}: {found}")
+    assert float(found["tick p999"]) <= LATEST_MS
+
+
+class Size(tuple[float, int, int]):
+    """Resident memory [MB], file descriptors, threads."""
+
+    @staticmethod
+    def of(pid: int) -> Size:
+        """As the kernel has them."""
+        status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+        resident_mb = int(status["VmRSS"].split()[0]) / 1024
+        return Size((resident_mb, len(os.listdir(f"/proc/{pid}/fd")), int(status["Threads"])))
+
+
+@pytest.mark.slow
+def test_memory_descriptors_and_threads_stay_as_they_are(tmp_path: Path) -> None:
+    """30 pairs a second, an operator who drives, maps and states on the bus."""
+    with daemon(tmp_path, 3.0) as (process, operator, base):
+        time.sleep(20)  # caches, pools and the map of a scene that is seen again and again fill up
+        sizes = []
+        deadline_s = time.monotonic() + SOAK_S
+        while time.monotonic() < deadline_s:
+            time.sleep(PERIOD_S)
+            assert process.alive
+            sizes.append(Size.of(process.process.pid))
+        rate_hz, drives = operator.values("odometry")["rate_hz"], base.drives
+    half = len(sizes) // 2
+    before, after = sizes[:half], sizes[half:]
+    megabytes = [size[0] for size in sizes]
+    print(f"\n{SOAK_S:.0f} s at {rate_hz} poses/s: {len(operator.poses)} poses; resident {megabytes[0]:.1f} MB, after "
+          f"half {megabytes[half]:.1f}, at the end {megabytes[-1]:.1f}, most {max(megabytes):.1f}; descriptors "
+          f"{sorted({size[1] for size in sizes})}, threads {sorted({size[2] for size in sizes})}")
+    assert drives and max(size[0] for size in after) <= max(size[0] for size in before) + GROWTH_MB
+    for index in (1, 2):
+        assert max(size[index] for size in after) <= max(size[index] for size in before)
