@@ -12,6 +12,7 @@ from omnid.transport.bus_config import BusConfig
 
 _ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
                   "declare_liveliness_subscriber")
+_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**")  # a star is not for a part that begins with @
 
 
 def access_control(config: BusConfig) -> dict[str, Any]:
@@ -24,8 +25,8 @@ def access_control(config: BusConfig) -> dict[str, Any]:
         "enabled": True,
         "default_permission": "deny",
         "rules": [
-            _rule("hear", "egress", (*_ALWAYS, "put", "delete"), ["**", "@/**", "@ros2_lv/**"]),
-            _rule("ask", "ingress", _ALWAYS, ["**", "@/**", "@ros2_lv/**"]),
+            _rule("hear", "egress", (*_ALWAYS, "put", "delete"), list(_EVERYTHING)),
+            _rule("ask", "ingress", _ALWAYS, list(_EVERYTHING)),
             _rule("command", "ingress", ("put",), command_keys(config)),
         ],
         "subjects": [everybody, *commanders],

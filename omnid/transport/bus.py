@@ -38,6 +38,7 @@ class Bus:
         self._channels: dict[str, _Channel] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
         self._take: Take | None = None
+        self._graph: _Graph | None = None
         self._held: list[object] = []  # what is declared lives as long as it is referred to
         self._left = False
         self.lost = 0
@@ -96,14 +97,13 @@ class Bus:
 
     def _open(self) -> None:
         session = open_session(self._config)
-        graph = _Graph(session, self._config)
+        self._graph = graph = _Graph(session, self._config)
         self._held.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
         self._channels = {name: _Channel(session, self._config, name, graph) for name in SAID}
         for name in {*self._newest, *(name for name, topic in SAID.items() if topic.late)}:
             self._answer(session, name)
         if self._take is not None:
             self._listen(session, self._take)
-        self._held.append(graph)
         self._session = session
 
     def _answer(self, session: zenoh.Session, name: str) -> None:
@@ -124,10 +124,9 @@ class Bus:
             key = f"{self._config.ros2_domain}/{plain}"
             skipped += len(str(self._config.ros2_domain)) + 1
             self._held.append(session.declare_subscriber(key, _taker(take, skipped, ending=2)))
-        graph = _Graph(session, self._config)
-        for name, schema in HEARD.items():
-            graph.announce("MS", name, schema)
-        self._held.append(graph)
+        if self._graph is not None:
+            for name, schema in HEARD.items():
+                self._graph.announce("MS", name, schema)
 
 
 def _taker(take: Take, skipped: int, ending: int = 0) -> Callable[[zenoh.Sample], None]:

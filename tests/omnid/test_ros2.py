@@ -1,0 +1,201 @@
+"""What ROS 2 sees of the bus, byte by byte: rmw_zenoh, and zenoh-bridge-ros2dds."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import struct
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+from zenoh import ext
+
+from omnid.client import Pose, Robot
+from omnid.errors import OmnidError
+from omnid.transport import codec, ros2
+from omnid.transport.bus import Bus, BusConfig
+from tests.omnid.buses import ROUTER, free_endpoint, odometry, script, wait_until
+
+ODOMETRY_KEY = ("0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
+                "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0")
+HASHES = {  # as published by ROS 2's own type description service, first digits
+    "std_msgs/msg/String": "df668c74", "nav_msgs/msg/Odometry": "3cc97dc7", "geometry_msgs/msg/PoseStamped": "10f3786d",
+    "sensor_msgs/msg/PointCloud2": "9198cabf", "tf2_msgs/msg/TFMessage": "e369d0f0",
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36ef", "sensor_msgs/msg/CompressedImage": "15640771",
+    "geometry_msgs/msg/TwistStamped": "5f0fcd4f",
+}
+TOPICS = {
+    "/omnid/cloud": "sensor_msgs/msg/PointCloud2", "/omnid/drive": "geometry_msgs/msg/TwistStamped",
+    "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
+    "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
+    "/tf": "tf2_msgs/msg/TFMessage", "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
+    "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",
+}
+
+
+@contextlib.contextmanager
+def client(endpoint: str) -> Iterator[zenoh.Session]:
+    config = zenoh.Config()
+    for key, value in (("mode", "client"), ("connect/endpoints", [endpoint]), ("scouting/multicast/enabled", False)):
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        yield session
+
+
+@pytest.mark.parametrize("schema", HASHES)
+def test_type_hashes_are_those_of_ros(schema: str) -> None:
+    assert ros2.type_hash(schema).startswith(f"RIHS01_{HASHES[schema]}") and len(ros2.type_hash(schema)) == 71
+
+
+def test_the_data_key_is_the_one_that_ros_subscribes() -> None:
+    assert ros2.data_key(0, "/omnid/odom", codec.ODOMETRY_SCHEMA) == ODOMETRY_KEY
+
+
+def test_the_attachment_is_what_zenoh_s_own_serializer_makes() -> None:
+    gid = bytes(range(16))
+    made = ros2.attachment(7, 1_700_000_000_123_456_789, gid)
+    assert len(made) == 33
+    assert made == bytes(ext.z_serialize((ext.Int64(7), ext.Int64(1_700_000_000_123_456_789), gid)))
+    assert made.hex() == "0700000000000000" + struct.pack("<q", 1_700_000_000_123_456_789).hex() + "10" + gid.hex()
+
+
+def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
+    node = ros2.RmwNode(5, "aac3178e146ba6f1fc6e6a4085e77f21", "robot")
+    assert node.token == "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/robot"
+    assert node.publisher(3, "/site/robot/odom", codec.ODOMETRY_SCHEMA) == (
+        "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/3/MP/%/%/robot/%site%robot%odom/"
+        "nav_msgs::msg::dds_::Odometry_/RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0/"
+        "::,10:,:,:,,")
+    assert len({ros2.gid_of(node.publisher(i, "/a", codec.ODOMETRY_SCHEMA)) for i in range(3)}) == 3
+
+
+def test_rmw_zenoh_gets_the_same_message_with_its_attachment() -> None:
+    endpoint, gids, numbers = free_endpoint(), set(), []
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus, client(endpoint) as session:
+        samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.FifoChannel(100))
+        while len(numbers) < 3:
+            bus.publish("odom", odometry(1), b'{"seq":1}')
+            sample = samples.try_recv()
+            if sample is not None:
+                number, sent_ns, length = struct.unpack_from("<qqB", sample.attachment.to_bytes())
+                assert sample.payload.to_bytes() == odometry(1) and len(sample.attachment) == 33 and length == 16
+                assert abs(time.time_ns() - sent_ns) < 60 * 10**9
+                numbers.append(number)
+                gids.add(sample.attachment.to_bytes()[17:])
+        with Robot(connect=(endpoint,)) as robot:  # the plain key stays, for those who know omnid
+            pose = robot.subscribe(Pose).newest()
+            assert pose is not None and pose.note.seq == 1
+    assert len(gids) == 1 and numbers == list(range(numbers[0], numbers[0] + 3))
+
+
+def tokens(endpoint: str, pattern: str, expected: int) -> set[str]:
+    found: set[str] = set()
+    with client(endpoint) as session:
+        def look() -> bool:
+            found.update(str(reply.ok.key_expr) for reply in session.liveliness().get(pattern) if reply.ok)
+            return len(found) >= expected
+        wait_until(look)
+    return found
+
+
+def test_all_topics_are_announced_to_rmw_zenoh() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
+        bus.hear(lambda key, payload: None)
+        found = [token.split("/") for token in tokens(endpoint, "@ros2_lv/3/**", len(TOPICS) + 1)]
+    announced = {parts[9].replace("%", "/"): (parts[5], parts[10]) for parts in found if parts[5] != "NN"}
+    assert announced == {topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema))
+                         for topic, schema in TOPICS.items()}
+    assert len({parts[4] for parts in found}) == len(TOPICS) + 1, "each endpoint has a number of its own"
+    assert [parts[5:] for parts in found if parts[5] == "NN"] == [["NN", "%", "%", "omnid"]]
+
+
+def test_a_twist_of_ros_reaches_the_robot() -> None:
+    endpoint, heard = free_endpoint(), []
+    key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
+        bus.hear(lambda key, payload: heard.append((key, payload)))
+        with client(endpoint) as session:
+            message = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1)
+            wait_until(lambda: session.put(key, message) is None and bool(heard))
+    assert heard[0] == ("cmd/twist", message)
+
+
+def test_the_bridge_finds_topics_under_their_plain_names() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="ros2dds"))) as bus, client(endpoint) as session:
+        bus.hear(lambda key, payload: None)
+        found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
+        odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
+        wait_until(lambda: bus.publish("odom", odometry(1)) is None and bus.publish("/tf", b"tf") is None
+                   and odom.try_recv() is not None and tf.try_recv() is not None)
+    assert "MP/omnid§odom/nav_msgs§msg§Odometry/:1:0:0,10" in found
+    assert "MP/tf/tf2_msgs§msg§TFMessage/:1:0:0,10" in found
+    assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
+
+
+def test_a_name_that_ros_cannot_take_is_refused() -> None:
+    with pytest.raises(OmnidError, match="ROS 2 takes"):
+        Bus(BusConfig(robot="robot-1", listen=(), ros2="rmw_zenoh"))
+
+
+SDK = os.environ.get("OMNID_ZENOH_ROS2", "")  # the folder of a virtual environment with zenoh-ros2-sdk
+ECHO = """
+import sys, time
+from rosbags.typesys import Stores, get_typestore
+from zenoh_ros2_sdk import ROS2Subscriber
+from zenoh_ros2_sdk.session import ZenohSession
+host, port = sys.argv[1].removeprefix("tcp/").split(":")
+known = ZenohSession.get_instance(host, int(port)).store  # what it would fetch from GitHub
+known.register({name: kind for name, kind in get_typestore(Stores.ROS2_HUMBLE).fielddefs.items()
+                if name not in known.fielddefs and "Odometry" not in name})
+def say(message):
+    pose = message.pose.pose.position
+    print(message.header.stamp.nanosec, message.header.frame_id, message.child_frame_id, pose.x, pose.y, flush=True)
+kind = "nav_msgs/msg/Odometry"
+definition = open(sys.argv[2]).read()
+subscriber = ROS2Subscriber("/omnid/odom", kind, say, definition, router_ip=host, router_port=int(port),
+                            type_hash=sys.argv[3])
+print("ready", flush=True)
+time.sleep(30)
+"""
+
+
+def listed(router: str) -> set[str]:
+    """The lines of its list; peers find each other a moment after they have found the router."""
+    said = subprocess.run([f"{SDK}/bin/zenoh-ros2", "--no-daemon", "--router", router.removeprefix("tcp/"),
+                           "--timeout", "3", "topic", "list", "-t"], capture_output=True, text=True, timeout=60)
+    return set(said.stdout.splitlines())
+
+
+@pytest.mark.skipif(not SDK or shutil.which(f"{SDK}/bin/zenoh-ros2") is None,
+                    reason="needs zenoh-ros2-sdk in a virtual environment that OMNID_ZENOH_ROS2 names")
+def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
+    """zenoh-ros2-sdk 0.1.8: its `topic list -t`, and its subscriber."""
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as ends:
+        ends.enter_context(script(ROUTER, endpoint))
+        config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh", retry_s=0.5)
+        bus = ends.enter_context(contextlib.closing(Bus(config)))
+        bus.hear(lambda key, payload: None)
+        wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})
+        (tmp_path / "Odometry.msg").write_text("std_msgs/Header header\nstring child_frame_id\n"
+                                               "geometry_msgs/PoseWithCovariance pose\n"
+                                               "geometry_msgs/TwistWithCovariance twist\n")
+        echo = subprocess.Popen([f"{SDK}/bin/python", "-c", ECHO, endpoint, str(tmp_path / "Odometry.msg"),
+                                 ros2.type_hash(codec.ODOMETRY_SCHEMA)], stdout=subprocess.PIPE, text=True)
+        ends.callback(echo.wait)
+        ends.callback(echo.kill)
+        assert echo.stdout is not None
+        while "ready" not in echo.stdout.readline():
+            assert echo.poll() is None
+        os.set_blocking(echo.stdout.fileno(), False)
+        lines: list[str] = []
+        wait_until(lambda: bus.publish("odom", odometry(4)) is None and bool(lines.extend(echo.stdout) or lines))
+    assert lines[0].split() == ["4", "odom", "base_link", "1.0", "-1.0"]
