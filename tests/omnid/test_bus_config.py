@@ -1,0 +1,83 @@
+"""The knobs of the bus: what cannot work is told before anything is opened, in one line that names the knob."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from omnid.errors import OmnidError
+from omnid.transport.bus_config import BusConfig, checked
+from omnid.transport.session import open_session, zenoh_config
+
+
+def refused(**knobs: Any) -> str:
+    with pytest.raises(OmnidError) as caught:
+        checked(BusConfig(**knobs))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("knob", ["config", "tls_ca", "tls_listen_key", "tls_connect_certificate", "users_file",
+                                  "password_file"])
+def test_a_missing_file_is_named(knob: str, tmp_path: Path) -> None:
+    told = refused(**{knob: str(tmp_path / "nowhere")})
+    assert f"bus.{knob}" in told and "nowhere" in told and "No such file" in told
+
+
+@pytest.mark.parametrize("knob", ["config", "tls_ca", "users_file"])
+def test_a_file_of_anything_is_told(knob: str, tmp_path: Path) -> None:
+    path = tmp_path / "binary"
+    path.write_bytes(bytes(range(256)))
+    assert f"bus.{knob}" in refused(**{knob: str(path)})
+
+
+def test_a_key_must_be_pem_and_users_have_passwords(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("hello\n")
+    assert "PEM" in refused(tls_ca=str(path))
+    assert "user:password" in refused(users_file=str(path))
+
+
+@pytest.mark.parametrize(("knobs", "other"), [
+    ({"mode": "client"}, "bus.connect"),
+    ({"user": "ada"}, "bus.password_file"),
+    ({"listen": ("tls/127.0.0.1:1",)}, "bus.tls_listen_key"),
+    ({"tls_mutual": True}, "bus.tls_ca"),
+    ({"command_names": ("driver",)}, "bus.tls_mutual"),
+    ({"command_users": ("ada",)}, "bus.users_file"),
+])
+def test_what_one_knob_needs_of_another_is_asked_for(knobs: dict[str, Any], other: str) -> None:
+    assert other in refused(**knobs)
+
+
+def setting(config: BusConfig, key: str) -> Any:
+    return json.loads(zenoh_config(config).get_json(key))
+
+
+def test_without_a_word_nobody_beyond_this_machine_is_heard_or_told() -> None:
+    assert setting(BusConfig(), "listen/endpoints") == ["tcp/127.0.0.1:7447"]
+    assert setting(BusConfig(), "scouting/multicast/enabled") is False
+    assert setting(BusConfig(), "access_control")["default_permission"] == "deny"
+
+
+def test_zenoh_s_own_file_comes_first_and_what_is_set_here_goes_over_it(tmp_path: Path) -> None:
+    path = tmp_path / "zenoh.json5"
+    path.write_text("""{ // as zenohd reads it
+        listen: {endpoints: ["tcp/127.0.0.1:1"]}, connect: {endpoints: ["tcp/127.0.0.1:2"]},
+        transport: {link: {tx: {lease: 1234}}} }""")
+    config = BusConfig(config=str(path), connect=("tcp/127.0.0.1:3",))
+    assert setting(config, "listen/endpoints") == ["tcp/127.0.0.1:1"]
+    assert setting(config, "connect/endpoints") == ["tcp/127.0.0.1:3"]
+    assert setting(config, "transport/link/tx/lease") == 1234
+    assert setting(config, "scouting/multicast/enabled") is False
+
+
+def test_a_file_that_zenoh_cannot_read_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "zenoh.json5"
+    path.write_text("{ mode: 'emperor' }")
+    with pytest.raises(OmnidError, match=r"bus\.config") as caught:
+        open_session(BusConfig(config=str(path)))
+    assert "\n" not in str(caught.value) and ".rs:" not in str(caught.value)

@@ -1,0 +1,165 @@
+"""The client: what the examples in its words say is so."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import random
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from itertools import count
+
+import numpy as np
+import pytest
+
+import omnid.client
+from calib import se3
+from omnid.client import Cloud, Driver, Pose, Report, Robot, subscribe
+from omnid.errors import OmnidError
+from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import Status
+from omnid.transport.decode import cloud_from, pose_from, report_from
+from omnid.transport.note import Note, note_bytes, note_from_bytes
+from tests.omnid.buses import free_endpoint, odometry, script, wait_until
+
+
+@contextlib.contextmanager
+def robot() -> Iterator[tuple[Bus, str]]:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        yield bus, endpoint
+
+
+def test_only_the_newest_pose_is_kept() -> None:
+    with robot() as (bus, endpoint), subscribe(connect=(endpoint,)) as poses:
+        assert poses.newest() is None and poses.wait(0.05) is None
+        numbers = count()
+        wait_until(lambda: bus.publish("odom", odometry(next(numbers))) is None and poses.newest() is not None)
+        for i in range(1000, 1010):
+            bus.publish("odom", odometry(i))
+        time.sleep(0.3)
+        pose = poses.newest()
+        assert pose is not None and pose.stamp_ns == 10**9 + 1009 and poses.newest() is None
+
+
+def test_a_pose_says_where_the_robot_is_and_how_sure_that_is() -> None:
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [1.0, 2.0, 3.0])
+    payload = codec.odometry_cdr(5, T, 2.0 * np.eye(6), np.arange(6.0), np.eye(6))
+    pose = pose_from(payload, note_bytes(Note(7, "degraded", 2, 30, 40, 9)), received_ns=11)
+    assert (pose.x_m, pose.y_m, pose.z_m, pose.state) == (1.0, 2.0, 3.0, "degraded")
+    assert pose.yaw_rad == pytest.approx(0.5) and pose.received_ns == 11
+    assert pose.note == Note(7, "degraded", 2, 30, 40, 9)
+    np.testing.assert_array_equal(pose.covariance, 2.0 * np.eye(6))
+    np.testing.assert_array_equal(pose.velocity, np.arange(6.0))
+    assert pose_from(payload, b"").state == "unknown"
+
+
+def test_reports_and_clouds_come_back_as_they_were_said() -> None:
+    report = report_from(codec.diagnostics_cdr(5, [Status("a", 1, "so so", {"k": "v"}), Status("b", 0, "", {})]))
+    assert report.stamp_ns == 5 and [status.name for status in report.statuses] == ["a", "b"]
+    assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    cloud = cloud_from(codec.point_cloud_cdr(6, "odom", points, np.arange(50.0)))
+    assert (cloud.stamp_ns, cloud.frame) == (6, "odom")
+    np.testing.assert_array_equal(cloud.points, points)
+    np.testing.assert_array_equal(cloud.confidence, np.arange(50.0))
+
+
+@pytest.mark.parametrize(("kind", "topic", "payload", "decode"), [
+    (Pose, "odom", odometry(3), lambda data: pose_from(data, b"")),
+    (Report, "status", codec.diagnostics_cdr(5, [Status("a", 1, "so so", {"k": "v"})]), report_from),
+    (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), cloud_from),
+])
+def test_whatever_comes_is_read_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
+    rng = random.Random(2)
+    for _ in range(1500):
+        spoiled = bytearray(payload)
+        for _ in range(rng.randint(1, 6)):
+            spoiled[rng.randrange(len(spoiled))] = rng.randrange(256)
+        with contextlib.suppress(OmnidError):
+            assert isinstance(decode(bytes(spoiled[: rng.randint(0, len(spoiled))])), kind)
+            assert isinstance(decode(bytes(spoiled)), kind)
+    with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
+        messages = connection.subscribe(kind)
+        wait_until(lambda: bus.publish(topic, payload[:9]) is None and messages.newest() is None
+                   and messages.broken > 0)
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{", b"[" * 3000, b"1", bytes(5000)])
+def test_a_note_is_one_or_is_refused(data: bytes) -> None:
+    with pytest.raises(OmnidError):
+        note_from_bytes(data)
+    assert note_from_bytes(b'{"state": 3, "seq": true, "resets": 4, "new": 1}') == Note(resets=4)
+
+
+def test_it_needs_neither_opencv_nor_what_the_daemon_needs() -> None:
+    said = subprocess.run([sys.executable, "-c", "import omnid.client, sys; print(*sys.modules)"], capture_output=True,
+                          text=True, check=True).stdout.split()
+    assert not {"cv2", "serial", "filterpy", "mcap", "scipy"} & set(said) and "zenoh" in said
+
+
+def example(text: str | None) -> str:
+    """The code in a docstring: its indented part."""
+    lines = textwrap.dedent((text or "").split("\n", 1)[1]).splitlines()
+    return textwrap.dedent("\n".join(line for line in lines if line.startswith("    "))) + "\n"
+
+
+def test_the_example_of_ten_lines_prints_poses() -> None:
+    with robot() as (bus, endpoint):
+        code = example(omnid.client.__doc__).replace('("omnid")', f'("omnid", connect=("{endpoint}",))')
+        assert 5 <= len(code.strip().splitlines()) <= 10
+        with script(f"print('ready', flush=True)\n{code}") as process:
+            numbers = count()
+            wait_until(lambda: bus.publish("odom", odometry(next(numbers)), note_bytes(Note(1, "tracking"))) is None
+                       and process.poll() is not None)
+            assert process.returncode == 0 and process.stdout is not None
+            assert process.stdout.read().startswith("tracking: ")
+
+
+def test_the_waypoint_example_drives_a_robot_to_its_last_point() -> None:
+    """A robot of nothing but its odometry: it goes where it is told."""
+    state = {"x": 0.0, "y": 0.0}
+    stops: list[str] = []
+
+    def obey(key: str, payload: bytes) -> None:
+        if key == "cmd/heading":
+            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
+            state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
+            state["y"] += 0.1 * velocity_mps * math.sin(heading_rad)
+        elif key == "cmd/twist":
+            stops.append(key)
+
+    with robot() as (bus, endpoint):
+        bus.hear(obey)
+        code = example(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
+        with script(f"print('ready', flush=True)\n{code}") as process:
+            def run() -> bool:
+                T = se3.transform(np.eye(3), [state["x"], state["y"], 0.0])
+                bus.publish("odom", codec.odometry_cdr(time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6)),
+                            note_bytes(Note(1, "tracking")))
+                return process.poll() is not None
+            wait_until(run, pause_s=0.005)
+            assert process.returncode == 0
+        wait_until(lambda: bool(stops))
+    assert math.hypot(state["x"] - 1.0, state["y"] - 1.0) < 0.15
+
+
+def test_commands_arrive_as_they_were_meant() -> None:
+    heard: list[tuple[str, bytes]] = []
+    with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
+        driver = connection.driver()
+        assert not driver.heard
+        bus.hear(lambda key, payload: heard.append((key, payload)))
+        wait_until(lambda: driver.heard)
+        driver.twist(0.5, -0.25)
+        driver.heading(0.75, 1.5)
+        driver.stop()
+        wait_until(lambda: len(heard) == 3)
+    (twist, a), (heading, b), (stop, _) = heard
+    assert (twist, heading, stop) == ("cmd/twist", "cmd/heading", "cmd/stop")
+    assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
+    assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)
