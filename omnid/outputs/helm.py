@@ -178,7 +178,7 @@ class Helm:
         before, self.reason = self.reason, reason_to_stop(situation, self._settings.deadlines)
         if not self.reason:
             return
-        self._void_ns = max(now_ns, self._stop_ns)
+        self._void_ns = now_ns
         if not before:
             self.stops[self.reason] += 1
             self._report(f"the wheels stop: {self.reason}")

@@ -1,4 +1,4 @@
-"""The live daemon in real time: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`, the soak with `-m slow`.
+"""The live daemon in real time: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`, its soak: `-m slow`.
 
 OMNID_BENCHMARK_S: seconds a measurement (60). OMNID_SOAK_MINUTES: how long the soak takes (2; 10 for the full one).
 """

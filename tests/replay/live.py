@@ -134,7 +134,7 @@ class Operator:
 
     def send(self, key: str, payload: bytes) -> None:
         """Sends anything once."""
-        self._session.put(f"omnid/{key}", payload)
+        self._session.put(f"omnid/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)  # not one is lost
 
     def message(self, part: str) -> str:
         """What the daemon last said about a part."""
