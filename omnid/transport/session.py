@@ -15,7 +15,7 @@ from omnid.transport.bus_config import BusConfig, set_knobs, text_of
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _TRY_MS: Final = 1000  # a client's try to reach its router; it opens no session without
-_URGENT_BATCHES: Final = 16  # zenoh's 2 are full after odom and pose, which are sent at once, and tf would be dropped
+_URGENT_BATCHES: Final = 16  # zenoh's own 2 are soon full on a busy host, and poses are dropped
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
     "tls_listen_key": "listen_private_key",

@@ -12,10 +12,10 @@ EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 
 
 class Topic(NamedTuple):
-    """A topic: the type of ROS 2, and whether it overtakes all others."""
+    """A topic and how it travels."""
 
-    schema: str
-    realtime: bool = False
+    schema: str  # the type of ROS 2
+    realtime: bool = False  # it overtakes all others
     late: bool = False  # whoever comes late gets the newest at once
 
 

@@ -68,7 +68,7 @@ def test_another_process_reads_the_same_odometry() -> None:
     bus = Bus(BusConfig(robot="site/robot-1", listen=(endpoint,)))
     with contextlib.closing(bus), subscriber(endpoint, "site/robot-1/**", 5) as process:
         lines = publish_until_done(bus, "odom", process)
-    assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP True"] * 5
+    assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP False"] * 5
     records = [codec.odometry_from_cdr(bytes.fromhex(line)) for line in lines[1::2]]
     for record in records:
         expected = codec.odometry_from_cdr(odometry(record.stamp_ns - 10**9))

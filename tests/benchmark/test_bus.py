@@ -1,0 +1,230 @@
+"""What the bus costs and how fast it is: `python -m pytest -m benchmark -s tests/benchmark/test_bus.py`.
+
+Every subscriber, and the router, is a process of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.client import Report, Robot
+from omnid.messages import Odometry
+from omnid.outputs.bus import BusSink
+from omnid.outputs.encoded import Encoder
+from omnid.telemetry import Histogram
+from omnid.transport.bus import Bus, BusConfig
+from tests.omnid.buses import ROUTER, free_endpoint, script, wait_until
+
+pytestmark = pytest.mark.benchmark
+RATE_HZ = 30.0
+
+# Notes of each robot's poses: how many came, were missed, and how long they took.
+COUNTER = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+last, ways_s, missed = {}, [], [0]
+def take(sample):
+    now_ns = time.time_ns()
+    note = json.loads(sample.attachment.to_bytes())
+    key, seq = str(sample.key_expr), note["seq"]
+    missed[0] += seq - last.get(key, seq - 1) - 1
+    last[key] = seq
+    ways_s.append((now_ns - note["sent_ns"]) * 1e-9)
+with zenoh.open(config) as session:
+    poses = session.declare_subscriber("**/odom", take)
+    rest = session.declare_subscriber("**/pose", lambda sample: None)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        ways_s.sort()
+        print(json.dumps({
+            "came": len(ways_s), "missed": missed[0], "newest": min(last.values()),
+            "p50_ms": 1e3 * ways_s[len(ways_s) // 2], "p99_ms": 1e3 * ways_s[int(0.99 * len(ways_s))],
+        }), flush=True)
+        ways_s.clear(); missed[0] = 0
+"""
+
+
+def told(process: subprocess.Popen[str]) -> dict[str, float]:
+    """What a counter has counted since the last time of asking."""
+    assert process.stdin is not None and process.stdout is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return cast("dict[str, float]", json.loads(process.stdout.readline()))
+
+
+@contextlib.contextmanager
+def counter(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    arguments = [sys.executable, "-c", COUNTER, endpoint]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def odometry(seq: int) -> Odometry:
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, 1e-3 * seq]), [1e-3 * seq, 0.0, 0.0])
+    return Odometry(seq, time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 50, 60, cast("Any", None))
+
+
+def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:
+    """The cost of each pose with all that is said of it; every sink says one each 1 / RATE_HZ."""
+    cost = Histogram()
+    next_s = time.monotonic()
+    for seq in range(first, first + count):
+        for sink in sinks:
+            message, started_s = odometry(seq), time.perf_counter()
+            sink.process(message)
+            cost.add(time.perf_counter() - started_s)
+        next_s += 1.0 / RATE_HZ
+        time.sleep(max(0.0, next_s - time.monotonic()))
+    return cost
+
+
+def sink_on(bus: Bus) -> BusSink:
+    return BusSink(bus, Encoder(np.eye(4), 1000))
+
+
+@pytest.mark.parametrize("way", ["direct", "router"])
+def test_latency_and_cost(way: str) -> None:
+    here, there = free_endpoint(), free_endpoint()
+    with contextlib.ExitStack() as ends:
+        if way == "router":
+            ends.enter_context(script(ROUTER, there))
+        connect = (there,) if way == "router" else ()
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=connect))))
+        listener = ends.enter_context(counter(there if way == "router" else here))
+        sink = sink_on(bus)
+        publish([sink], 0, 30)
+        told(listener)
+        cost = publish([sink], 30, 300)
+        time.sleep(0.5)
+        found = told(listener)
+    print(f"\n{way}: one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms, {found['came']:.0f} of 300 "
+          f"came; publishing a frame p50 {1e3 * cost.p(0.5):.2f} ms, p99 {1e3 * cost.p(0.99):.2f} ms")
+    assert found["newest"] == 329 and found["missed"] == 0 and cost.p(0.5) < 1e-3
+
+
+def test_a_router_is_back_within_five_seconds() -> None:
+    here, there = free_endpoint(), free_endpoint()
+    with contextlib.ExitStack() as ends:
+        router = ends.enter_context(script(ROUTER, there))
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,)))))
+        direct, behind = ends.enter_context(counter(here)), ends.enter_context(counter(there))
+        sink = sink_on(bus)
+        publish([sink], 0, 30)
+        told(direct), told(behind)
+        router.kill()
+        router.wait()
+        publish([sink], 30, 90)
+        ends.enter_context(script(ROUTER, there))
+        back_s = time.monotonic()
+        publish([sink], 120, 180)
+        time.sleep(0.3)
+        near, far = told(direct), told(behind)
+    missed_s = far["missed"] / RATE_HZ - 3.0
+    print(f"\nrouter killed for 3 s: direct {near['missed']:.0f} of {near['came']:.0f} missed; behind the router again "
+          f"{missed_s:.1f} s after it was back ({time.monotonic() - back_s:.0f} s watched)")
+    assert near["missed"] == 0 and near["newest"] == far["newest"] == 299 and missed_s < 5.0
+
+
+SLOW = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    all = session.declare_subscriber("omnid/**", lambda sample: time.sleep(0.5))
+    print("ready", flush=True)
+    time.sleep(1000)
+"""
+
+
+def test_a_slow_subscriber_slows_nobody_else(scene: Path) -> None:
+    """The daemon on a log, alone and with one who takes half a second for each message."""
+    endpoint = free_endpoint()
+    words = [sys.executable, "-m", "omnid", "run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml",
+             "--set", f"bus.listen=['{endpoint}']", "--set", "bus.panorama_hz=10", "--set", "live.cloud_s=0.5"]
+    with subprocess.Popen(words, stderr=subprocess.DEVNULL) as daemon:
+        try:
+            with Robot(connect=(endpoint,), patience_s=30.0) as robot:
+                rates = {"alone": measured(robot)}
+                with script(SLOW, endpoint):
+                    rates["with a slow subscriber"] = measured(robot)
+        finally:
+            daemon.terminate()
+    for name, (rate_hz, p50_ms, poses) in rates.items():
+        print(f"\n{name}: {rate_hz:.1f} poses/s, capture to pose p50 {p50_ms:.1f} ms, {poses} poses heard in 10 s")
+    alone, slow = rates.values()
+    assert slow[0] > 0.8 * alone[0]
+
+
+def measured(robot: Robot) -> tuple[float, float, int]:
+    """Over ten seconds: poses per second that the daemon finds and their median latency, and poses that came."""
+    came: list[str] = []
+    robot.each(lambda topic, payload, note: came.append(topic))
+    with robot.subscribe(Report) as reports:
+        wait_until(lambda: bool(came))
+        time.sleep(3.0)
+        came.clear()
+        rates = [float(report.value("omnid: odometry", "rate_hz") or "nan") for _ in range(10)
+                 if (report := full(reports)) is not None]
+        last = full(reports)
+    return float(np.nanmean(rates)), float(last.value("omnid: odometry", "to_pose_p50_ms") or "nan"), came.count("odom")
+
+
+def full(reports: Any) -> Report:
+    while not (report := reports.wait(5.0)).value("omnid: odometry", "rate_hz"):
+        pass
+    return cast("Report", report)
+
+
+FLEET = 24
+
+
+def test_a_fleet_on_one_router_loses_no_pose() -> None:
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as ends:
+        router = ends.enter_context(script(ROUTER, endpoint))
+        listener = ends.enter_context(counter(endpoint))
+        sinks = []
+        for number in range(FLEET):
+            bus = Bus(BusConfig(robot=f"robot{number}", mode="client", listen=(), connect=(endpoint,)))
+            ends.callback(bus.close)
+            wait_until(lambda bus=bus: bus.join() is None and bus._session is not None)
+            sinks.append(sink_on(bus))
+        publish(sinks, 0, 30)
+        told(listener)
+        before_s, started_s = cpu_s(router.pid), time.monotonic()
+        publish(sinks, 30, 300)
+        share = (cpu_s(router.pid) - before_s) / (time.monotonic() - started_s)
+        time.sleep(0.5)
+        found = told(listener)
+    print(f"\n{FLEET} robots at {RATE_HZ:.0f} Hz: {found['came']:.0f} of {FLEET * 300} poses came, "
+          f"{found['missed']:.0f} missed; one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms; "
+          f"the router took {100 * share:.0f} % of a core")
+    assert found["newest"] == 329 and found["missed"] == 0
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = re.sub(r".*\)", "", Path(f"/proc/{pid}/stat").read_text()).split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
