@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from calib import se3
-from calib.camera import Array, OmniCamera
+from calib.camera import Array
 from calib.errors import CalibError
 
-Make = Callable[[Array], OmniCamera]
 MAX_STEPS = 60
 # Rounds with the kernel's width measured anew.
 KERNEL_ROUNDS = 3
@@ -28,6 +28,16 @@ LOST_PX = 300.0
 STILL, UNDAMPED = 1e-9, 1e-7
 # Numeric derivatives: parameters are scaled so that one unit moves the picture by about a pixel; points by their depth.
 STEP = 1e-4
+
+
+class Projection(Protocol):
+    """A camera, or several as one: pixels (N, 2) of points (N, 3), NaN where there is no image."""
+
+    def project(self, points: Array) -> Array:
+        """The pixels."""
+
+
+Make = Callable[[Array], Projection]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +72,7 @@ class Adjusted:
         return float(np.nanmean(self.errors_px))
 
 
-def residuals(camera: OmniCamera, T_cam_board: Array, observed: Observed) -> Array:
+def residuals(camera: Projection, T_cam_board: Array, observed: Observed) -> Array:
     """Measured minus modelled pixels (K, N, 2); NaN where there is no measurement, LOST_PX where there is no model."""
     cast = camera.project(se3.apply(T_cam_board, observed.points).reshape(-1, 3)).reshape(observed.pixels.shape)
     lost = np.isnan(cast) & np.isfinite(observed.pixels)
@@ -188,7 +198,7 @@ def _jacobians(state: _State) -> tuple[Array, Array]:
     return by_parameter.reshape(*shape, 2, -1), by_pose.reshape(*shape, 2, 6)
 
 
-def _by_point(camera: OmniCamera, points: Array) -> Array:
+def _by_point(camera: Projection, points: Array) -> Array:
     """Derivative (N, 2, 3) of the pixels by the points."""
     reach = STEP * np.linalg.norm(points, axis=1, keepdims=True)
     columns = [(camera.project(points + reach * axis) - camera.project(points - reach * axis)) / (2 * reach)

@@ -88,7 +88,7 @@ def calibrate(views: Sequence[BoardView], board: Board, size: tuple[int, int], m
 
     solved = solve(_observed(good, board))
     for _ in range(MAX_REJECTIONS):
-        bad = _bad_views(solved.fit)
+        bad = bad_views(solved.fit)
         if not bad.any():
             break
         rejected += [_too_far(seen, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
@@ -132,7 +132,7 @@ def _plausible(views: list[BoardView], board: Board, size: tuple[int, int],
                                  f"off any board, the others {np.rad2deg(usual):.2f}"))
 
 
-def _bad_views(fit: Adjusted) -> NDArray[np.bool_]:
+def bad_views(fit: Adjusted) -> NDArray[np.bool_]:
     """Which views (K,) are off by much more than the others, by most of their corners; the worst third at most."""
     errors = np.nanmedian(fit.errors_px, axis=1)
     bad = errors > max(BAD_RATIO * float(np.median(errors)), BAD_PX)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from calib.bundle import Adjusted, Make, Observed, adjust
+from calib.bundle import Adjusted, Observed, adjust
 from calib.camera import Array
 from calib.errors import CalibError
 from calib.ocam import OcamCamera, View
@@ -34,7 +36,7 @@ def raise_degree(fit: Adjusted, observed: Observed, camera: OcamCamera) -> Adjus
     return adjust(ocam_maker(camera.size, camera.view, degree), start, fit.T_cam_board, observed)
 
 
-def ocam_maker(size: tuple[int, int], view: View, degree: int = DEGREE) -> Make:
+def ocam_maker(size: tuple[int, int], view: View, degree: int = DEGREE) -> Callable[[Array], OcamCamera]:
     """The camera of a vector of parameters."""
     conversion = _conversion(size, degree)
 

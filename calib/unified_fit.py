@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calib import se3
-from calib.bundle import Adjusted, Make, Observed, adjust
+from calib.bundle import Adjusted, Observed, adjust
 from calib.camera import Array
 from calib.ocam import OcamCamera
 from calib.unified import UnifiedCamera
@@ -59,7 +61,7 @@ def _conversion(size: tuple[int, int], terms: int) -> Array:
     return np.array([1, scale, scale, scale, scale, *[1.0] * terms]) / scale
 
 
-def unified_maker(size: tuple[int, int], terms: int = 0) -> Make:
+def unified_maker(size: tuple[int, int], terms: int = 0) -> Callable[[Array], UnifiedCamera]:
     """The camera of a vector of parameters."""
     conversion = _conversion(size, terms)
 

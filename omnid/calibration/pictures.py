@@ -35,7 +35,7 @@ def read_pictures(sources: Sequence[str], topic: str | None = None) -> Pictures:
     if topic and not logs:
         raise OmnidError(f"--topic {topic}: only a log has topics; found pictures")
     pictures = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
-    _one_size(pictures)
+    one_size(pictures)
     return pictures
 
 
@@ -79,7 +79,8 @@ def _read(path: Path) -> Image:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def _one_size(pictures: Pictures) -> None:
+def one_size(pictures: Pictures) -> None:
+    """OmnidError unless all pictures are of one size."""
     sizes: dict[tuple[int, ...], str] = {}
     for name, image in pictures.items():
         sizes.setdefault(image.shape[::-1], name)

@@ -35,16 +35,21 @@ def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequen
     pixels = np.array([view.pixels for view in found.views])
     parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by picture</h2>",
              _views(found, missing), "<h2>Error by distance from the centre</h2>",
-             _table(("radius [px]", "mean error [px]", "corners"),
+             table(("radius [px]", "mean error [px]", "corners"),
                     [(f"{r:.0f}", f"{e:.3f}", str(n)) for r, e, n in
                      error_by_radius(found.fit, pixels, found.camera.center)]),
-             "<h2>Coverage</h2>", _figure(coverage_picture(first, found), "all corners; arrows are the residuals, "
+             "<h2>Coverage</h2>", figure(coverage_picture(first, found), "all corners; arrows are the residuals, "
                                           f"{ARROW:.0f} times as long; the cross is the centre"),
-             "<h2>Unrolled</h2>", _figure(panorama_picture(first, found.camera, mask), f"{found.views[0].name} about "
+             "<h2>Unrolled</h2>", figure(panorama_picture(first, found.camera, mask), f"{found.views[0].name} about "
                                           "the ray of the centre: what runs along it in the world stands upright"),
              "<h2>Residuals</h2>", *_residuals(found, images)]
-    return f"<!DOCTYPE html><html><head><meta charset='utf-8'><title>Camera calibration</title><style>{STYLE}</style>" \
-           f"</head><body>{''.join(parts)}</body></html>\n"
+    return page("Camera calibration", parts)
+
+
+def page(title: str, parts: Sequence[str]) -> str:
+    """A whole HTML page of parts."""
+    return f"<!DOCTYPE html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>" \
+           f"<body>{''.join(parts)}</body></html>\n"
 
 
 def _head(found: Calibration) -> str:
@@ -62,7 +67,7 @@ def _warnings(found: Calibration) -> str:
 
 
 def _parameters(found: Calibration) -> str:
-    return _table(("parameter", "value", "standard deviation"),
+    return table(("parameter", "value", "standard deviation"),
                   [(name, f"{value:.8g}", f"{deviation:.2g}") for name, value, deviation in found.parameters])
 
 
@@ -74,10 +79,11 @@ def _views(found: Calibration, missing: Sequence[str]) -> str:
              f"<span class='bar' style='width:{200 * error / worst:.0f}px'></span>")
             for view, error, count in zip(found.views, errors, corners, strict=True)]
     none = f"<p>No board found in {escape(', '.join(missing))}.</p>" if missing else ""
-    return _table(("picture", "mean error [px]", "corners", "confidence", ""), rows) + none
+    return table(("picture", "mean error [px]", "corners", "confidence", ""), rows) + none
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; cells are HTML."""
     titles = "".join(f"<th>{title}</th>" for title in head)
     lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
@@ -85,12 +91,13 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _residuals(found: Calibration, images: Mapping[str, Image]) -> list[str]:
     shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
-    return [_figure(residual_picture(images[view.name], view.pixels, residuals),
+    return [figure(residual_picture(images[view.name], view.pixels, residuals),
                     f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")
             for view, residuals, error in shown]
 
 
-def _figure(picture: Image, caption: str) -> str:
+def figure(picture: Image, caption: str) -> str:
+    """A picture within the page."""
     data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     source = base64.b64encode(data.tobytes()).decode()
     image = f"<img src='data:image/jpeg;base64,{source}' alt=''>"

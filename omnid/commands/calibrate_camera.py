@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -14,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board import Board, BoardView
-from calib.board_find import find_board
 from calib.camera import Mask
 from calib.camera_file import CameraFile, Quality, camera_toml
 from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
 from calib.ocam import VIEWS
 from calib.rig_file import write_file
 from calib.stack_mask import find_mask
+from omnid.calibration.boards import find_boards, spread
 from omnid.calibration.pictures import Pictures, read_pictures
 from omnid.calibration.report import report_html
 from omnid.errors import OmnidError
@@ -34,7 +32,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Add `camera` to `omnid calibrate`."""
     parser = actions.add_parser("camera", help="a camera.toml from pictures of a checkerboard")
     parser.add_argument("pictures", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
-    parser.add_argument("--corners", required=True, type=_corners, metavar="6x7", help="where four squares meet, "
+    parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="where four squares meet, "
                         "counted along both sides of the board")
     parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
     parser.add_argument("--topic", help="the camera's topic in a log")
@@ -49,7 +47,8 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.set_defaults(run=run)
 
 
-def _corners(text: str) -> tuple[int, int]:
+def corners(text: str) -> tuple[int, int]:
+    """The inner corners along both sides, out of 6x7."""
     sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
     if sides is None:
         raise argparse.ArgumentTypeError(f"expected two numbers of inner corners like 6x7, found {text!r}")
@@ -62,7 +61,9 @@ def run(args: argparse.Namespace) -> int:
     board = Board(columns, rows, args.square_mm / 1e3)
     _check_outputs(args)
     pictures = read_pictures(args.pictures, args.topic)
-    views = _views(pictures, board, args)
+    many = any(source.endswith(".mcap") for source in args.pictures)
+    views = find_boards(pictures, board, thorough=not many, tell=not args.quiet)
+    views = spread(views, MAX_LOG_VIEWS) if many else views
     found = _fitted(views, pictures, board, args)
     mask = find_mask(list(pictures.values()), found.camera.center) if args.mask else None
     _write(found, mask, args)
@@ -81,49 +82,6 @@ def _check_outputs(args: argparse.Namespace) -> None:
     check_outputs([(option, path) for option, path in named if path is not None], read)
     if args.mask and (args.mask.suffix.lower() != ".png" or args.mask.parent.resolve() != args.output.parent.resolve()):
         raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}, where it is looked for")
-
-
-def _views(pictures: Pictures, board: Board, args: argparse.Namespace) -> list[BoardView]:
-    """The views of the board; OmnidError that says what was seen where there is none."""
-    views, seen = list[BoardView](), Counter[tuple[int, int]]()
-    many = any(source.endswith(".mcap") for source in args.pictures)
-    for number, (name, image) in enumerate(pictures.items(), 1):
-        search = find_board(image, board, name, thorough=not many)
-        if search.view is not None:
-            views.append(search.view)
-        seen[_sorted(search.seen)] += search.seen != (0, 0)
-        said = f"board found, confidence {search.view.confidence:.2f}" if search.view else _no_board(search.seen)
-        if not args.quiet:
-            print(f"[{number}/{len(pictures)}] {name}: {said}", file=sys.stderr)
-    if not views:
-        raise OmnidError(_none_found(len(pictures), board, seen))
-    return _spread(views, MAX_LOG_VIEWS) if many else views
-
-
-def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
-    return min(sides), max(sides)
-
-
-def _no_board(seen: tuple[int, int]) -> str:
-    return f"no board, but a grid of {seen[0]}x{seen[1]}" if seen != (0, 0) else "no board"
-
-
-def _none_found(pictures: int, board: Board, seen: Counter[tuple[int, int]]) -> str:
-    likely, times = seen.most_common(1)[0] if seen else ((0, 0), 0)
-    hint = (f"a grid of {likely[0]}x{likely[1]} was seen in {times}: try --corners {likely[0]}x{likely[1]}" if times
-            else "count the inner corners, and take pictures with the whole board in view, sharp and well lit")
-    return f"calibrate: no board of {board.columns}x{board.rows} inner corners in any of {pictures} pictures; {hint}"
-
-
-def _spread(views: Sequence[BoardView], count: int) -> list[BoardView]:
-    """At most so many views whose corners lie as far as can be from one another's."""
-    corners = np.nan_to_num(np.array([view.pixels[[0, -1]].ravel() for view in views]))
-    chosen = [0]
-    distance = np.full(len(views), np.inf)
-    while len(chosen) < min(count, len(views)):
-        distance = np.minimum(distance, np.linalg.norm(corners - corners[chosen[-1]], axis=1))
-        chosen.append(int(distance.argmax()))
-    return [views[index] for index in sorted(set(chosen))]
 
 
 def _fitted(views: list[BoardView], pictures: Pictures, board: Board, args: argparse.Namespace) -> Calibration:

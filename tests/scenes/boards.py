@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.board import Board
 from calib.camera import Array, Mask, OmniCamera
-from calib.rig import MountedCamera
+from calib.rig import MountedCamera, Rig
 from tests.scenes.caster import render_grey
 from tests.scenes.sensor import Exposure, Sensor
 from tests.scenes.surfaces import Rectangle, Scene
@@ -39,11 +39,11 @@ def board_texture(board: Board, dark: float = 25.0, light: float = 225.0) -> NDA
     return np.pad(large, margin, constant_values=light).astype(np.uint8)
 
 
-def board_rectangle(board: Board, T_cam_board: Array, texture: NDArray[np.uint8]) -> Rectangle:
-    """The print as a rectangle in the camera's frame; the board's origin is its first inner corner."""
+def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]) -> Rectangle:
+    """The print as a rectangle in the rig's frame; the board's origin is its first inner corner."""
     edge = (1 + MARGIN_SQUARES) * board.square_m
     width, height = ((side + 1 + 2 * MARGIN_SQUARES) * board.square_m for side in (board.columns, board.rows))
-    origin, right, below = se3.apply(T_cam_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0],
+    origin, right, below = se3.apply(T_rig_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0],
                                                             [-edge, height - edge, 0]]))
     return Rectangle(origin, right - origin, below - origin, texture, "board")
 
@@ -71,7 +71,7 @@ def board_pose(ray: Array, distance_m: float, tilt_rad: Array, board: Board) -> 
 
 @dataclass(frozen=True)
 class Studio:
-    """A camera with its mask, and a board; the camera's rays are cast once for all its pictures."""
+    """A camera with its mask on a rig, and a board; its rays are cast once for all its pictures."""
 
     board: Board
     mounted: MountedCamera
@@ -81,15 +81,16 @@ class Studio:
         """The studio of a camera that stands in the origin."""
         return Studio(board, MountedCamera(camera, np.eye(4), mask))
 
-    def photograph(self, T_cam_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
+    def photograph(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
                    contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0) -> Shot:
         """The picture taken of the board among noisy walls; shadow: what part of the board is darkened to."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
         texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
-        scene = Scene((board_rectangle(self.board, T_cam_board, texture.astype(np.uint8)), *clutter(rng)))
+        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *clutter(rng)))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
         exposure = Exposure.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
+        T_cam_board = self.mounted.T_cam_rig @ T_rig_board
         corners = self.mounted.camera.project(se3.apply(T_cam_board, self.board.points))
         return Shot(exposure.expose(ideal, rng), corners, T_cam_board)
 
@@ -120,3 +121,21 @@ def around(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: in
     raise AssertionError(f"only {len(poses)} of {count} boards fit into the view")
 
 
+def around_both(rig: Rig, board: Board, count: int, *, seed: int = 0, distance_m: tuple[float, float] = (0.25, 0.5),
+                elevation_deg: Sequence[float] = (50.0, 110.0)) -> list[Array]:
+    """Poses T_rig_board of boards all around a rig that stands in its lower camera, wholly in view of both."""
+    poses: list[Array] = []
+    for turn in range(20 * count):
+        tried = around(rig.lower.camera, board, rig.lower.visible, 1, seed=100 * seed + turn, distance_m=distance_m,
+                       elevation_deg=elevation_deg)[0]
+        T = _about_axis(2 * np.pi * len(poses) / count) @ tried
+        if all(in_view(m.camera, m.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig) @ T, board, m.visible)
+               for m in (rig.lower, rig.upper)):
+            poses.append(se3.inverse(rig.lower.T_cam_rig) @ T)
+        if len(poses) == count:
+            return poses
+    raise AssertionError(f"only {len(poses)} of {count} boards fit into both views")
+
+
+def _about_axis(angle_rad: float) -> Array:
+    return se3.transform(se3.rotation_exp([0.0, 0.0, angle_rad]), np.zeros(3))

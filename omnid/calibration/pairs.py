@@ -1,0 +1,97 @@
+"""The pictures of two cameras, by instant: lower_*, upper_* of a folder, or the pairs of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.errors import BrokenFrame
+from drivers.frame import Frame, gray
+from drivers.mcap_reader import LogReader
+from omnid.calibration.pictures import SUFFIXES, Image, Pictures, one_size, read_pictures
+from omnid.config import Config
+from omnid.errors import OmnidError
+
+SIDES = ("lower", "upper")
+# So many pairs of a log are looked at, evenly spread.
+LOG_PAIRS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class PairedPictures:
+    """Pictures of the lower and the upper camera by the name of the instant; some are of one camera only."""
+
+    sides: tuple[Pictures, Pictures]
+    topics: tuple[str, str] = ("", "")
+
+    @property
+    def names(self) -> list[str]:
+        """All instants, in their order."""
+        return sorted({**self.sides[0], **self.sides[1]})
+
+
+def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedPictures:
+    """The pictures in a folder or a log; lower and upper name a log's topics. OmnidError where no two make a pair."""
+    is_log = source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
+    if not is_log and (lower or upper):
+        raise OmnidError(f"{source}: only a log has topics; found a folder of pictures")
+    pairs = _of_log(source, lower, upper) if is_log else _of_folder(source)
+    if not pairs.sides[0].keys() & pairs.sides[1].keys():
+        raise OmnidError(f"{source}: no two pictures of one instant: {_counted(pairs)}; a folder has to hold pairs "
+                         "like lower_001.png and upper_001.png, a log pictures with nearly equal stamps")
+    return pairs
+
+
+def _counted(pairs: PairedPictures) -> str:
+    return ", ".join(f"{len(side)} of the {name} camera" for name, side in zip(SIDES, pairs.sides, strict=True))
+
+
+def _of_folder(folder: Path) -> PairedPictures:
+    if not folder.is_dir():
+        raise OmnidError(f"{folder}: expected a log (.mcap) or a folder with pictures lower_*, upper_*; found "
+                         f"{'a file' if folder.exists() else 'nothing'}")
+    lower, upper = (_of_side(folder, side) for side in SIDES)
+    return PairedPictures((lower, upper))
+
+
+def _of_side(folder: Path, side: str) -> Pictures:
+    paths = sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise OmnidError(f"{folder}: no pictures {side}_* in this folder; name them lower_001.png, upper_001.png ...")
+    found = read_pictures([str(path) for path in paths])
+    return {Path(name).stem.removeprefix(f"{side}_"): image for name, image in found.items()}
+
+
+def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedPictures:
+    reader = LogReader(log, lower, upper)
+    try:
+        stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
+        pairs = [_decoded(pair) for number, pair in enumerate(paired(reader.frames())) if number % stride == 0]
+        topics = reader.topics
+    finally:
+        reader.close()
+    named = {f"pair{number * stride:05d}": pair for number, pair in enumerate(pairs) if pair}
+    sides = [{name: pair[side] for name, pair in named.items()} for side in (0, 1)]
+    for pictures in sides:
+        one_size(pictures)
+    return PairedPictures((sides[0], sides[1]), (topics["lower"], topics["upper"]))
+
+
+def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:
+    try:
+        return gray(pair[0]), gray(pair[1])
+    except BrokenFrame:
+        return None
+
+
+def paired(frames: Iterator[Frame]) -> Iterator[tuple[Frame, Frame]]:
+    """The lower and upper frames of one instant, out of frames in the order of their stamps; nothing is decoded."""
+    tolerance_ns = round(Config().pair.tolerance_ms * 1e6)
+    waiting: Frame | None = None
+    for frame in frames:
+        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= tolerance_ns:
+            yield (waiting, frame) if frame.camera == "upper" else (frame, waiting)
+            waiting = None
+        else:
+            waiting = frame

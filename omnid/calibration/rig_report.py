@@ -1,0 +1,90 @@
+"""The report of a rig's calibration: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+from html import escape
+
+import cv2
+import numpy as np
+
+from calib import se3
+from calib.errors import CalibError
+from calib.panorama import fit_cylinder, remap_tables
+from calib.rig import Rig
+from calib.rig_fit import MOTION_NAMES, RigCalibration
+from omnid.calibration.drawings import ARROW, Image, residual_picture
+from omnid.calibration.pairs import SIDES, PairedPictures
+from omnid.calibration.report import figure, page, table
+
+MAX_SHOWN_VIEWS = 20
+LINES = 24  # columns drawn through both panoramas
+PANORAMA_WIDTH = 1400
+
+
+def rig_report_html(found: RigCalibration, pictures: PairedPictures, rig: Rig) -> str:
+    """The whole page."""
+    parts = [_head(found), "<h2>Between the cameras</h2>", _motion(found)]
+    for name, rows in zip(SIDES, found.parameters, strict=True):
+        told = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in rows]
+        parts += [f"<h2>The {name} camera</h2>", table(("parameter", "value", "standard deviation"), told) if told
+                  else "<p>Taken as it was given.</p>"]
+    parts += ["<h2>Error by instant</h2>", _views(found), "<h2>Rectified</h2>", *_rectified(found, pictures, rig),
+              "<h2>Residuals</h2>", *_residuals(found, pictures)]
+    return page("Rig calibration", parts)
+
+
+def _head(found: RigCalibration) -> str:
+    left_out = "".join(f"<p class='warn'>left out {escape(bad.name)}: {escape(bad.reason)}</p>"
+                       for bad in found.rejected)
+    return (f"<h1>Rig calibration</h1><p>{found.pairs} pairs, {len(found.views) - found.pairs} views of one camera. "
+            f"<b>Baseline {found.baseline_m * 1e3:.2f} mm</b>, deviation {found.baseline_sigma_m * 1e3:.2f} mm. Mean "
+            f"reprojection error {found.fit.mean_px:.3f} px.</p>{left_out}")
+
+
+def _motion(found: RigCalibration) -> str:
+    """T_upper_lower in millimetres and degrees."""
+    turn = se3.rotation_log(found.T_upper_lower[:3, :3])
+    values = np.concatenate([found.T_upper_lower[:3, 3] * 1e3, np.rad2deg(turn)])
+    sigmas = np.concatenate([found.motion_sigma[:3] * 1e3, np.rad2deg(found.motion_sigma[3:])])
+    units = ["mm"] * 3 + ["deg"] * 3
+    return table(("T_upper_lower", "value", "standard deviation"),
+                 [(name, f"{value:.4f} {unit}", f"{sigma:.4f}")
+                  for name, value, sigma, unit in zip(MOTION_NAMES, values, sigmas, units, strict=True)])
+
+
+def _views(found: RigCalibration) -> str:
+    lower, upper = (found.side_errors_px(side) for side in (0, 1))
+    return table(("instant", "lower [px]", "upper [px]"),
+                 [(escape(view.name), _number(a), _number(b))
+                  for view, a, b in zip(found.views, lower, upper, strict=True)])
+
+
+def _number(error: float) -> str:
+    return f"{error:.3f}" if np.isfinite(error) else "not seen"
+
+
+def _rectified(found: RigCalibration, pictures: PairedPictures, rig: Rig) -> list[str]:
+    """Both panoramas of one instant, one above the other: what lies on a line above lies on it below."""
+    name = next(view.name for view in found.views if None not in view.seen)
+    try:
+        cylinder = fit_cylinder(rig, PANORAMA_WIDTH)
+    except CalibError as error:
+        return [f"<p class='warn'>{escape(str(error))}</p>"]
+    rows = [cv2.remap(side[name], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
+            for side, mounted in zip(reversed(pictures.sides), (rig.upper, rig.lower), strict=True)]
+    canvas = np.asarray(cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR), np.uint8)
+    for column in range(PANORAMA_WIDTH // (2 * LINES), PANORAMA_WIDTH, PANORAMA_WIDTH // LINES):
+        canvas[:, column] = (80, 200, 0)
+    return [figure(canvas, f"{name}: the upper panorama above the lower one; everything is on the same line in both")]
+
+
+def _residuals(found: RigCalibration, pictures: PairedPictures) -> list[str]:
+    shown = []
+    for k, view in enumerate(found.views[:MAX_SHOWN_VIEWS]):
+        for side, seen in enumerate(view.seen):
+            if seen is not None:
+                image: Image = pictures.sides[side][view.name]
+                residuals = np.split(found.fit.residuals[k], 2)[side]
+                shown.append(figure(residual_picture(image, seen.pixels, residuals),
+                                    f"{SIDES[side]}, {view.name}: arrows {ARROW:.0f} times as long"))
+    return shown

@@ -1,0 +1,224 @@
+"""`omnid calibrate rig`: from rendered pairs of pictures to rig.toml and report; bad input is one clear line."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from calib import se3
+from calib.board import Board
+from calib.camera import Array, Mask
+from calib.camera_file import CameraFile, camera_toml
+from calib.rig import MountedCamera, Rig
+from calib.rig_file import read_rig
+from calib.unified import UnifiedCamera
+from drivers.mcap_writer import LogWriter
+from omnid.cli import main
+from tests.scenes.boards import Studio, around_both
+from tests.scenes.sensor import Sensor
+
+BOARD = Board(7, 6, 0.03)
+T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])
+PAIRS = 7
+
+
+def rig_of(size: int) -> Rig:
+    """A rig whose upper camera is turned about every axis, with pictures of size x size."""
+    scale, mounted = size / 768, []
+    for xi, focal, center, T in ((0.93, (-205.0, 206.2), (384.2, 380.9), np.eye(4)),
+                                 (0.97, (-208.0, 207.2), (381.2, 385.9), T_UPPER_LOWER)):
+        u, v = center[0] * scale, center[1] * scale
+        camera = UnifiedCamera(xi, (focal[0] * scale, focal[1] * scale), (u, v), (size, size))
+        mounted.append(MountedCamera(camera, T, Mask((u, v), 50 * scale, 372 * scale)))
+    return Rig(mounted[0], mounted[1])
+
+
+TRUTH = rig_of(480)
+LOWER, UPPER = TRUTH.lower.camera, TRUTH.upper.camera
+
+
+def photographed(rig: Rig, folder: Path, count: int) -> Path:
+    """Pairs of pictures of a board, all around, and the cameras' files."""
+    studios = {"lower": Studio(BOARD, rig.lower), "upper": Studio(BOARD, rig.upper)}
+    for seed, T in enumerate(around_both(rig, BOARD, count, distance_m=(0.2, 0.42))):
+        for name, studio in studios.items():
+            shot = studio.photograph(T, seed=seed, sensor=Sensor(noise_sigma=1.0))
+            cv2.imwrite(str(folder / f"{name}_{seed:02d}.png"), shot.picture)
+    for name, mounted in (("lower", rig.lower), ("upper", rig.upper)):
+        (folder / f"{name}.toml").write_text(camera_toml(CameraFile(mounted.camera, mounted.mask)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven pairs of small pictures."""
+    return photographed(TRUTH, tmp_path_factory.mktemp("pairs"), PAIRS)
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixteen pairs of larger ones."""
+    return photographed(rig_of(640), tmp_path_factory.mktemp("many"), 16)
+
+
+def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
+    return main(["calibrate", "rig", *map(str, words), "--corners", corners, "--square-mm", str(square_mm), "--quiet"])
+
+
+@pytest.fixture(scope="module")
+def five(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first five pairs."""
+    made = tmp_path_factory.mktemp("five")
+    for path in folder.glob("*_0[0-4].png"):
+        shutil.copy(path, made)
+    return made
+
+
+def given(folder: Path) -> list[object]:
+    return ["--lower-camera", folder / "lower.toml", "--upper-camera", folder / "upper.toml"]
+
+
+def between(rig: Rig) -> Array:
+    return np.asarray(rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig))
+
+
+def turn_off_deg(rig: Rig) -> float:
+    gap = se3.inverse(T_UPPER_LOWER) @ between(rig)
+    return float(np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))))
+
+
+@pytest.mark.slow
+def test_pictures_alone_give_cameras_and_rig_as_they_are(many: Path, tmp_path: Path,
+                                                         capsys: pytest.CaptureFixture[str]) -> None:
+    out, report = tmp_path / "rig.toml", tmp_path / "report.html"
+    assert run(many, "-o", out, "--model", "omni", "--report", report, "--expected-baseline-mm", "180") == 0
+    said = capsys.readouterr()
+    assert said.out.count("\n") == 1 and "16 pairs" in said.out and said.err == ""
+    found = read_rig(out)
+    assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
+    for mounted, truth in ((found.lower, rig_of(640).lower.camera), (found.upper, rig_of(640).upper.camera)):
+        assert isinstance(mounted.camera, UnifiedCamera) and isinstance(truth, UnifiedCamera)
+        assert mounted.camera.center == pytest.approx(truth.center, abs=0.1)
+        assert mounted.camera.focal == pytest.approx(truth.focal, rel=5e-4)
+        assert mounted.mask is not None and mounted.mask.outer_px == pytest.approx(310, abs=3)
+    page = report.read_text()
+    assert page.count("data:image/jpeg;base64,") == 1 + 2 * 16 and "Baseline 180" in page and "r_x" in page
+
+
+@pytest.mark.slow
+def test_the_polynomial_model_gives_the_same_rig(many: Path, tmp_path: Path) -> None:
+    assert run(many, "-o", tmp_path / "rig.toml", "--mask") == 0
+    found = read_rig(tmp_path / "rig.toml")
+    assert found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
+    T_omni_ocam = se3.transform(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))  # x down, not against u
+    gap = se3.inverse(T_UPPER_LOWER) @ T_omni_ocam @ between(found) @ se3.inverse(T_omni_ocam)
+    assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
+    assert found.lower.mask is not None and found.lower.mask.image is not None
+    assert (tmp_path / "rig.lower.png").exists()
+
+
+def test_cameras_that_are_given_are_taken_as_they_are(folder: Path, tmp_path: Path) -> None:
+    assert run(folder, "-o", tmp_path / "rig.toml", *given(folder)) == 0
+    found = read_rig(tmp_path / "rig.toml")
+    assert found.lower.camera == LOWER and found.upper.camera == UPPER and found.lower.mask == TRUTH.lower.mask
+    assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
+
+
+def log_of(folder: Path, path: Path) -> None:
+    """The pairs as PNG messages, the upper camera 2 ms late, with a lone picture between."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds, schema = store.types, "sensor_msgs/msg/CompressedImage"
+    with LogWriter(path) as writer:
+        for k in range(PAIRS):
+            for name, late_ns in (("lower", 0), ("upper", 2_000_000), ("upper", 50_000_000))[:2 + (k == 3)]:
+                data = np.frombuffer((folder / f"{name}_{k:02d}.png").read_bytes(), np.uint8)
+                header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](k + 1, late_ns), name)
+                cdr = store.serialize_cdr(kinds[schema](header, "png", data), schema)
+                writer.write(f"/{name}/image", schema, bytes(cdr), (k + 1) * 10**9 + late_ns)
+
+
+def test_a_log_is_paired_by_its_stamps(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log_of(folder, tmp_path / "log.mcap")
+    assert run(tmp_path / "log.mcap", "-o", tmp_path / "rig.toml", *given(folder)) == 0
+    assert re.search(r"[67] pairs\n", capsys.readouterr().out)
+    found = read_rig(tmp_path / "rig.toml")
+    assert found.topics == ("/lower/image", "/upper/image") and turn_off_deg(found) < 0.02
+
+
+def bad(folder: Path, made: Path, kind: str) -> list[object]:
+    """Words that name bad input: a folder of three pairs, spoilt."""
+    blank = np.full((480, 480), 90, np.uint8)
+    for name in ("lower", "upper"):
+        for k in range(3):
+            shutil.copy(folder / f"{name}_{k:02d}.png", made)
+    match kind:
+        case "blank":
+            for path in made.glob("upper_*"):
+                cv2.imwrite(str(path), blank)
+        case "sizes":
+            cv2.imwrite(str(made / "upper_09.png"), blank[:300])
+        case "text":
+            (made / "lower_09.png").write_text("no picture")
+        case "one side":
+            for path in made.glob("upper_*"):
+                path.unlink()
+        case "unpaired":
+            for path in made.glob("upper_*"):
+                path.rename(made / path.name.replace("_0", "_1"))
+        case "missing":
+            return [made / "none"]
+        case "size of camera":
+            text = (folder / "lower.toml").read_text().replace("size = [480, 480]", "size = [640, 480]")
+            (made / "lower.toml").write_text(text)
+            return [made, "--lower-camera", made / "lower.toml", "--upper-camera", folder / "upper.toml"]
+        case "one camera":
+            return [made, "--lower-camera", folder / "lower.toml"]
+        case "topic":
+            return [made, "--lower", "/x"]
+    return [made]
+
+
+@pytest.mark.parametrize(("kind", "says"), [
+    ("three", "needs 4 views of the board at least, found 3"),
+    ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 pictures"),
+    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected a picture"),
+    ("one side", "no pictures upper_*"), ("unpaired", "no two pictures of one instant: 3 of the lower camera, 3 of"),
+    ("missing", "found nothing"), ("one camera", "expected both --lower-camera and --upper-camera"),
+    ("size of camera", "--lower-camera: it is of 640x480 px, the lower pictures are 480x480"),
+    ("topic", "only a log has topics"),
+])
+def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*bad(folder, tmp_path, kind), "-o", tmp_path / "rig.toml") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line and not (tmp_path / "rig.toml").exists()
+
+
+@pytest.mark.parametrize(("square_mm", "words", "says"), [
+    (25, ["--expected-baseline-mm", "180"], "with squares of 29.97 mm it would be so"),
+    (0.3, [], "a baseline of 1.802 mm came out, expected 10 to 3000 mm"),
+    (3000, [], "a baseline of 1.802e+04 mm came out"), (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
+    (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),
+])
+def test_a_wrong_square_is_told_by_the_baseline(folder: Path, five: Path, tmp_path: Path, square_mm: float,
+                                                words: list[str], says: str,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rig.toml"
+    assert run(five, "-o", out, *given(folder), *words, square_mm=square_mm) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line and not out.exists()
+
+
+def test_the_wrong_count_is_told_the_right_one(folder: Path, five: Path, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    for path in five.glob("*_0[0-4].png"):
+        if path.name.endswith(("_00.png", "_01.png")):
+            shutil.copy(path, tmp_path)
+    assert run(tmp_path, "-o", tmp_path / "rig.toml", *given(folder), corners="8x5") == 2
+    assert "try --corners 6x7" in capsys.readouterr().err
