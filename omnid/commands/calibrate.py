@@ -1,4 +1,4 @@
-"""`omnid calibrate`: cameras from pictures of a board; a rig from Kalibr or OCamCalib files, and back."""
+"""`omnid calibrate`: cameras and rigs from pictures of a board, checks of a rig; Kalibr and OCamCalib files in and out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
-from omnid.commands import calibrate_camera, calibrate_rig
+from omnid.commands import calibrate_camera, calibrate_check, calibrate_rig
 from omnid.errors import OmnidError
 from omnid.outputs.files import check_outputs
 
@@ -24,9 +24,10 @@ from omnid.outputs.files import check_outputs
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `calibrate` to the command line."""
     parser = subparsers.add_parser("calibrate", help="make a camera.toml or a rig.toml, or other programs' files")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="camera|rig|import|export")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="camera|rig|check|import|export")
     calibrate_camera.add_parser(actions)
     calibrate_rig.add_parser(actions)
+    calibrate_check.add_parser(actions)
     importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, or from two OCamCalib files")
     exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
     _add_import(importing)

@@ -1,0 +1,80 @@
+"""Some pairs of a log's pictures, and what they say of a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.rig import Rig
+from calib.rim_check import RimShift, rim_shift
+from drivers.errors import DriverError
+from drivers.mcap_reader import LogReader
+from omnid.calibration.pairs import SIDES, paired
+from omnid.config import PanoramaConfig
+from omnid.core.rig_check import RigCheck, RigFinding
+from omnid.errors import OmnidError
+from omnid.messages import FramePair
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import geometry
+from omnid.stages.pair import Decoder
+
+PAIRS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """What some pairs say: the columns, and the rims of the lower and the upper mirror where they can be told."""
+
+    finding: RigFinding
+    rims: tuple[RimShift | None, RimShift | None]
+
+    @property
+    def good(self) -> bool:
+        """Whether the rig can be trusted."""
+        return self.finding.verdict == "good" and all(rim is None or rim.fits for rim in self.rims)
+
+
+def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:
+    """The log's two cameras: by the topics asked for, by the rig's where the log has them, or by their names."""
+    named = [asked or known or None for asked, known in zip(topics, rig.topics if rig else ("", ""), strict=True)]
+    if rig and not any(topics):
+        with suppress(DriverError):
+            return LogReader(log, *named)
+    return LogReader(log, *topics)
+
+
+def read_pairs_of(reader: LogReader, rig: Rig) -> list[FramePair]:
+    """PAIRS pairs at most, evenly spread over the log; OmnidError where there are none of the rig's size."""
+    stride = max(1, (sum(1 for _ in paired(reader.frames())) - 1) // PAIRS + 1)
+    decode, found = Decoder(rig), list[FramePair]()
+    for number, (lower, upper) in enumerate(paired(reader.frames())):
+        if number % stride:
+            continue
+        pictures = decode(lower), decode(upper)
+        if pictures[0] is not None and pictures[1] is not None:
+            found.append(FramePair(number, lower.stamp_ns, pictures[0], pictures[1]))
+    if not found:
+        raise OmnidError("calibrate check: no pair of pictures in the log; "
+                         f"{decode.fault or 'the stamps of both cameras must agree'}")
+    return found
+
+
+def look(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> Looked:
+    """What the pairs say of a rig."""
+    place = geometry(rig, config)
+    dewarp, check = Dewarp(place, config), RigCheck(place.cylinder, len(pairs))
+    for pair in pairs:
+        panoramas = dewarp.process(pair)
+        check.add(panoramas.lower, panoramas.upper, panoramas.visible)
+    rims = tuple(rim_shift(_brightest([getattr(pair, side) for pair in pairs]), mounted.mask)
+                 for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True))
+    return Looked(check.finding(), (rims[0], rims[1]))
+
+
+def _brightest(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    return np.asarray(np.max(np.stack(pictures), axis=0), np.uint8)

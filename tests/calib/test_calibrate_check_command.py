@@ -1,0 +1,123 @@
+"""`omnid calibrate check` on rendered logs: a good rig is called good, a wrong one found out and put right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.camera import Mask
+from calib.rig import Rig
+from calib.rig_file import read_rig, write_rig
+from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
+from omnid.cli import main
+from omnid.config import PanoramaConfig
+from omnid.messages import FramePair
+
+Turn = tuple[float, float, float]
+
+
+def misturned(rig: Rig, turn_deg: Turn) -> Rig:
+    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
+    R = rig.T_rect_rig[:3, :3]
+    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
+    back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
+    T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
+    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
+
+
+@pytest.fixture(scope="module")
+def pairs(scene: Path) -> list[FramePair]:
+    rig = read_rig(scene / "rig.toml")
+    return read_pairs_of(open_log(scene / "log.mcap", (None, None), rig), rig)
+
+
+def looked(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> Looked:
+    return look(pairs, misturned(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
+
+
+def test_a_good_rig_is_called_good(scene: Path, pairs: list[FramePair]) -> None:
+    found = looked(scene, pairs, (0, 0, 0))
+    assert found.good and found.finding.verdict == "good" and found.finding.turn_deg < 0.05
+    assert abs(found.finding.offset_px) < 0.03 and found.finding.left_px < 0.15 and None not in found.rims
+
+
+@pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0, 0, -0.5)])
+def test_half_a_degree_is_found_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
+    found = looked(scene, pairs, turn_deg).finding
+    assert found.verdict == "drifted" and found.drift is not None
+    assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05)
+
+
+def test_a_turn_about_the_vertical_shows_all_around_and_a_tilt_as_a_wave(scene: Path, pairs: list[FramePair]) -> None:
+    turned, tilted = (looked(scene, pairs, turn).finding for turn in ((0.0, 0.0, 2.0), (0.0, 2.0, 0.0)))
+    medians = [np.array([median for _, median, count in found.by_azimuth if count > 10]) for found in (turned, tilted)]
+    assert medians[0].min() > 1.5 and np.ptp(medians[0]) < 0.5
+    assert medians[1].min() < -0.2 and medians[1].max() > 0.2
+
+
+def test_what_is_far_off_is_broken(scene: Path, pairs: list[FramePair]) -> None:
+    assert looked(scene, pairs, (0, 3.0, 0)).finding.verdict == "broken"
+    exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
+    assert not looked(scene, exchanged, (0, 0, 0)).good
+
+
+def run(*words: object) -> int:
+    return main(["calibrate", "check", *map(str, words)])
+
+
+def test_the_command_says_so_and_puts_it_right(scene: Path, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    log, wrong, right = scene / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
+    truth = read_rig(scene / "rig.toml")
+    write_rig(wrong, misturned(truth, (0.6, -0.4, 1.5)))
+    assert run(log, "--rig", scene / "rig.toml") == 0
+    assert capsys.readouterr().out.startswith("good: ")
+    assert run(log, "--rig", wrong, "--refine", "-o", right) == 1
+    said = capsys.readouterr().out
+    assert said.startswith("drifted: ") and "turned by 1.6" in said and "about z" in said and "lower rim: " in said
+    assert "not to be known without a board: the baseline's length" in said
+    again = read_rig(right)
+    gap = again.upper.T_cam_rig @ se3.inverse(truth.upper.T_cam_rig)
+    assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
+    assert again.baseline_m == pytest.approx(truth.baseline_m, abs=1e-9)
+    assert run(log, "--rig", right) == 0
+
+
+def test_a_mask_beyond_the_rim_is_told(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = read_rig(scene / "rig.toml")
+    assert rig.lower.mask is not None
+    u, v = rig.lower.mask.center
+    write_rig(tmp_path / "rig.toml", replace(rig, lower=replace(rig.lower, mask=Mask((u + 9, v), 0.0,
+                                                                                   rig.lower.mask.outer_px))))
+    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
+    said = capsys.readouterr().out
+    assert said.startswith("drifted: ") and "lower rim: centre moved by -9.0" in said and "upper rim" in said
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    ([], "no rig.toml is attached to the log"), (["--rig", "none.toml"], "none.toml: cannot be read"),
+    (["--refine"], "--refine and -o go together"), (["-o", "rig.toml"], "--refine and -o go together"),
+    (["--lower", "/x"], "no topic '/x'"),
+])
+def test_bad_input_is_one_line(scene: Path, words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scene / "log.mcap", *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+
+
+def test_pictures_of_another_size_are_one_line(scene: Path, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    text = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
+    (tmp_path / "rig.toml").write_text(text)
+    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 2
+    assert "pictures are 256x256 px, the rig's are 300x256" in capsys.readouterr().err
+
+
+def test_a_dark_log_tells_nothing(scene: Path, pairs: list[FramePair]) -> None:
+    dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
+    found = looked(scene, dark, (0, 0, 0))
+    assert found.finding.verdict == "unknown" and found.rims == (None, None)

@@ -1,0 +1,89 @@
+"""The drift of a rig from rays: found about every axis, past false matches, honest, and undone in the rig."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.camera import Array, Mask
+from calib.rig import Rig
+from calib.rig_drift import corrected, find_drift
+from calib.rim_check import rim_shift
+
+
+def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
+    """Rays to points (rig frame) as the true rig sees them, in the rectified frame that another rig makes of them."""
+    found = []
+    for true, wrong in ((rig.lower, assumed.lower), (rig.upper, assumed.upper)):
+        seen = se3.apply(true.T_cam_rig, points)
+        found.append(seen @ wrong.T_cam_rig[:3, :3] @ assumed.T_rect_rig[:3, :3].T)
+    return found[0], found[1]
+
+
+def misturned(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
+    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
+    R = rig.T_rect_rig[:3, :3]
+    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
+    back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
+    T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
+    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
+
+
+@pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (-3.0, 2.0, 5.0), (0, 0, 0)])
+def test_a_turn_is_found_about_every_axis_and_undone(rig: Rig, around: Array,
+                                                     turn_deg: tuple[float, float, float]) -> None:
+    wrong = misturned(rig, turn_deg)
+    drift = find_drift(*rays(rig, around, wrong))
+    assert drift is not None
+    assert np.rad2deg(drift.turn) == pytest.approx(turn_deg, abs=1e-5)
+    assert np.abs(drift.shift).max() < 1e-6 and np.abs(drift.residuals).max() < 1e-7
+    again = corrected(wrong, drift)
+    np.testing.assert_allclose(again.upper.T_cam_rig, rig.upper.T_cam_rig, atol=1e-6)
+    assert again.lower is wrong.lower and again.topics == rig.topics
+
+
+def test_a_viewpoint_aside_is_told_from_a_tilt(rig: Rig, around: Array) -> None:
+    R = rig.T_rect_rig[:3, :3]
+    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
+    T_rig_upper[:3, 3] -= R.T @ np.array([0.02, -0.01, 0.0]) * rig.baseline_m
+    wrong = replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T_rig_upper)))
+    drift = find_drift(*rays(rig, around, wrong))
+    assert drift is not None
+    again = corrected(wrong, drift)
+    T_true, T_found = (r.lower.T_cam_rig @ se3.inverse(r.upper.T_cam_rig) for r in (rig, again))
+    assert np.rad2deg(np.linalg.norm(se3.rotation_log(T_true[:3, :3].T @ T_found[:3, :3]))) < 0.01
+    along = [T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (T_true, T_found)]
+    assert np.linalg.norm(along[0] - along[1]) < 2e-4
+
+
+def test_false_matches_hardly_move_it_and_deviations_are_honest(rig: Rig, around: Array) -> None:
+    wrong, misses = misturned(rig, (0.3, -0.2, 0.4)), []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        lower, upper = rays(rig, around, wrong)
+        upper = upper / np.linalg.norm(upper, axis=1, keepdims=True) + 2e-3 * rng.standard_normal(upper.shape)
+        upper[:60] += 0.1 * rng.standard_normal((60, 3))
+        drift = find_drift(lower, upper)
+        assert drift is not None
+        misses.append((np.rad2deg(drift.turn) - (0.3, -0.2, 0.4)) / np.rad2deg(drift.turn_sigma))
+    assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.5
+
+
+def test_few_points_tell_nothing(rig: Rig, around: Array) -> None:
+    assert find_drift(*rays(rig, around[:29], rig)) is None
+
+
+@pytest.mark.parametrize(("moved", "radius", "fits"), [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False),
+                                                      ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)])
+def test_a_rim_that_has_moved_is_told(moved: tuple[float, float], radius: float, fits: bool) -> None:
+    v, u = np.indices((260, 260))
+    center = (130.0 + moved[0], 128.0 + moved[1])
+    grey = np.random.default_rng(0).integers(120, 200, (260, 260))
+    picture = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
+    shift = rim_shift(picture, Mask((130.0, 128.0), 0.0, 100.0))
+    assert shift is not None and shift.fits == fits
+    assert shift.moved_px == pytest.approx(moved, abs=0.5) and shift.wider_px == pytest.approx(radius - 100, abs=2.5)
+    assert rim_shift(picture, None) is None and rim_shift(np.zeros_like(picture), Mask((130.0, 128.0), 0, 100)) is None
