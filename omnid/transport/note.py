@@ -23,9 +23,12 @@ class Note:
     sent_ns: int = 0  # of Unix time, when it was handed to the network
 
 
+_USUAL: Final = asdict(Note())
+
+
 def note_bytes(note: Note) -> bytes:
     """The note as it travels."""
-    return json.dumps(asdict(note), separators=(",", ":")).encode()
+    return json.dumps({name: getattr(note, name) for name in _USUAL}, separators=(",", ":")).encode()
 
 
 def note_from_bytes(data: bytes) -> Note:
@@ -36,5 +39,5 @@ def note_from_bytes(data: bytes) -> Note:
         found = None
     if not isinstance(found, dict):
         raise OmnidError(f"{len(data)} bytes beside a pose are no note in JSON; is it omnid that sends there?")
-    known = {name: found[name] for name, usual in asdict(Note()).items() if type(found.get(name)) is type(usual)}
+    known = {name: found[name] for name, usual in _USUAL.items() if type(found.get(name)) is type(usual)}
     return Note(**known)

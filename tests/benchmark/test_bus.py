@@ -86,7 +86,10 @@ def odometry(seq: int) -> Odometry:
 
 
 def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:
-    """The cost of each pose with all that is said of it; every sink says one each 1 / RATE_HZ."""
+    """The cost of each pose with all that is said of it, every sink's each 1 / RATE_HZ.
+
+    This process sleeps in between, so its caches are cold: for the daemon itself see the table of its stages.
+    """
     cost = Histogram()
     next_s = time.monotonic()
     for seq in range(first, first + count):
@@ -120,7 +123,7 @@ def test_latency_and_cost(way: str) -> None:
         found = told(listener)
     print(f"\n{way}: one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms, {found['came']:.0f} of 300 "
           f"came; publishing a frame p50 {1e3 * cost.p(0.5):.2f} ms, p99 {1e3 * cost.p(0.99):.2f} ms")
-    assert found["newest"] == 329 and found["missed"] == 0 and cost.p(0.5) < 1e-3
+    assert found["newest"] == 329 and found["missed"] == 0
 
 
 def test_a_router_is_back_within_five_seconds() -> None:
@@ -166,16 +169,19 @@ def test_a_slow_subscriber_slows_nobody_else(scene: Path) -> None:
              "--set", f"bus.listen=['{endpoint}']", "--set", "bus.panorama_hz=10", "--set", "live.cloud_s=0.5"]
     with subprocess.Popen(words, stderr=subprocess.DEVNULL) as daemon:
         try:
-            with Robot(connect=(endpoint,), patience_s=30.0) as robot:
+            with Robot(connect=(endpoint,), patience_s=30.0) as robot, robot.subscribe(Report) as reports:
                 rates = {"alone": measured(robot)}
                 with script(SLOW, endpoint):
                     rates["with a slow subscriber"] = measured(robot)
+                last = full(reports)
         finally:
             daemon.terminate()
+    cost_ms = [float(last.value("omnid: stage bus", f"work_{which}_ms")) for which in ("p50", "p99")]
     for name, (rate_hz, p50_ms, p99_ms) in rates.items():
         print(f"\n{name}: {rate_hz:.1f} poses/s, capture to network p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms")
+    print(f"the bus's own stage: p50 {cost_ms[0]:.2f} ms, p99 {cost_ms[1]:.2f} ms a message")
     alone, slow = rates.values()
-    assert slow[0] > 0.8 * alone[0]
+    assert slow[0] > 0.8 * alone[0] and cost_ms[0] < 1.0
 
 
 def measured(robot: Robot) -> tuple[float, float, float]:
