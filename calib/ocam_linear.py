@@ -5,6 +5,7 @@ Works in the toolbox's frame: x down the rows, y along the columns, rays (x, y, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,26 +120,36 @@ def _third_row(R: Array) -> Array:
 
 def _signs(rho: Array, across: Array, height: Array, scale_px: float) -> Array:
     """Which sign (K,) of (r31, r32) gives each picture a parabola f with a0 < 0: negating all of f fits as well."""
-    signs = np.ones(len(rho))
-    for k in range(len(rho)):
-        basis = (rho[k, :, None] / scale_px) ** powers(2)
-        parabola, _ = _polynomial(rho[k:k + 1], across[k:k + 1], height[k:k + 1], basis[None])
-        signs[k] = -1.0 if parabola[0] > 0 else 1.0
-    return signs
+    A, b, _ = _without_shifts(rho, across, height, (rho[..., None] / scale_px) ** powers(2))
+    parabolas = np.linalg.pinv(A) @ b[..., None]
+    return np.where(parabolas[:, 0, 0] > 0, -1.0, 1.0)
 
 
 def _polynomial(rho: Array, across: Array, height: Array, basis: Array) -> tuple[Array, Array]:
     """Coefficients (D,) and t3 (K,) of f(rho) * across = rho * (height + t3), least squares: eq. (15) to (18)."""
-    K, N, D = basis.shape
-    weight = 1 / np.maximum(across, 1e-9)
-    A = np.zeros((K, N, D + K))
-    A[..., :D] = basis * across[..., None]
-    A[np.arange(K), :, D + np.arange(K)] = -rho
-    known = np.isfinite(rho)
-    A, b = (A * weight[..., None])[known], (rho * height * weight)[known]
-    size = np.linalg.norm(A, axis=0)
-    solved = np.linalg.lstsq(A / size, b, rcond=None)[0] / size
-    return solved[:D], solved[D:]
+    A, b, shifts = _without_shifts(rho, across, height, basis)
+    flat = A.reshape(-1, A.shape[-1])
+    size = np.linalg.norm(flat, axis=0)
+    coefficients = np.linalg.lstsq(flat / size, b.ravel(), rcond=None)[0] / size
+    return coefficients, shifts(coefficients)
+
+
+def _without_shifts(rho: Array, across: Array, height: Array, basis: Array
+                    ) -> tuple[Array, Array, Callable[[Array], Array]]:
+    """Equations (K, N, D) and right sides (K, N) for the coefficients alone, and the t3 (K,) that go with these.
+
+    Every t3 stands in its own picture's equations only: these are projected to where it does not count.
+    """
+    known, weight = np.isfinite(rho), 1 / np.maximum(across, 1e-9)
+    A = np.where(known[..., None], basis * (across * weight)[..., None], 0.0)
+    b, shift = (np.where(known, side * rho * weight, 0.0) for side in (height, -1.0))
+    squared = np.maximum((shift**2).sum(axis=1), 1e-300)
+    along_A, along_b = ((shift[:, None] @ side)[:, 0] / squared[:, None] for side in (A, b[..., None]))
+
+    def shifts(coefficients: Array) -> Array:
+        return np.asarray(along_b[:, 0] - along_A @ coefficients)
+
+    return A - shift[..., None] * along_A[:, None], b - shift * along_b, shifts
 
 
 def _angles(rays: Array, points: Array) -> Array:
