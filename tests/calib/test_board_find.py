@@ -98,6 +98,7 @@ def test_a_hidden_corner_is_left_out_and_the_rest_is_kept() -> None:
     assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
 def test_another_count_is_not_found_and_the_right_one_is_told(asked: tuple[int, int]) -> None:
     shot = STUDIO.photograph(poses(1, seed=2)[0])
@@ -106,6 +107,7 @@ def test_another_count_is_not_found_and_the_right_one_is_told(asked: tuple[int, 
     assert sorted(search.seen) == [5, 6]
 
 
+@pytest.mark.slow
 def test_no_board_is_found_where_there_is_none() -> None:
     rng = np.random.default_rng(3)
     noise = rng.integers(0, 255, (300, 300)).astype(np.uint8)

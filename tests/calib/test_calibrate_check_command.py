@@ -59,6 +59,11 @@ def test_a_turn_about_the_vertical_shows_all_around_and_a_tilt_as_a_wave(scene: 
     assert medians[1].min() < -0.2 and medians[1].max() > 0.2
 
 
+def test_many_degrees_are_still_measured(scene: Path, pairs: list[FramePair]) -> None:
+    found = looked(scene, pairs, (0.0, 0.0, 11.0)).finding
+    assert found.verdict == "broken" and found.turn_deg == pytest.approx(11.0, abs=0.1)
+
+
 def test_what_is_far_off_is_broken(scene: Path, pairs: list[FramePair]) -> None:
     assert looked(scene, pairs, (0, 3.0, 0)).finding.verdict == "broken"
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
