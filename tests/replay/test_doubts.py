@@ -57,10 +57,10 @@ def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Pa
 def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
     plain = np.zeros((256, 256, 2), np.uint8)
     topics = {"lower": "/lower/image_raw", "upper": "/upper/image_raw"}
-    log = write_log(tmp_path / "log.mcap", [Entry(topics[p.camera], IMAGE, image(p.stamp_ns, "yuv422", plain), 1)
+    log = write_log(tmp_path / "log.mcap", [Entry(topics[p.camera], IMAGE, image(p.stamp_ns, "bayer_rggb8", plain), 1)
                                             for p in pictures(scene / "log.mcap")])
     result = omnid.replay(log, rig=scene / "rig.toml")
-    assert result.code == 1 and "'yuv422'" in result.err and "rgb8" in result.err
+    assert result.code == 1 and "'bayer_rggb8'" in result.err and "rgb8" in result.err
 
 
 def test_a_rim_that_is_not_found_is_said(omnid: Command, tmp_path: Path, scene: Path) -> None:
