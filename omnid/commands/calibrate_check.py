@@ -14,13 +14,16 @@ from calib.rim_check import RimShift
 from omnid.calibration.pairs import SIDES
 from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
 from omnid.config import Config
-from omnid.core.rig_check import MIN_MATCHES, RigFinding
+from omnid.core.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.errors import OmnidError
 from omnid.log_rig import attached_rig
 from omnid.messages import FramePair
 from omnid.outputs.files import check_outputs
 
 REFINEMENTS = 3
+# A mirror does not move so far aside; a camera's centre that is some pixels off looks as if it had.
+NO_MIRROR_DEG = 5.0
+ANEW = "the cameras' own parameters have changed, which no turn makes good: calibrate anew with a board"
 UNKNOWN = ("not to be known without a board: the baseline's length (kept), the cameras' own parameters, and the rig's "
            "place on the robot")
 
@@ -75,6 +78,7 @@ def report(found: Looked, pairs: int) -> str:
                                   if count))
     if finding.drift is not None:
         lines += _drift(finding)
+        lines += [ANEW] * _bent(finding)
     lines += [_rim(name, rim) for name, rim in zip(SIDES, found.rims, strict=True)]
     return "\n".join(lines)
 
@@ -95,7 +99,13 @@ def _drift(finding: RigFinding) -> list[str]:
                                                                                             strict=False))
     return [f"upper camera: turned by {finding.turn_deg:.3f} deg: {axes}; z is along the baseline",
             f"upper viewpoint: aside by {aside} deg, as seen from the lower one",
-            f"columns once that is taken away: {finding.left_px:.2f} px at most in any direction"]
+            f"columns once that is taken away: off by {finding.left_px:.2f} px or less in half of all directions"]
+
+
+def _bent(finding: RigFinding) -> bool:
+    """Whether more than the upper camera's place must have changed."""
+    shift = np.zeros(2) if finding.drift is None else finding.drift.shift
+    return finding.left_px > DRIFTED_PX or bool(np.rad2deg(np.linalg.norm(shift)) > NO_MIRROR_DEG)
 
 
 def _rim(name: str, rim: RimShift | None) -> str:
@@ -108,6 +118,7 @@ def _rim(name: str, rim: RimShift | None) -> str:
 
 def _refine(rig: Rig, pairs: list[FramePair], found: Looked, path: Path) -> None:
     """Turns the upper camera as the drift says, looks again, and writes the rig."""
+    bent = _bent(found.finding)
     for _ in range(REFINEMENTS):
         if found.finding.drift is None:
             raise OmnidError("calibrate check: too few points match to refine the rig; calibrate it anew with a board")
@@ -117,8 +128,8 @@ def _refine(rig: Rig, pairs: list[FramePair], found: Looked, path: Path) -> None
             break
     write_rig(path, rig)
     print(f"{path}: {found.finding.summary}\n{UNKNOWN}")
-    if found.finding.verdict != "good":
-        print("the columns are still not right: the cameras' own parameters have changed; calibrate anew with a board")
+    if bent or found.finding.verdict != "good":
+        print(ANEW)
 
 
 def _sigma(finding: RigFinding) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -37,7 +37,8 @@ SIGMAS = 4.0
 # Of the points that are found; of a rig that is wrong by many degrees no more match than by accident.
 MIN_SHARE, MIN_TRIED = 0.08, 400
 SECTORS, MIN_IN_SECTOR = 12, 20
-DRIFTED_PX = 0.7
+# A camera that is no more what it was bends the columns all around; one wall alone may mislead all its matches.
+DRIFTED_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class RigFinding:
     offset_px: float  # median of the upper columns less the lower ones
     spread_px: float  # 1.48 times the median distance from it
     by_azimuth: tuple[tuple[float, float, int], ...]  # degrees, median offset [px] or NaN, matches
-    left_px: float  # the largest of these once the drift is taken away: what no turn of a camera explains
+    left_px: float  # what half of these exceed once the drift is taken away: no turn of a camera explains it
     drift: Drift | None
 
     @property
@@ -138,7 +139,8 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     enough = len(aside) >= MIN_MATCHES
     drift = find_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
     left = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
-    left_px = max((abs(median) for _, median, count in left if count >= MIN_IN_SECTOR), default=float("nan"))
+    offsets = [abs(median) for _, median, count in left if count >= MIN_IN_SECTOR]
+    left_px = float(np.median(offsets)) if offsets else float("nan")
     return RigFinding(_verdict(drift, left_px, (len(aside), found.tried)), len(aside), found.tried, offset, spread,
                       _by_azimuth(found.lower, aside, cylinder), left_px, drift)
 

@@ -12,6 +12,7 @@ from calib import se3
 from calib.camera import Mask
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
+from calib.unified import UnifiedCamera
 from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
 from omnid.cli import main
 from omnid.config import PanoramaConfig
@@ -90,6 +91,17 @@ def test_the_command_says_so_and_puts_it_right(scene: Path, tmp_path: Path,
     assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
     assert again.baseline_m == pytest.approx(truth.baseline_m, abs=1e-9)
     assert run(log, "--rig", right) == 0
+
+
+def test_a_camera_whose_centre_is_off_is_to_be_calibrated_anew(scene: Path, tmp_path: Path,
+                                                               capsys: pytest.CaptureFixture[str]) -> None:
+    rig = read_rig(scene / "rig.toml")
+    camera = rig.upper.camera
+    assert isinstance(camera, UnifiedCamera)
+    off = replace(camera, center=(camera.center[0] + 2.0, camera.center[1]))
+    write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, camera=off)))
+    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
+    assert "calibrate anew with a board" in capsys.readouterr().out
 
 
 def test_a_mask_beyond_the_rim_is_told(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
