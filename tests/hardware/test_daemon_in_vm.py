@@ -1,0 +1,157 @@
+"""The whole of `omnid run` under its unit: guest/daemon.py in one guest, each of its tests told of here by itself.
+
+The pictures are those of the sample log, shown by two loopback cameras; ttyS1 leads to a controller out here.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from calib.rig_file import rig_toml
+from drivers.frame import Frame
+from drivers.log_camera import Pictures
+from drivers.mcap_reader import LogReader
+from drivers.simulated_line import SimulatedLine
+from drivers.simulated_motor import LONGEST_ABSENCE_S
+from omnid.log_rig import attached_rig
+from omnid.stages.geometry import with_rims
+from tests.hardware.image import ROOT
+from tests.hardware.machine import Guest, Result, run_in_vm
+
+pytestmark = pytest.mark.vm
+SCRIPT = Path(__file__).with_name("guest") / "daemon.py"
+SAMPLE = ROOT / "omnid/sample/log.mcap"
+NAMES = [entry.name for entry in ast.parse(SCRIPT.read_text("utf-8")).body
+         if isinstance(entry, ast.FunctionDef) and entry.name.startswith("test_")]
+STEP_S = 0.01
+
+
+class Controller:
+    """A base at the far end of ttyS1, whose state is told to whoever sends a line over ttyS2."""
+
+    def __init__(self, folder: Path) -> None:
+        self.serial = tuple(f"unix:{folder / name}" for name in ("wheels", "questions"))
+        self._line = SimulatedLine()
+        self._fastest_mps = 0.0  # that a wheel was told since the last question
+        self._listeners = [_listener(folder / name) for name in ("wheels", "questions")]
+        self._halt = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the thread; for a guest that never came, too."""
+        self._halt.set()
+        self._thread.join()
+        for listener in self._listeners:
+            listener.close()
+
+    def _serve(self) -> None:
+        answers: dict[socket.socket, Callable[[bytes], bytes]] = {}
+        last_s = time.monotonic()
+        listeners = dict(zip(self._listeners, (self._obey, self._tell), strict=True))
+        with ExitStack() as ends:
+            while not self._halt.is_set():
+                readable, _, _ = select.select([*listeners, *answers], [], [], STEP_S)
+                now_s = time.monotonic()
+                self._line.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
+                last_s = now_s
+                for port in readable:
+                    if port in listeners:
+                        answers[ends.enter_context(port.accept()[0])] = listeners.pop(port)
+                    elif data := port.recv(4096):
+                        port.sendall(answers[port](data))
+                    else:
+                        del answers[port]
+
+    def _obey(self, data: bytes) -> bytes:
+        answer = self._line.feed(data)
+        self._fastest_mps = max(self._fastest_mps, *map(abs, self._line.base.told_mps))
+        return answer
+
+    def _tell(self, data: bytes) -> bytes:
+        if b"\n" not in data:
+            return b""
+        base = self._line.base
+        state = {"told_mps": max(map(abs, base.told_mps)), "fastest_mps": self._fastest_mps, "way_m": base.travel_m[0],
+                 **{name: getattr(base, name) for name in ("commands", "errors", "expiries", "unsafe_resumes")}}
+        self._fastest_mps = state["told_mps"]
+        return json.dumps(state).encode() + b"\n"
+
+
+def _listener(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen()
+    return listener
+
+
+@contextmanager
+def controller(folder: Path) -> Iterator[Controller]:
+    """A controller, while it is wanted."""
+    made = Controller(folder)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def rig_of_the_sample() -> bytes:
+    """Its rig with the rims in it, which a daemon would look for in the first pictures."""
+    reader = LogReader(SAMPLE)
+    try:
+        rig = attached_rig(reader, SAMPLE)
+    finally:
+        reader.close()
+    pictures = Pictures.of(SAMPLE)
+    frames: list[Frame] = [frame for both in zip(pictures.lower, pictures.upper, strict=False) for _, frame in both]
+    return rig_toml(with_rims(rig, frames)).encode()
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    report = "--junitxml=/mnt/job/results/report.xml"
+    command = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10", "-x", report]
+    with controller(tmp_path_factory.mktemp("ports")) as base:
+        guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=900)
+        return run_in_vm([*command, "tests/hardware/guest/daemon.py"], guest)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_the_guest(result: Result, name: str) -> None:
+    cases = [case for case in ElementTree.fromstring(result.files["report.xml"]).iter("testcase")
+             if case.get("name") == name]
+    assert cases, f"it was not run:\n{result.output[-4000:]}"
+    faults = [fault.text for case in cases for fault in case if fault.tag in ("failure", "error", "skipped")]
+    assert not faults, "\n".join(map(str, faults))
+
+
+def omnid(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "omnid", *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_what_was_recorded_until_the_kill_is_made_whole(result: Result, tmp_path: Path) -> None:
+    """The pictures up to the newest pose that was heard, and less than two seconds more are lost."""
+    cut, whole = tmp_path / "killed.mcap.part", tmp_path / "killed.mcap"
+    cut.write_bytes(result.files["killed.mcap.part"])
+    assert omnid("log", "info", cut).returncode == 1
+    mended = omnid("log", "recover", cut)
+    assert mended.returncode == 0, mended.stderr
+    assert omnid("log", "info", whole).returncode == 0
+    guest = json.loads(result.files["killed.json"])
+    found = Pictures.of(whole)
+    for eye in (found.lower, found.upper):
+        assert len(eye) > 5 and guest["killed_ns"] - eye[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000
