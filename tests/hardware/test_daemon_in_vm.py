@@ -144,7 +144,7 @@ def omnid(*words: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_what_was_recorded_until_the_kill_is_made_whole(result: Result, tmp_path: Path) -> None:
-    """The pictures up to the newest pose that was heard, and less than two seconds more are lost."""
+    """Nothing older than two seconds before the newest pose that was heard is lost."""
     cut, whole = tmp_path / "killed.mcap.part", tmp_path / "killed.mcap"
     cut.write_bytes(result.files["killed.mcap.part"])
     assert omnid("log", "info", cut).returncode == 1
