@@ -151,7 +151,7 @@ REMARKS = """## What stands out
   seeds).
 - Plain KLT does better than the paper's: with a pyramid of four levels it keeps a third to a half of the features
   through 18 degrees, so that the searches, which keep nearly all, gain a factor of 1.9 to 2.9 and not 2.5 every
-  time. With two levels the factor is 7 and more. Beyond 45 degrees nothing of plain KLT is left.
+  time. With two levels the factor is 7 and more. Beyond 70 degrees next to nothing of plain KLT is left.
 - Half a step off, the 18 degree search finds fewer features than on a step; correlation does not mind, at a tenth
   of the time.
 - Eq. 9, frame to frame, is not short on these walls; its error shows sideways, several times that of bearings, and
