@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 from itertools import chain, islice
 from pathlib import Path
 from types import FrameType
@@ -36,6 +35,7 @@ from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end
 from omnid.service import Status as StatusLine
 from omnid.settings import dump
+from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
 from omnid.transport.bus import Bus
@@ -43,7 +43,6 @@ from omnid.transport.codec import Status, compile_serialisers
 from omnid.transport.commands import Commands
 
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOKS = 60  # pictures of either camera in which the rim is looked for, where the rig has no mask
 TICKERS = frozenset({"motor", "status", "watchdog", "router"})
 Say = Callable[[int, str], None]  # severity as syslog has it, and one line
@@ -74,7 +73,7 @@ class Live:
         """The exit code, 0 after a signal to end."""
         show_stacks_at_the_end()
         compile_serialisers()
-        with self._ended_by_signals(), ExitStack() as ends:
+        with ended_by_signals(self._on_signal), ExitStack() as ends:
             place = self._geometry()
             self._wire(place, {name: ends.enter_context(closing(self._open(name))) for name in CAMERAS}, ends)
             for refused in prepare(self._config.realtime, self._config.graph.opencv_threads):
@@ -165,18 +164,8 @@ class Live:
 
         return publish
 
-    @contextmanager
-    def _ended_by_signals(self) -> Iterator[None]:
-        """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once."""
-        heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup has it
-        before = {number: signal.signal(number, self._on_signal) for number in heeded}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
     def _on_signal(self, number: int, _: FrameType | None) -> None:
+        """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once."""
         if not self._running:
             raise SystemExit(0)  # nothing flows yet, the wheels stand; whatever is open is closed on the way
         self._graph.stop()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.frame import Camera, FrameSource
@@ -16,8 +14,8 @@ from omnid.graph import NEWEST, Graph
 from omnid.outputs.encoded import Encoder
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.settings import dump
+from omnid.signals import ended_by_signals
 
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PERIOD_S = 15.0  # between two lines about how it goes
 
 
@@ -43,7 +41,7 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
     graph.sink("record", recorder, *frames)
     graph.ticker("progress", PERIOD_S, lambda: report(NOTICE, told(recorder, graph)) if recorder.state.files else None)
     try:
-        with _ended_by_signals(graph):
+        with ended_by_signals(lambda *_: graph.stop()):  # a second one ends it at once
             graph.run()
     finally:
         recorder.close()
@@ -58,18 +56,3 @@ def told(recorder: FrameRecorder, graph: Graph) -> str:
     kept = state.messages - state.lost - state.refused
     return (f"recording: {kept} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
             f"refused {state.refused + recorder.unfit}, oldest files deleted {state.deleted}, {state.status}")
-
-
-@contextmanager
-def _ended_by_signals(graph: Graph) -> Iterator[None]:
-    """The first signal ends the run whole, a second one at once."""
-
-    def stop(*_: object) -> None:
-        graph.stop()
-
-    before = {number: signal.signal(number, stop) for number in STOPPING}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -34,13 +32,13 @@ from omnid.outputs.verdict import doubts, found_nothing
 from omnid.pace import Pace
 from omnid.pipeline import Ends, Watched, wire
 from omnid.settings import dump
+from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
 
@@ -94,7 +92,7 @@ class Replay:
                 ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
             self._show_progress(reader)
             try:
-                with self._stopped_by_signals():
+                with ended_by_signals(self._on_signal):
                     self._graph.run()
             except (OmnidError, DriverError):
                 if self._tally.poses:  # what there was until then is whole
@@ -196,18 +194,8 @@ class Replay:
         drops["queue"] = sum(stage.dropped for stage in self._graph.telemetry.stages if stage.name not in TICKERS)
         return drops
 
-    @contextmanager
-    def _stopped_by_signals(self) -> Iterator[None]:
-        """Ctrl-C, SIGTERM and a terminal that is closed end the run whole; a second one ends it at once."""
-        heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as nohup has it
-        before = {number: signal.signal(number, self._on_signal) for number in heeded}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
     def _on_signal(self, number: int, _: FrameType | None) -> None:
+        """The first signal ends the run whole; a second one ends it at once."""
         again, self._signal = self._signal, number
         self._graph.stop()
         if again and self._options.inline:  # nothing else reaches a stage that this thread is stuck in

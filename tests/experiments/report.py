@@ -146,12 +146,10 @@ On the panoramas of the turns, one thread.
 REMARKS = """## What stands out
 - Enhanced SAD keeps the paper's promise: on identical bricks it is as right as a semi-global prior, and odometry on
   it is even a little more exact; it takes twice the time. Original SAD is helped here by a check from the upper
-  picture, which the paper does not have: where it has few wrong matches it has hardly any matches. Below some 450
-  px of picture, where a course of bricks is four pixels high, enhanced SAD is misled as well (seen in two of six
-  seeds).
+  picture, which the paper does not have: where it has few wrong matches it has hardly any matches.
 - Plain KLT does better than the paper's: with a pyramid of four levels it keeps a third to a half of the features
   through 18 degrees, so that the searches, which keep nearly all, gain a factor of 1.9 to 2.9 and not 2.5 every
-  time. With two levels the factor is 7 and more. Beyond 70 degrees next to nothing of plain KLT is left.
+  time. Beyond 70 degrees next to nothing of plain KLT is left.
 - Half a step off, the 18 degree search finds fewer features than on a step; correlation does not mind, at a tenth
   of the time.
 - Eq. 9, frame to frame, is not short on these walls; its error shows sideways, several times that of bearings, and
