@@ -1,0 +1,69 @@
+"""`omnid diff`: where two recorded runs part."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+AGREE, PART = 0, 1
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `diff` to the command line."""
+    parser = subparsers.add_parser("diff", help="where two recorded runs over the same pictures part; exit code 1 "
+                                   "where they do")
+    parser.add_argument("a", type=Path, metavar="A.mcap", help="what `omnid run`, replay --record or listen --mcap "
+                        "wrote, or any log with nav_msgs/msg/Odometry")
+    parser.add_argument("b", type=Path, metavar="B.mcap", help="likewise; poses of the same stamp are compared")
+    parser.add_argument("--tolerance-mm", type=float, default=5.0, metavar="MM", help="poses that are nearer are the "
+                        "same, and commands that differ by less per second; default %(default)s")
+    parser.add_argument("--tolerance-deg", type=float, default=0.1, metavar="DEG", help="likewise, of angles; default "
+                        "%(default)s")
+    parser.add_argument("--shared", type=float, default=90.0, metavar="PERCENT", help="the least share of the longer "
+                        "run's poses that the other must have; default %(default)s")
+    parser.add_argument("--align", action="store_true", help="lay the first common pose of B on that of A: for runs "
+                        "that began at different pictures")
+    parser.add_argument("--topic", help="that of the poses, where a recording has several")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prints what there is to say; 0 where the runs agree, 1 where they part."""
+    from omnid.journal import WARNING, tell
+    from omnid.listening.heard import plain
+    from omnid.recorded_run import read_run
+    from omnid.run_comparison import Comparison, Tolerance
+
+    limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
+    a, b = (read_run(path, args.topic) for path in (args.a, args.b))
+    if _identical(a.path, b.path):
+        print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
+        return AGREE
+    tolerance = Tolerance(limits[0] * 1e-3, math.radians(limits[1]), limits[2] * 1e-2)
+    comparison = Comparison(a, b, tolerance, align=args.align)
+    for warning in (*a.warnings, *b.warnings):
+        tell(WARNING, warning)
+    print("\n".join(map(plain, comparison.lines())))
+    return PART if comparison.parted else AGREE
+
+
+def _limit(args: argparse.Namespace, name: str) -> float:
+    from omnid.errors import OmnidError
+
+    value = float(getattr(args, name))
+    if not 0.0 <= value < math.inf:
+        raise OmnidError(f"--{name.replace('_', '-')} {value:g}: expected a number of 0 or more")
+    return value
+
+
+def _identical(a: Path, b: Path) -> bool:
+    """Whether both files hold the same bytes."""
+    import filecmp
+
+    from omnid.errors import OmnidError
+
+    try:
+        return filecmp.cmp(a, b, shallow=False)
+    except OSError as error:
+        raise OmnidError(f"{error.filename}: cannot be read any more: {error.strerror}") from error

@@ -1,0 +1,289 @@
+"""`omnid diff` on recordings whose differences are known, and on files that are none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib import se3
+from drivers.mcap_writer import LogWriter
+from omnid import recorded_run
+from omnid.cli import main
+from omnid.core.run_differences import Series, gaps, pose_excess
+from omnid.core.table_differences import table_differences
+from omnid.recorded_run import read_run
+from omnid.transport import codec
+from tests.drivers.mcap_logs import START_NS
+
+PERIOD_NS = 10**8
+COUNT = 20
+
+
+def pose(index: int, off_m: float = 0.0, off_deg: float = 0.0) -> np.ndarray:
+    """On a circle, put aside by so much."""
+    turn = se3.rotation_exp((0, 0, 0.1 * index + math.radians(off_deg)))
+    return se3.transform(turn, (math.sin(0.1 * index), 1 - math.cos(0.1 * index) + off_m, 0.0))
+
+
+def stamp_ns(index: int) -> int:
+    return START_NS + index * PERIOD_NS
+
+
+def text_of(index: int) -> str:
+    return f"{stamp_ns(index) // 10**9}.{stamp_ns(index) % 10**9:09d} ({index / 10:.3f} s)"
+
+
+class Recording:
+    """A recording as a run writes it, with what is wanted in it."""
+
+    def __init__(self, path: Path, settings: str = "", robot: str = "omnid") -> None:
+        self.path, self._robot = path, robot
+        self._writer = LogWriter(path, {"omnid.toml": settings.encode(), "rig.toml": b"schema = 1\n"})
+
+    def add(self, topic: str, schema: str, data: bytes, index: int) -> None:
+        """Any message."""
+        self._writer.write(f"/{self._robot}/{topic}", schema, data, stamp_ns(index))
+
+    def odom(self, index: int, T: np.ndarray) -> None:
+        """A pose."""
+        zero = np.zeros((6, 6))
+        data = codec.odometry_cdr(stamp_ns(index), T, zero, np.zeros(6), zero)
+        self.add("odom", codec.ODOMETRY_SCHEMA, data, index)
+
+    def state(self, index: int, state: str, resets: int = 0) -> None:
+        """A change of the state."""
+        said = codec.Status("omnid: odometry", 0, state, {"state": state, "resets": str(resets)})
+        self.add("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns(index), [said]), index)
+
+    def drive(self, index: int, velocity_mps: float) -> None:
+        """A command."""
+        data = codec.twist_stamped_cdr(stamp_ns(index), "base_link", velocity_mps, 0.0)
+        self.add("drive", codec.TWIST_SCHEMA, data, index)
+
+    def done(self) -> Path:
+        """The whole file."""
+        self._writer.close()
+        return self.path
+
+
+def run_of(path: Path, poses: Sequence[tuple[int, np.ndarray]], settings: str = "", **more: Any) -> Path:
+    recording = Recording(path, settings, **more)
+    recording.state(poses[0][0], "tracking")
+    for index, T in poses:
+        recording.odom(index, T)
+        recording.drive(index, 0.3)
+    return recording.done()
+
+
+def circle(off_from: int = COUNT, off_m: float = 0.0, off_deg: float = 0.0) -> list[tuple[int, np.ndarray]]:
+    """All poses; those from one number on are put aside."""
+    return [(i, pose(i, off_m, off_deg) if i >= off_from else pose(i)) for i in range(COUNT)]
+
+
+def diff(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+    capsys.readouterr()
+    code = main(["diff", *map(str, words)])
+    out, err = capsys.readouterr()
+    return code, err if code == 2 else out
+
+
+@pytest.fixture
+def first(tmp_path: Path) -> Path:
+    return run_of(tmp_path / "a.mcap", circle())
+
+
+def test_the_same_file_is_identical(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = tmp_path / "copy.mcap"
+    other.write_bytes(first.read_bytes())
+    code, out = diff(capsys, first, other)
+    assert code == 0 and out.endswith("are identical, byte for byte\n")
+
+
+def test_the_same_poses_in_another_file_agree_to_the_last_bit(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
+) -> None:
+    code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", circle(), "a = 1"))
+    assert code == 0 and "to the last bit the same" in out and "at most 0.000 mm, 0.0000 deg" in out
+    assert "a: A nothing, B 1" in out and "rig        the same" in out
+
+
+def test_where_they_part_and_by_how_much(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = run_of(tmp_path / "b.mcap", circle(12, 0.0071, 0.03))
+    code, out = diff(capsys, first, other)
+    assert code == 1 and out.endswith("they part: poses\n")
+    assert f"more than 5 mm or 0.1 deg first at {text_of(12)}: 7.100 mm, 0.0300 deg; at 8 poses in all" in out
+    assert f"the same to the last bit before {text_of(12)}" in out
+    assert diff(capsys, first, other, "--tolerance-mm", 7.2)[0] == 0
+    code, out = diff(capsys, first, other, "--tolerance-mm", 7.2, "--tolerance-deg", 0.02)
+    assert code == 1 and f"first at {text_of(12)}: 7.100 mm" in out
+
+
+def test_at_most_and_at_the_end_are_told_apart(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    bent = [(i, pose(i, 0.02 if i == 7 else 0.001 if i == COUNT - 1 else 0.0)) for i in range(COUNT)]
+    code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", bent))
+    assert code == 1 and "at most 20.000 mm, 0.0000 deg; at the end 1.000 mm, 0.0000 deg" in out
+
+
+def test_half_a_turn_is_no_small_difference(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", circle(3, 0.0, 180.0)))
+    assert code == 1 and "at most 0.000 mm, 180.0000 deg" in out
+
+
+def test_poses_that_one_run_lacks(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    lost = [(i, T) for i, T in circle() if i not in (4, 9, 10, 11)]
+    other = run_of(tmp_path / "b.mcap", lost)
+    code, out = diff(capsys, first, other)
+    assert code == 1 and "they part: less than 90% of the poses are in both" in out
+    assert "in both    16 poses (80.0% of the longer run)" in out
+    assert f"only in A  4 poses in 2 stretches, the longest of 3 from {text_of(9)} on" in out
+    assert "only in B  none" in out
+    assert diff(capsys, first, other, "--shared", 80)[0] == 0
+
+
+def test_states_and_resets_that_differ(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = Recording(tmp_path / "b.mcap")
+    for i, T in circle():
+        other.odom(i, T)
+    for index, state, resets in ((0, "tracking", 0), (8, "lost", 0), (11, "degraded", 1), (13, "tracking", 1)):
+        other.state(index, state, resets)
+    code, out = diff(capsys, first, other.done())
+    assert code == 1 and out.endswith("they part: states\n")
+    assert "states     A 0 changes, 0 resets; B 3 changes, 1 resets" in out
+    assert f"others at 12 poses, first at {text_of(8)}: A tracking after 0 resets, B lost after 0 resets" in out
+
+
+def test_a_run_without_states_differs_in_none(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = Recording(tmp_path / "b.mcap")
+    for i, T in circle():
+        other.odom(i, T)
+    code, out = diff(capsys, first, other.done())
+    assert code == 0 and "B 0 changes, unknown resets" in out and "commands   A 20, B 0, 0 of the same stamps" in out
+
+
+def test_commands_that_differ(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = Recording(tmp_path / "b.mcap")
+    for i, T in circle():
+        other.odom(i, T)
+        other.drive(i, 0.3 if i < 15 else 0.31)
+    code, out = diff(capsys, first, other.done())
+    assert code == 1 and out.endswith("they part: commands\n")
+    assert f"first at {text_of(15)}: 10.000 mm/s, 0.0000 deg/s; 5 commands in all" in out
+
+
+def test_runs_that_start_elsewhere_can_be_aligned(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
+) -> None:
+    elsewhere = se3.exp((3.0, -1.0, 0.2, 0.0, 0.0, 2.0))
+    other = run_of(tmp_path / "b.mcap", [(i, elsewhere @ T) for i, T in circle()[2:]])
+    code, out = diff(capsys, first, other)
+    assert code == 1 and "with --align the first pose of B is laid on that of A" in out
+    code, out = diff(capsys, first, other, "--align")
+    assert code == 0 and "at most 0.000 mm, 0.0000 deg" in out
+
+
+def test_other_clocks_are_refused_with_advice(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+    other = run_of(tmp_path / "b.mcap", [(i + 100, T) for i, T in circle()])
+    code, line = diff(capsys, first, other)
+    assert code == 2 and line.count("\n") == 1 and "has the same stamp" in line and "omnid replay" in line
+
+
+def test_a_run_cut_short_says_what_is_compared(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    whole = run_of(tmp_path / "b.mcap", circle()).read_bytes()
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    assert main(["diff", str(first), str(cut), "--shared", "10"]) == 0
+    assert "cut or corrupt" in capsys.readouterr().err
+
+
+def test_foreign_bytes_and_repeated_stamps_are_told(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
+) -> None:
+    other = Recording(tmp_path / "b.mcap")
+    for i, T in [*circle(), (3, pose(3, 9.0))]:
+        other.odom(i, T)
+    other.add("odom", codec.ODOMETRY_SCHEMA, b"no pose", COUNT)
+    other.drive(COUNT, math.nan)
+    assert main(["diff", str(first), str(other.done())]) == 0
+    err = capsys.readouterr().err
+    assert "1 messages on '/omnid/odom' are no nav_msgs/msg/Odometry" in err and "have a stamp that came before" in err
+    assert "1 messages on '/omnid/drive' are no geometry_msgs/msg/TwistStamped" in err
+
+
+WRONG = {
+    "no file": (["{a}", "none.mcap"], "none.mcap"),
+    "no log": (["{a}", "{text}"], "is not an MCAP log"),
+    "no poses": (["{a}", "{bare}"], "omnid replay"),
+    "no such topic": (["{a}", "{a}", "--topic", "/x"], "'/omnid/odom'"),
+    "several topics": (["{a}", "{two}"], "--topic"),
+    "nan": (["{a}", "{a}", "--tolerance-mm", "nan"], "--tolerance-mm nan"),
+    "below 0": (["{a}", "{a}", "--tolerance-deg", "-1"], "--tolerance-deg"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_gives_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path, case: str
+) -> None:
+    words, expected = WRONG[case]
+    bare, two = Recording(tmp_path / "bare.mcap"), Recording(tmp_path / "two.mcap")
+    bare.drive(0, 1.0)
+    for topic in ("odom", "other"):
+        zero = np.zeros((6, 6))
+        two.add(topic, codec.ODOMETRY_SCHEMA, codec.odometry_cdr(START_NS, np.eye(4), zero, np.zeros(6), zero), 0)
+    (tmp_path / "text").write_text("no log")
+    files = {"a": first, "text": tmp_path / "text", "bare": bare.done(), "two": two.done()}
+    code, line = diff(capsys, *(word.format(**files) for word in words))
+    assert code == 2 and line.count("\n") == 1 and expected in line
+
+
+def test_of_several_topics_the_named_one_counts(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for name, off_m in (("a", 0.0), ("b", 1.0)):
+        recording = Recording(tmp_path / f"{name}.mcap")
+        for i in range(3):
+            recording.odom(i, pose(i))
+            zero = np.zeros((6, 6))
+            data = codec.odometry_cdr(stamp_ns(i), pose(i, off_m), zero, np.zeros(6), zero)
+            recording.add("wheels", codec.ODOMETRY_SCHEMA, data, i)
+        recording.done()
+    both = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    assert diff(capsys, *both, "--topic", "/omnid/odom")[0] == 0
+    assert diff(capsys, *both, "--topic", "/omnid/wheels")[0] == 1
+
+
+def test_what_cannot_be_held_is_refused(tmp_path: Path, first: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorded_run, "MOST", COUNT - 1)
+    with pytest.raises(recorded_run.OmnidError, match="cut it into shorter ones"):
+        read_run(first)
+
+
+def test_keys_are_named_by_their_paths() -> None:
+    a = {"rig": {"T": [[1.0, 0.0], [0.0, 1.0]], "name": "x"}, "same": 1, "flag": True}
+    b = {"rig": {"T": [[1.0, 0.0], [0.5, 1.0]], "name": "x"}, "same": 1.0, "flag": 1, "new": "y" * 100}
+    found = table_differences(a, b)
+    assert [(entry.path, entry.a, entry.b) for entry in found[:2]] == [("rig.T[1][0]", "0.0", "0.5"),
+                                                                        ("flag", "True", "1")]
+    assert found[2].path == "new" and found[2].a == "nothing" and found[2].b.endswith("(102 characters)")
+
+
+def test_stretches_that_are_missing() -> None:
+    whole, other = (Series(np.array(stamps), np.zeros((len(stamps), 1))) for stamps in ([1, 2, 3, 4, 5, 6], [2, 5]))
+    found = gaps(whole, other)
+    assert (found.missing, found.stretches, found.longest, found.longest_ns) == (4, 3, 2, 3)
+    assert gaps(other, whole).missing == 0
+
+
+def test_angles_are_exact_where_they_are_tiny() -> None:
+    stamps = np.array([1, 2])
+    angles = (1e-9, 1e-4)
+    a = Series(stamps, np.tile([0, 0, 0, *se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)))], (2, 1)))
+    turned = [se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)) @ se3.rotation_exp((0, angle, 0))) for angle in angles]
+    b = Series(stamps, np.array([[0, 0, 0, *q] for q in turned]))
+    np.testing.assert_allclose(pose_excess(a, b, 0, 0).amounts[:, 1], angles, rtol=1e-5)
+    assert pose_excess(a, a, 0, 0).first_trace is None
