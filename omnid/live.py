@@ -13,7 +13,6 @@ from typing import Protocol
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Camera, Frame, FrameSource
-from drivers.simulated_motor import SimulatedMotor
 from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
 from omnid.errors import OmnidError
@@ -24,9 +23,10 @@ from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
-from omnid.outputs.helm import Helm, HelmSettings
+from omnid.outputs.helm import HelmSettings
+from omnid.outputs.helm_link import HelmLink
+from omnid.outputs.helm_messages import Orders
 from omnid.outputs.latency import Latency
-from omnid.outputs.motor import open_motor
 from omnid.outputs.status import StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
@@ -38,6 +38,7 @@ from omnid.settings import dump
 from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
+from omnid.telemetry import StageStats
 from omnid.transport.bus import Bus
 from omnid.transport.codec import Status, compile_serialisers
 from omnid.transport.commands import Commands
@@ -62,11 +63,10 @@ class Live:
 
     def __init__(self, config: Config, open_camera: Opener, say: Say, rig: Rig | None = None) -> None:
         self._config, self._open, self._say, self._rig = config, open_camera, say, rig
-        on_thread = ThreadStart(priorities(config.realtime, "motor", *CAMERAS), say)
+        on_thread = ThreadStart(priorities(config.realtime, *CAMERAS), say)
         self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
         self._tally, self._latency = Tally(), Latency()
         self.offset_ns = time.time_ns() - time.monotonic_ns()  # from the stamps in here to Unix time
-        self.twin: SimulatedMotor | None = None
         self._running = False
 
     def run(self) -> int:
@@ -121,7 +121,8 @@ class Live:
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
         commands = self._commands(bus, helm) if helm else None
         report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
-                                      self._tally, self._latency.to_pose, helm, commands, TICKERS))
+                                      self._tally, self._latency.to_pose, helm.logbook if helm else None, commands,
+                                      TICKERS))
         wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder)])]
         graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
         service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)
@@ -137,19 +138,21 @@ class Live:
             self._graph.ticker("router", self._config.bus.retry_s, bus.join)
         return bus
 
-    def _helm(self, place: Geometry, ends: ExitStack) -> Helm:
+    def _helm(self, place: Geometry, ends: ExitStack) -> HelmLink:
         config = self._config
-        driver, self.twin = open_motor(config.motor, ends)
         settings = HelmSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
                                 config.helm.limits)
-        return Helm(driver, place.rig.T_base_rig, settings, lambda text: self._say(WARNING, text))
+        helm = HelmLink(Orders(config.motor, settings, config.realtime), place.rig.T_base_rig,
+                        self._graph.telemetry.add(StageStats("motor")), lambda text: self._say(WARNING, text))
+        ends.callback(helm.close)
+        return helm
 
     def _recorder(self, place: Geometry, encode: Encoder, ends: ExitStack) -> FrameRecorder:
         recorder = open_recorder(self._config, rig_toml(place.rig), self._say, encode=encode, offset_ns=self.offset_ns)
         ends.callback(recorder.close)
         return recorder
 
-    def _commands(self, bus: Bus, helm: Helm) -> Commands:
+    def _commands(self, bus: Bus, helm: HelmLink) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
         bus.hear(commands.take)
         return commands

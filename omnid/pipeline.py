@@ -11,7 +11,7 @@ from omnid.config import Config
 from omnid.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, Odometry
 from omnid.outputs.encoded import Outgoing
-from omnid.outputs.helm import Helm
+from omnid.outputs.helm_link import HelmLink
 from omnid.outputs.motor import MotorTick
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
@@ -30,7 +30,7 @@ class Ends:
     recorder: Sink[Any] | None = None  # of all that is said, and of the pictures
     bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
-    helm: Helm | None = None  # of a live robot: it decides by itself, at its own rate
+    helm: HelmLink | None = None  # of a live robot: it decides by itself, at its own rate, in its own process
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     pictures: tuple[Stream[Frame], ...] = ()  # that are recorded as well
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
@@ -68,13 +68,11 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
 def _commands(graph: Graph, odometry: Stream[Odometry], geometry: Geometry, config: Config, ends: Ends
               ) -> Stream[VelocityCommand]:
     """What the wheels are told. Their deadline waits for nobody: the newest pose or command lies in a slot."""
-    period_s = 1.0 / config.motor.rate_hz
     if ends.helm:
         graph.sink("helm", ends.helm, odometry, policy=NEWEST, depth=1)
-        graph.ticker("motor", period_s, ends.helm)
-        return graph.source("drive", ends.helm.told, wake=ends.helm.hush)
+        return graph.source("drive", ends.helm.told, wake=ends.helm.end)
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
     if ends.motor:
         graph.sink("commands", ends.motor, commands)
-        graph.ticker("motor", period_s, ends.motor)
+        graph.ticker("motor", 1.0 / config.motor.rate_hz, ends.motor)
     return commands

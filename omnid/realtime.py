@@ -68,9 +68,9 @@ class ThreadStart:
                          f"{priority_advice(max(self._priorities.values()))}")
 
 
-def priorities(config: RealtimeConfig, motor: str, *captures: str) -> dict[str, int]:
-    """The priorities by thread, for ThreadStart: the motor's tick comes before the pictures."""
-    return {name: config.capture_priority for name in captures} | {motor: config.motor_priority}
+def priorities(config: RealtimeConfig, *captures: str) -> dict[str, int]:
+    """The priorities by thread, for ThreadStart; the wheels' tick has a process of its own."""
+    return {name: config.capture_priority for name in captures}
 
 
 def raise_thread(priority: int) -> bool:

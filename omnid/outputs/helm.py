@@ -1,34 +1,22 @@
-"""The wheels of a live robot: at a fixed rate, from the newest pose and the newest command, whatever the stages do."""
+"""The wheels of a live robot: at a fixed rate, from the newest pose and the newest command."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from queue import Empty, Full, Queue
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from omnid.core.command_limits import STOP, CommandLimits
-from omnid.core.ego_motion import LOST
 from omnid.core.fail_safe import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
 from omnid.core.heading import Drive, HeadingHold, HeadingLimits, Setpoint
 from omnid.core.heading_goal import HeadingGoal
-from omnid.flow import Slot, nothing
-from omnid.messages import Odometry
-from omnid.stages.odometry import of_base
-from omnid.telemetry import Histogram
+from omnid.flow import nothing
+from omnid.outputs.logbook import Account, Tick
 
-LONGEST_RAMP_S = 3.0  # at the end: whatever has not stood still by then is stopped at once
-TOLD = 16  # commands that may wait for whoever records them
 SURE = ("", IDLE, COMMAND_STALE)  # reasons for which the pose has been found good
 NS = 1e-9
 
@@ -47,7 +35,7 @@ class Heading(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """A command and when it came."""
+    """A command and when it came (CLOCK_MONOTONIC)."""
 
     arrival_ns: int
     setpoint: Setpoint
@@ -64,104 +52,90 @@ class HelmSettings:
 
 
 class Helm:
-    """A sink for poses, a mailbox for commands, and the tick that drives.
+    """Takes poses and commands, the newest of which count, and drives with each call.
 
     It stops, with the deceleration of its limits, for every reason of omnid.core.fail_safe. A stop voids all commands
-    that came before it: only one that comes later moves the wheels again.
+    that came before it: only one that comes later moves the wheels again. For one thread.
     """
 
-    def __init__(self, driver: MotorDriver, T_base_rig: NDArray[np.float64], settings: HelmSettings,
-                 report: Callable[[str], None] = nothing, *, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._driver, self._T_base_rig, self._settings, self._report = driver, T_base_rig, settings, report
+    def __init__(self, driver: MotorDriver, settings: HelmSettings, report: Callable[[str], None] = nothing, *,
+                 clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._driver, self._settings, self._report = driver, settings, report
         self._clock_ns = clock_ns  # that of the pictures' stamps
         self._hold, self._goal = HeadingHold(settings.hold), HeadingGoal()
-        self._pose: Slot[Heading] = Slot()
-        self._command: Slot[Arrived] = Slot()
+        self._pose: Heading | None = None
+        self._command: Arrived | None = None
         self._void_ns = self._clock_ns()  # commands up to then count no more
         self._stop_ns = 0  # when a stop was asked for last
         self._last_ns = self._due_ns = 0  # when the last tick came, and when the next one should
         self._driven_ns = 0  # capture of the newest pose that was driven by
-        self._ending = self._failed = self._stopped = False
+        self._ending = self._stopped = False
         self._sent = STOP
-        self._told: Queue[VelocityCommand | None] = Queue(TOLD)
-        self.reason = IDLE
-        self.stops: Counter[str] = Counter()  # by reason
-        self.sent = self.errors = self.expiries = 0
-        self.fault = 0  # the controller's own number
-        self.to_wheel = Histogram()  # s from the capture of a pose's pictures to the first command that follows it
-        self.lateness = Histogram()  # s by which ticks come too late
+        self.account = Account()
 
     @property
-    def failed(self) -> bool:
-        """Whether the controller did not take the last command."""
-        return self._failed
+    def due_ns(self) -> int:
+        """When the next tick should come, CLOCK_MONOTONIC; 0: at once."""
+        return self._due_ns
 
-    def process(self, odometry: Odometry) -> None:
-        """Takes a pose; one that is not finite is as good as none."""
-        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
-        heading_rad, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[5])
-        state = odometry.state if math.isfinite(heading_rad) and math.isfinite(rate_radps) else LOST
-        self._pose.put(Heading(odometry.stamp_ns, heading_rad, rate_radps, state))
+    @property
+    def stands(self) -> bool:
+        """Whether the wheels were told to stand, or the controller hears nothing and stops them itself."""
+        return self._sent == STOP or self.account.failed
 
-    def command(self, setpoint: Setpoint, arrival_ns: int | None = None) -> None:
-        """Takes a command that arrived then (CLOCK_MONOTONIC), or just now, from any thread; the newest wins."""
-        self._command.put(Arrived(self._clock_ns() if arrival_ns is None else arrival_ns, setpoint))
+    def see(self, pose: Heading) -> None:
+        """Takes a pose."""
+        self._pose = pose
 
-    def stop(self) -> None:
-        """Stops the wheels at the next tick, whatever else is commanded until then; from any thread."""
-        self._stop_ns = self._clock_ns()  # a time, for a flag could be cleared by the tick the moment it is set
+    def command(self, arrived: Arrived) -> None:
+        """Takes a command."""
+        self._command = arrived
 
-    def __call__(self) -> None:
+    def stop(self, asked_ns: int) -> None:
+        """Stops the wheels at the next tick, whatever had been commanded until then."""
+        self._stop_ns = max(self._stop_ns, asked_ns)
+
+    def end(self) -> None:
+        """Stops the wheels for good."""
+        self._ending = True
+
+    def __call__(self) -> Tick:
         """One tick."""
         now_ns = self._clock_ns()
         dt_s, late_s = self._rhythm(now_ns)
-        pose, command = self._pose.get(), self._command.get()
+        pose, command = self._pose, self._command
         self._judge(self._situation(now_ns, late_s, pose, command), now_ns)
         drive, goal_rad = self._steered(now_ns, dt_s, pose, command)
-        if (status := self._send(VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps))) is None:
-            return
-        self._heed(status, drive)
-        self._goal.heard(status.heading_rad, pose.at(now_ns) if pose and self.reason in SURE else None)
-        if pose is not None and pose.stamp_ns > self._driven_ns:
-            self._driven_ns = pose.stamp_ns
-            self.to_wheel.add((self._clock_ns() - pose.stamp_ns) * NS)
-
-    def finish(self) -> None:
-        """There will be no more poses."""
-        self.hush()
-
-    def told(self) -> Iterator[VelocityCommand]:
-        """What the wheels have been told, for whoever keeps or shows it, until hushed; too much of it is forgotten."""
-        while (command := self._told.get()) is not None:
-            yield command
-
-    def hush(self) -> None:
-        """Ends `told`; for any thread."""
-        with suppress(Empty):
-            while True:
-                self._told.get_nowait()
-        with suppress(Full):  # by another that hushes: then there is an end already
-            self._told.put_nowait(None)
+        told = VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps)
+        status = self._send(told)
+        if status is not None:
+            self._heed(status, drive)
+            sure = pose if self.account.reason in SURE else None
+            self._goal.heard(status.heading_rad, sure.at(now_ns) if sure else None)
+        done_ns = self._clock_ns()
+        to_wheel_s = self._followed(pose, done_ns) if status is not None else math.nan
+        return Tick(None if status is None else told, late_s, (done_ns - now_ns) * NS, to_wheel_s, self.account)
 
     def close(self) -> None:
-        """Slows down to a stand, then releases the driver; the wheels stand when this returns."""
-        self._ending = True
-        deadline_ns = self._clock_ns() + round(LONGEST_RAMP_S / NS)
-        try:
-            while self._sent != STOP and not self._failed and self._clock_ns() < deadline_ns:
-                self()
-                time.sleep(max(0.0, (self._due_ns - self._clock_ns()) * NS))
-        finally:
-            self._driver.close()
+        """Stops the wheels at once and releases the driver."""
+        self._driver.close()
+
+    def _followed(self, pose: Heading | None, done_ns: int) -> float:
+        """How old the pictures of a pose are that is driven by for the first time, s; else NaN."""
+        if pose is None or pose.stamp_ns <= self._driven_ns:
+            return math.nan
+        self._driven_ns = pose.stamp_ns
+        return (done_ns - pose.stamp_ns) * NS
 
     def _rhythm(self, now_ns: int) -> tuple[float, float]:
         """Seconds since the last tick, and by how much this one comes later than in step with the earliest ones."""
-        period_ns = round(self._settings.period_s * 1e9)  # as the graph's ticker has it
+        period_ns = round(self._settings.period_s * 1e9)
         dt_ns = now_ns - self._last_ns if self._last_ns else period_ns
         self._last_ns = now_ns
         due_ns = min(self._due_ns or now_ns, now_ns)
-        self._due_ns = due_ns + (1 + (now_ns - due_ns) // period_ns) * period_ns
-        self.lateness.add((now_ns - due_ns) * NS)
+        missed = (now_ns - due_ns) // period_ns
+        self._due_ns = due_ns + (1 + missed) * period_ns
+        self.account.missed += missed
         return dt_ns * NS, (now_ns - due_ns) * NS
 
     def _situation(self, now_ns: int, late_s: float, pose: Heading | None, command: Arrived | None) -> Situation:
@@ -170,22 +144,23 @@ class Helm:
             pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * NS,
             pose_state="" if pose is None else pose.state,
             command_age_s=(now_ns - command.arrival_ns) * NS if command is not None and valid else math.inf,
-            late_s=late_s, motor_failed=self._failed, motor_stopped=self._stopped,
+            late_s=late_s, motor_failed=self.account.failed, motor_stopped=self._stopped,
             stop_asked=self._stop_ns > self._void_ns, ending=self._ending)
 
     def _judge(self, situation: Situation, now_ns: int) -> None:
         """Notes why the wheels must stand, if they must; voids the commands so far, and counts what stopped a drive."""
-        before, self.reason = self.reason, reason_to_stop(situation, self._settings.deadlines)
-        if not self.reason:
+        before, reason = self.account.reason, reason_to_stop(situation, self._settings.deadlines)
+        self.account.reason = reason
+        if not reason:
             return
         self._void_ns = now_ns
         if not before:
-            self.stops[self.reason] += 1
-            self._report(f"the wheels stop: {self.reason}")
+            self.account.stops[reason] += 1
+            self._report(f"the wheels stop: {reason}")
 
     def _steered(self, now_ns: int, dt_s: float, pose: Heading | None, command: Arrived | None) -> tuple[Drive, float]:
         """The drive within the limits, and the controller's heading that it leads to."""
-        if self.reason or pose is None or command is None:
+        if self.account.reason or pose is None or command is None:
             return self._settings.limits.step(STOP, self._sent, dt_s), self._goal.stay()
         heading_rad = pose.at(now_ns)
         wanted = self._hold.step(command.setpoint, heading_rad, dt_s, self._sent)
@@ -197,22 +172,20 @@ class Helm:
         try:
             status = self._driver.send(command)
         except DriverError as error:
-            if not self._failed:
+            if not self.account.failed:
                 self._report(str(error))
-            self._failed, self._sent = True, STOP  # its own watchdog stops a controller that hears nothing
-            self.errors += 1
+            self.account.failed, self._sent = True, STOP  # its own watchdog stops a controller that hears nothing
+            self.account.errors += 1
             return None
-        if self._failed:
+        if self.account.failed:
             self._report("the motor controller is back")
-        self._failed = False
-        self.sent += 1
-        with suppress(Full):
-            self._told.put_nowait(command)
+        self.account.failed = False
+        self.account.sent += 1
         return status
 
     def _heed(self, status: MotorStatus, drive: Drive) -> None:
         """Takes to heart what the controller says: one that has stopped by itself did not obey."""
         self._stopped = status.watchdog_expired
-        self.expiries += status.watchdog_expired
+        self.account.expiries += status.watchdog_expired
         self._sent = STOP if status.watchdog_expired else drive
-        self.fault = status.fault
+        self.account.fault = status.fault

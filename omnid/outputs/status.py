@@ -10,7 +10,7 @@ from typing import NamedTuple
 from drivers.frame import Camera
 from drivers.v4l2_ledger import CameraState
 from omnid.core.fail_safe import ASKED, COMMAND_STALE, FAILED, IDLE
-from omnid.outputs.helm import Helm
+from omnid.outputs.logbook import Logbook
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
 from omnid.telemetry import Histogram, StageStats, Telemetry
@@ -51,7 +51,7 @@ class Watched(NamedTuple):
     pair: LivePair
     tally: Tally
     to_pose: Histogram
-    helm: Helm | None
+    helm: Logbook | None
     commands: Commands | None
     tickers: frozenset[str]  # their `dropped` are missed deadlines
 
@@ -120,17 +120,16 @@ class StatusReport:
             yield Status(f"omnid: {name} camera", OK if said == state.status else ERROR, said,
                          {"mode": state.mode, "rate_hz": rate, **counts})
 
-    def _helm(self, helm: Helm, commands: Commands | None) -> Status:
-        reason = helm.reason  # and copies of what another thread may add to meanwhile
-        values = {"sent": str(helm.sent), "errors": str(helm.errors), "expiries": str(helm.expiries),
-                  "fault": str(helm.fault)}
-        values |= {f"stopped, {why}": str(count) for why, count in dict(helm.stops).items()}
+    def _helm(self, helm: Logbook, commands: Commands | None) -> Status:
+        account = helm.account  # once, for another thread replaces it
+        values = {name: str(getattr(account, name)) for name in ("sent", "errors", "expiries", "fault", "untold")}
+        values |= {f"stopped, {why}": str(count) for why, count in account.stops.items()}
         values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
         values["tick_late_p999_ms"] = f"{1e3 * helm.lateness.p(0.999):.2f}"
         if commands is not None:
             values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
             values |= {f"refused, {why}": str(count) for why, count in dict(commands.refused).items()}
-        bad = reason == FAILED or helm.failed or helm.fault
+        reason, bad = account.reason, account.reason == FAILED or account.failed or account.fault
         return Status("omnid: wheels", ERROR if bad else OK if reason in CALM else WARN, reason or "driving", values)
 
     def _stage(self, stage: StageStats) -> Status:

@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import pytest
 
-from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.serial_motor import SerialMotor
@@ -22,8 +20,9 @@ from omnid.core import fail_safe
 from omnid.core.command_limits import CommandLimits
 from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import LONGEST_TICK_S, HeadingLimits, Setpoint
-from omnid.messages import Odometry
-from omnid.outputs.helm import TOLD, Helm, HelmSettings
+from omnid.outputs.helm import Arrived, Heading, Helm, HelmSettings
+from omnid.outputs.logbook import Logbook
+from omnid.telemetry import StageStats
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000
@@ -61,7 +60,8 @@ class Bench:
         self.now_ns = 10**12
         self.wheels = Wheels()
         self.said: list[str] = []
-        self.helm = Helm(self.wheels, np.eye(4), SETTINGS, self.said.append, clock_ns=lambda: self.now_ns)
+        self.helm = Helm(self.wheels, SETTINGS, self.said.append, clock_ns=lambda: self.now_ns)
+        self.logbook = Logbook(StageStats("motor"))
 
     @property
     def last(self) -> VelocityCommand:
@@ -69,28 +69,24 @@ class Bench:
 
     def see(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
             age_s: float = 0.0) -> None:
-        self.helm.process(odometry(self.now_ns - round(age_s * 1e9), heading_rad, state, rate_radps))
+        self.helm.see(Heading(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
 
     def ask(self, setpoint: Setpoint = AHEAD) -> None:
         self.now_ns += 1
-        self.helm.command(setpoint)
+        self.helm.command(Arrived(self.now_ns, setpoint))
+
+    def stop(self) -> None:
+        self.helm.stop(self.now_ns)
 
     def tick(self, late_s: float = 0.0) -> None:
         self.now_ns += PERIOD_NS + round(late_s * 1e9)
-        self.helm()
+        self.logbook.add(self.helm())
 
     def drive(self, ticks: int = 20, setpoint: Setpoint = AHEAD) -> None:
         for _ in range(ticks):
             self.see()
             self.ask(setpoint)
             self.tick()
-
-
-def odometry(stamp_ns: int, heading_rad: float, state: str, rate_radps: float) -> Odometry:
-    T = se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [0.0, 0.0, 0.0])
-    velocity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate_radps])
-    nothing_seen: Any = None
-    return Odometry(0, stamp_ns, T, np.eye(6), velocity, np.eye(6), state, 0, 99, 99, nothing_seen)
 
 
 @pytest.fixture
@@ -101,7 +97,7 @@ def bench() -> Bench:
 @pytest.fixture
 def driving(bench: Bench) -> Bench:
     bench.drive()
-    assert bench.last.velocity_mps == 0.3 and bench.helm.reason == ""
+    assert bench.last.velocity_mps == 0.3 and bench.helm.account.reason == ""
     return bench
 
 
@@ -123,37 +119,36 @@ def both(bench: Bench) -> None:
 
 def test_nothing_moves_without_a_pose_or_without_a_command(bench: Bench) -> None:
     bench.tick()
-    assert bench.helm.reason == fail_safe.POSE_STALE
+    assert bench.helm.account.reason == fail_safe.POSE_STALE
     bench.ask()
     bench.tick()
-    assert is_stop(bench.last) and bench.helm.reason == fail_safe.POSE_STALE
+    assert is_stop(bench.last) and bench.helm.account.reason == fail_safe.POSE_STALE
     bench.see()
     bench.tick()
-    assert is_stop(bench.last) and bench.helm.reason == fail_safe.IDLE, "the command came before there was a pose"
+    assert is_stop(bench.last) and bench.helm.account.reason == fail_safe.IDLE, "the command came before there was a pose"
     bench.ask()
     bench.tick()
     assert bench.last.velocity_mps > 0.0
-    assert bench.helm.stops == {} and bench.said == [], "nothing that drove was stopped"
+    assert bench.helm.account.stops == {} and bench.said == [], "nothing that drove was stopped"
 
 
 def test_a_stale_pose_stops(driving: Bench) -> None:
     def late() -> None:
-        driving.helm.process(odometry(driving.now_ns - 10**9, 0.0, "tracking", 0.0))
+        driving.see(age_s=1.0)
         driving.ask()
 
     slows_down(driving, late)
-    assert driving.helm.reason == fail_safe.POSE_STALE and driving.helm.stops == {fail_safe.POSE_STALE: 1}
+    assert driving.helm.account.reason == fail_safe.POSE_STALE and driving.helm.account.stops == {fail_safe.POSE_STALE: 1}
     assert driving.said == ["the wheels stop: the pose is stale"]
 
 
-@pytest.mark.parametrize("odd", [{"state": "lost"}, {"heading_rad": math.nan}, {"rate_radps": math.nan}])
-def test_a_pose_that_is_lost_or_no_number_stops(driving: Bench, odd: dict[str, Any]) -> None:
+def test_a_pose_that_is_lost_stops(driving: Bench) -> None:
     def lose() -> None:
-        driving.see(**odd)
+        driving.see(state="lost")
         driving.ask()
 
     slows_down(driving, lose)
-    assert driving.helm.reason == fail_safe.POSE_LOST
+    assert driving.helm.account.reason == fail_safe.POSE_LOST
     both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0, "found again, and asked anew"
@@ -172,23 +167,23 @@ def test_when_commands_cease_the_wheels_stop(driving: Bench) -> None:
         driving.tick()
     assert driving.last.velocity_mps == 0.3, "0.45 s after the last one"
     slows_down(driving, driving.see)
-    assert driving.helm.stops == {fail_safe.COMMAND_STALE: 1} and driving.helm.reason == fail_safe.IDLE
+    assert driving.helm.account.stops == {fail_safe.COMMAND_STALE: 1} and driving.helm.account.reason == fail_safe.IDLE
 
 
 def test_a_stop_latches_until_a_command_that_comes_later(driving: Bench) -> None:
     driving.ask()
     driving.now_ns += 1
-    driving.helm.stop()
+    driving.stop()
     driving.now_ns += 1
     driving.ask()  # within the same tick: the stop counts
     driving.tick()
-    assert driving.helm.reason == fail_safe.ASKED
+    assert driving.helm.account.reason == fail_safe.ASKED
     slows_down_from = driving.last.velocity_mps
     assert 0.0 < slows_down_from < 0.3
     for _ in range(10):
         driving.see()
         driving.tick()
-    assert is_stop(driving.last) and driving.helm.reason == fail_safe.IDLE
+    assert is_stop(driving.last) and driving.helm.account.reason == fail_safe.IDLE
     both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0
@@ -199,9 +194,9 @@ def test_a_stop_that_comes_in_the_middle_of_a_tick_is_not_lost(driving: Bench) -
     send = driving.wheels.send
 
     def busy(command: VelocityCommand) -> MotorStatus:
-        for arrives in (driving.helm.command, lambda _: driving.helm.stop()):
-            driving.now_ns += 1000
-            arrives(AHEAD)
+        driving.ask()
+        driving.now_ns += 1000
+        driving.stop()
         return send(command)
 
     driving.wheels.send = busy  # type: ignore[method-assign]
@@ -210,7 +205,7 @@ def test_a_stop_that_comes_in_the_middle_of_a_tick_is_not_lost(driving: Bench) -
     driving.wheels.send = send  # type: ignore[method-assign]
     driving.see()
     driving.tick()
-    assert driving.helm.reason == fail_safe.ASKED
+    assert driving.helm.account.reason == fail_safe.ASKED
     slower = driving.last.velocity_mps
     driving.see()
     driving.tick()
@@ -220,11 +215,11 @@ def test_a_stop_that_comes_in_the_middle_of_a_tick_is_not_lost(driving: Bench) -
 def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_void(driving: Bench) -> None:
     arrival_ns = driving.now_ns
     driving.now_ns += 1
-    driving.helm.stop()
+    driving.stop()
     for _ in range(10):
         driving.see()
         driving.tick()
-    driving.helm.command(AHEAD, arrival_ns)
+    driving.helm.command(Arrived(arrival_ns, AHEAD))
     driving.tick()
     assert is_stop(driving.last)
 
@@ -232,33 +227,33 @@ def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_v
 def test_an_overloaded_host_stops_and_commands_from_before_are_void(driving: Bench) -> None:
     both(driving)
     driving.tick(late_s=0.26)
-    assert driving.helm.reason == fail_safe.OVERLOADED and driving.last.velocity_mps < 0.3
+    assert driving.helm.account.reason == fail_safe.OVERLOADED and driving.last.velocity_mps < 0.3
     slows_down_to: list[float] = []
     for _ in range(10):
         driving.see()
         driving.tick()
         slows_down_to.append(driving.last.velocity_mps)
     assert slows_down_to[-1] == 0.0
-    assert driving.helm.lateness.max_s == pytest.approx(0.26)
+    assert driving.logbook.lateness.max_s == pytest.approx(0.26)
 
 
 def test_a_tick_that_is_a_little_late_does_not_stop(driving: Bench) -> None:
     both(driving)
     driving.tick(late_s=0.2)
-    assert driving.helm.reason == "" and driving.last.velocity_mps == 0.3
+    assert driving.helm.account.reason == "" and driving.last.velocity_mps == 0.3
 
 
 def test_lateness_is_measured_against_the_rhythm(bench: Bench) -> None:
     """Ticks that are all late alike are late; after a long gap the rhythm goes on as it was."""
     bench.tick()
     for late_ns in (5_000_000, 5_000_000, 120_000_000, 30_000_000):
-        bench.now_ns = 10**12 + PERIOD_NS + bench.helm.lateness.count * PERIOD_NS + late_ns
+        bench.now_ns = 10**12 + PERIOD_NS + bench.logbook.lateness.count * PERIOD_NS + late_ns
         if late_ns == 30_000_000:
             bench.now_ns += 2 * PERIOD_NS  # that were left out
-        bench.helm()
-    assert [round(bench.helm.lateness.p(q), 3) for q in (0.2, 1.0)] == [0.0, 0.12]
-    assert bench.helm.lateness.p(0.6) == pytest.approx(0.005, rel=0.02)
-    assert bench.helm.lateness.p(0.8) == pytest.approx(0.03, rel=0.02)
+        bench.logbook.add(bench.helm())
+    assert [round(bench.logbook.lateness.p(q), 3) for q in (0.2, 1.0)] == [0.0, 0.12]
+    assert bench.logbook.lateness.p(0.6) == pytest.approx(0.005, rel=0.02)
+    assert bench.logbook.lateness.p(0.8) == pytest.approx(0.03, rel=0.02)
 
 
 def test_a_motor_that_fails_voids_what_was_asked(driving: Bench) -> None:
@@ -266,10 +261,10 @@ def test_a_motor_that_fails_voids_what_was_asked(driving: Bench) -> None:
     for _ in range(3):
         both(driving)
         driving.tick()
-    assert driving.helm.errors == 3 and driving.helm.failed
+    assert driving.helm.account.errors == 3 and driving.helm.account.failed
     driving.wheels.silent = False
     driving.tick()
-    assert is_stop(driving.last) and driving.helm.reason == fail_safe.FAILED
+    assert is_stop(driving.last) and driving.helm.account.reason == fail_safe.FAILED
     driving.see()
     driving.tick()
     assert is_stop(driving.last), "what was asked before the stop is void"
@@ -287,7 +282,7 @@ def test_a_controller_that_stopped_by_itself_starts_from_a_stand(driving: Bench)
     driving.wheels.expired = False
     both(driving)
     driving.tick()
-    assert is_stop(driving.last) and driving.helm.stops == {fail_safe.STOPPED: 1} and driving.helm.expiries == 1
+    assert is_stop(driving.last) and driving.helm.account.stops == {fail_safe.STOPPED: 1} and driving.helm.account.expiries == 1
     both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9
@@ -336,7 +331,7 @@ def test_while_it_slows_down_a_controller_that_steers_keeps_its_heading(bench: B
         bench.see(1.0)
         bench.ask(Setpoint(0.3, 2.0))
         bench.tick()
-    bench.helm.stop()
+    bench.stop()
     bench.now_ns += 1
     bench.see(1.0)
     bench.tick()
@@ -346,7 +341,7 @@ def test_while_it_slows_down_a_controller_that_steers_keeps_its_heading(bench: B
 @contextlib.contextmanager
 def real_helm(twin: SimulatedMotor) -> Iterator[Helm]:
     driver = SerialMotor(twin.port, timeout_s=2.0, watchdog_ms=10_000)
-    helm = Helm(driver, np.eye(4), HelmSettings(0.02, Deadlines(5.0, 5.0, 5.0), limits=LIMITS))
+    helm = Helm(driver, HelmSettings(0.02, Deadlines(5.0, 5.0, 5.0), limits=LIMITS))
     try:
         yield helm
     finally:
@@ -359,26 +354,10 @@ def run_until(helm: Helm, twin: SimulatedMotor, setpoint: Setpoint, happens: Cal
     while not happens():
         assert time.monotonic() < deadline_s, "it did not happen"
         state = twin.state
-        helm.process(odometry(time.monotonic_ns(), state.pose[2] + 0.7, "tracking", state.yaw_rate_radps))
-        helm.command(setpoint)
+        helm.see(Heading(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
+        helm.command(Arrived(time.monotonic_ns(), setpoint))
         helm()
         time.sleep(0.02)
-
-
-def test_bytes_to_wheels_and_a_ramp_at_the_end() -> None:
-    with contextlib.closing(SimulatedMotor()) as twin, real_helm(twin) as helm:
-        run_until(helm, twin, AHEAD, lambda: twin.state.velocity_mps > 0.29)
-        told: list[float] = []
-        send = SerialMotor.send
-
-        def noted(command: VelocityCommand) -> MotorStatus:
-            told.append(command.velocity_mps)
-            return send(helm._driver, command)  # type: ignore[arg-type]
-
-        helm._driver.send = noted  # type: ignore[method-assign]
-        helm.close()
-        assert told[-1] == 0.0 and len(told) >= 3 and told == sorted(told, reverse=True), "a ramp, not a jerk"
-        assert is_stop(twin.last_command) and twin.errors == 0
 
 
 @pytest.mark.parametrize("setpoint", [Setpoint(0.1, 1.1), Setpoint(0.1, None, 0.4), Setpoint(0.0, None, 0.4)])
@@ -391,7 +370,7 @@ def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoin
         else:
             run_until(helm, twin, setpoint, lambda: twin.pose[2] > 0.4)
             assert twin.state.yaw_rate_radps == pytest.approx(0.4, abs=0.2)
-        helm.stop()
+        helm.stop(time.monotonic_ns())
         heading_rad, slowed = twin.pose[2], time.monotonic() + PATIENCE_S
         while not (is_stop(twin.last_command) and twin.state.yaw_rate_radps == 0) and time.monotonic() < slowed:
             helm()
@@ -399,23 +378,33 @@ def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoin
         assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not go on to where nobody wants it any more"
 
 
-def test_close_stops_a_driver_whatever_becomes_of_the_ramp(driving: Bench) -> None:
-    def fails(_: VelocityCommand) -> MotorStatus:
-        raise RuntimeError("a fault of ours")
-
-    driving.wheels.send = fails  # type: ignore[method-assign]
-    with pytest.raises(RuntimeError):
-        driving.helm.close()
-    assert driving.wheels.closed
+def test_at_the_end_the_wheels_slow_down_whatever_is_asked(driving: Bench) -> None:
+    driving.helm.end()
+    assert not driving.helm.stands
+    slows_down(driving, lambda: both(driving))
+    assert driving.helm.stands and driving.helm.account.reason == fail_safe.ENDS
 
 
-def test_what_is_told_is_bounded_and_ends(driving: Bench) -> None:
-    driving.drive(10 * TOLD)
-    commands = driving.helm.told()
-    assert [next(commands).velocity_mps >= 0.0 for _ in range(TOLD)] == [True] * TOLD
-    driving.helm.hush()
-    driving.helm.hush()
-    assert list(commands) == []
+def test_a_controller_that_fails_needs_no_ramp(driving: Bench) -> None:
+    driving.wheels.silent = True
+    driving.tick()
+    assert driving.helm.stands
+
+
+def test_what_a_tick_came_to(driving: Bench) -> None:
+    """A pose counts once on its way to the wheels; what is not sent is not told."""
+    driving.see(age_s=0.01)
+    driving.now_ns += PERIOD_NS
+    tick = driving.helm()
+    assert tick.command == driving.last and tick.to_wheel_s == pytest.approx(0.06)
+    driving.now_ns += PERIOD_NS
+    assert math.isnan(driving.helm().to_wheel_s)
+    driving.wheels.silent = True
+    driving.see()
+    driving.now_ns += 4 * PERIOD_NS
+    tick = driving.helm()
+    assert tick.command is None and math.isnan(tick.to_wheel_s)
+    assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.account.missed == 3
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -435,12 +424,12 @@ def test_whatever_comes_no_limit_breaks_and_nothing_moves_unasked(seed: int) -> 
             asked = True
         if rng.random() < 0.03:
             bench.now_ns += 1
-            bench.helm.stop()
+            bench.stop()
             asked = False
         bench.wheels.silent, bench.wheels.expired = rng.random() < 0.02, rng.random() < 0.02
         count = len(bench.wheels.told)
         bench.tick(late_s=rng.choice([0.0] * 30 + [0.1, 0.5]))
-        asked = asked and not bench.helm.reason
+        asked = asked and not bench.helm.account.reason
         if len(bench.wheels.told) == count or bench.wheels.expired:
             spoken = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)  # the controller stands, or will
             asked = asked and len(bench.wheels.told) > count

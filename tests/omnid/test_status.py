@@ -18,8 +18,10 @@ from drivers.v4l2_ledger import CameraState
 from omnid.config import PairConfig
 from omnid.core.heading import Setpoint
 from omnid.messages import Odometry
-from omnid.outputs.helm import Helm, HelmSettings
+from omnid.outputs.helm import Arrived, Helm, HelmSettings
+from omnid.outputs.helm_link import heading_of
 from omnid.outputs.latency import Latency
+from omnid.outputs.logbook import Logbook
 from omnid.outputs.status import ERROR, OK, SILENT_S, STALE, WARN, StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
@@ -54,10 +56,12 @@ class Daemon:
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = LivePair(rig, PairConfig())
         self.wheels = Wheels()
-        self.helm = Helm(self.wheels, np.eye(4), HelmSettings(0.05))
-        self.commands = Commands(self.helm.command, self.helm.stop, 0.5)
+        self.helm = Helm(self.wheels, HelmSettings(0.05))
+        self.logbook = Logbook(self.stages[1])
+        self.commands = Commands(lambda setpoint, arrival_ns: self.helm.command(Arrived(arrival_ns, setpoint)),
+                                 lambda: self.helm.stop(time.monotonic_ns()), 0.5)
         self.report = StatusReport(Watched(self.telemetry, self.cameras, self.pair, self.tally, self.latency.to_pose,
-                                           self.helm, self.commands, frozenset({"motor"})))
+                                           self.logbook, self.commands, frozenset({"motor"})))
 
     def asked(self) -> dict[str, Status]:
         """All that is said, by name, after it has proved fit for the wire."""
@@ -77,7 +81,10 @@ class Daemon:
                             np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
         self.tally.process(odometry)
         self.latency.process(odometry)
-        self.helm.process(odometry)
+        self.helm.see(heading_of(odometry, np.eye(4)))
+
+    def tick(self) -> None:
+        self.logbook.add(self.helm())
 
 
 @pytest.fixture(scope="module")
@@ -150,17 +157,17 @@ def test_pictures_that_never_meet_and_pictures_that_are_none(daemon: Daemon) -> 
 
 def test_wheels(daemon: Daemon) -> None:
     daemon.pose()
-    daemon.helm.command(Setpoint(0.2, None))
-    daemon.helm()
+    daemon.helm.command(Arrived(time.monotonic_ns(), Setpoint(0.2, None)))
+    daemon.tick()
     said = daemon.asked()["wheels"]
     assert (said.level, said.message) == (OK, "driving") and said.values["sent"] == "1"
     assert "capture_to_wheel_p50_ms" in said.values and "tick_late_p99_ms" in said.values
     daemon.pose("lost")
-    daemon.helm()
+    daemon.tick()
     said = daemon.asked()["wheels"]
     assert (said.level, said.message) == (WARN, "the pose is lost") and said.values["stopped, the pose is lost"] == "1"
     daemon.wheels.fault = 7
-    daemon.helm()
+    daemon.tick()
     said = daemon.asked()["wheels"]
     assert said.level == ERROR and said.values["fault"] == "7"
 
@@ -181,9 +188,7 @@ def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
         while not halt.is_set():
             number = (number + 1) % 300
             if not number:
-                daemon.helm.stops.clear()
                 daemon.commands.refused.clear()
-            daemon.helm.stops[f"reason {number}"] += 1
             daemon.commands.refused[f"reason {number}"] += 1
 
     thread = threading.Thread(target=meddle)

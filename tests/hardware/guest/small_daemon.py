@@ -128,7 +128,7 @@ def main() -> None:
     """Runs until SIGTERM."""
     show_stacks_at_the_end()
     config, tally, bus = RealtimeConfig(), Tally(), Bus(BusConfig())
-    graph = Graph(policy=NEWEST, on_thread=ThreadStart(priorities(config, "motor", "lower")))
+    graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))
     graph.sink("bus", Speaker(bus), graph.stage("picture", Picture(), graph.source("lower", numbers)))
     graph.ticker("motor", 0.05, lambda: None)
     graph.ticker("report", 0.1, Reporter())
