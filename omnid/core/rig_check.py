@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,8 +35,9 @@ DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
 # A viewpoint aside moves near points only, by a tenth of its angle: it matters that much later.
 SHIFT_PART = 0.2
 SIGMAS = 4.0
-# Of the points that are found; of a rig that is wrong by many degrees no more match than by accident.
-MIN_SHARE, MIN_TRIED = 0.08, 400
+# Of a rig that is wrong by many degrees no more match than by accident. Only points that stand out so far [grey levels]
+# in the coarse picture tell so: what noise makes in the dark matches nowhere either.
+MIN_SHARE, MIN_CLEAR, CLEAR_GREY = 0.08, 400, 6.0
 SECTORS, MIN_IN_SECTOR = 12, 20
 # A camera that is no more what it was bends the columns all around; one wall alone may mislead all its matches.
 DRIFTED_PX = 0.3
@@ -43,11 +45,15 @@ DRIFTED_PX = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Points of the lower panorama found in the upper one: (column, row) (N, 2) each; tried is how many were sought."""
+    """Points of the lower panorama found in the upper one: (column, row) (N, 2) each.
+
+    tried is how many were sought, clear how many of these are no noise.
+    """
 
     lower: Array
     upper: Array
     tried: int
+    clear: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,27 +97,36 @@ class RigCheck:
 
     def finding(self) -> RigFinding:
         """What all pairs that are remembered say."""
-        lower = np.concatenate([found.lower for found in self._found] or [np.zeros((0, 2))])
-        upper = np.concatenate([found.upper for found in self._found] or [np.zeros((0, 2))])
-        return judge(Matches(lower, upper, sum(found.tried for found in self._found)), self._cylinder)
+        return judge(together(self._found), self._cylinder)
+
+
+def together(found: Iterable[Matches]) -> Matches:
+    """The matches of several pairs as one."""
+    parts = [Matches(np.zeros((0, 2)), np.zeros((0, 2)), 0, 0), *found]
+    lower, upper = (np.concatenate([getattr(part, side) for part in parts]) for side in ("lower", "upper"))
+    return Matches(lower, upper, sum(part.tried for part in parts), sum(part.clear for part in parts))
 
 
 def match(lower: Wrapped, upper: Wrapped, visible: Flags) -> Matches:
     """Corners of the lower panorama found in the upper one, wherever they are, to a fraction of a pixel."""
     points = corners(lower, visible, POINTS)
-    guess, likely = _coarse(lower, upper, points)
+    guess, likely, clear = _coarse(lower, upper, points)
     there, good = track(lower, upper, points, guess, KLT)
     step = there - guess
     step[:, 0] = (step[:, 0] + lower.width / 2) % lower.width - lower.width / 2
     good &= likely & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + 0.5)
-    return Matches(points[good], there[good], len(points))
+    return Matches(points[good], there[good], len(points), clear)
 
 
-def _coarse(lower: Wrapped, upper: Wrapped, points: Array) -> tuple[Array, Flags]:
-    """Where points (N, 2) are most likely in the upper panorama, to COARSE pixels, and whether that is like enough."""
+def _coarse(lower: Wrapped, upper: Wrapped, points: Array) -> tuple[Array, Flags, int]:
+    """Where points (N, 2) are most likely in the upper panorama, to COARSE pixels, and whether that is like enough.
+
+    Also how many of the points stand out clearly.
+    """
     small_lower, small_upper = (_smaller(wrapped.image) for wrapped in (lower, upper))
     height, width = small_upper.shape
-    guess, likely, padded = points.copy(), np.zeros(len(points), bool), points + np.array([lower.pad_px, 0])
+    guess, likely, clear = points.copy(), np.zeros(len(points), bool), 0
+    padded = points + np.array([lower.pad_px, 0])
     for index, (column, row) in enumerate((padded / COARSE).round().astype(int).tolist()):
         left, right, top = column - PATCH_PX, column + PATCH_PX + 1, row - PATCH_PX
         low, high = max(0, left - ASIDE_PX), min(width, right + ASIDE_PX)
@@ -122,7 +137,8 @@ def _coarse(lower: Wrapped, upper: Wrapped, points: Array) -> tuple[Array, Flags
         _, best, _, (aside, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
         guess[index] += COARSE * (low + aside - left), COARSE * down
         likely[index] = best >= MIN_LIKENESS
-    return guess, likely
+        clear += bool(patch.std() > CLEAR_GREY)
+    return guess, likely, clear
 
 
 def _smaller(image: Image) -> Image:
@@ -141,13 +157,13 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     left = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
     offsets = [abs(median) for _, median, count in left if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    return RigFinding(_verdict(drift, left_px, (len(aside), found.tried)), len(aside), found.tried, offset, spread,
+    return RigFinding(_verdict(drift, left_px, (len(aside), found.clear)), len(aside), found.tried, offset, spread,
                       _by_azimuth(found.lower, aside, cylinder), left_px, drift)
 
 
 def _verdict(drift: Drift | None, left_px: float, counts: tuple[int, int]) -> Verdict:
-    matches, tried = counts
-    if tried >= MIN_TRIED and matches < MIN_SHARE * tried:
+    matches, clear = counts
+    if clear >= MIN_CLEAR and matches < MIN_SHARE * clear:
         return "broken"
     if drift is None:
         return "unknown"

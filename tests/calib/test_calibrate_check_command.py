@@ -10,24 +10,15 @@ import pytest
 
 from calib import se3
 from calib.camera import Mask
-from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from calib.unified import UnifiedCamera
 from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
 from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
+from tests.scenes.rigs import misturned
 
 Turn = tuple[float, float, float]
-
-
-def misturned(rig: Rig, turn_deg: Turn) -> Rig:
-    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
-    R = rig.T_rect_rig[:3, :3]
-    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
-    back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
-    T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
-    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
 
 
 @pytest.fixture(scope="module")

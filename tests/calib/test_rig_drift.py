@@ -12,6 +12,7 @@ from calib.camera import Array, Mask
 from calib.rig import Rig
 from calib.rig_drift import corrected, find_drift
 from calib.rim_check import rim_shift
+from tests.scenes.rigs import misturned
 
 
 def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
@@ -21,15 +22,6 @@ def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
         seen = se3.apply(true.T_cam_rig, points)
         found.append(seen @ wrong.T_cam_rig[:3, :3] @ assumed.T_rect_rig[:3, :3].T)
     return found[0], found[1]
-
-
-def misturned(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
-    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
-    R = rig.T_rect_rig[:3, :3]
-    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
-    back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
-    T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
-    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (-3.0, 2.0, 5.0), (0, 0, 0)])

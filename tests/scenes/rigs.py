@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib import se3
@@ -40,3 +42,12 @@ def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, ri
 def _T_cam_rig(crooked_deg: tuple[float, float, float], viewpoint_mm: tuple[float, float, float]) -> Array:
     R = se3.rotation_exp(np.deg2rad(crooked_deg)) @ R_RIG_CAM
     return se3.inverse(se3.transform(R, 1e-3 * np.array(viewpoint_mm)))
+
+
+def misturned(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
+    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
+    R = rig.T_rect_rig[:3, :3]
+    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
+    back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
+    T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
+    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
