@@ -15,7 +15,9 @@ from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports
 from omnid.transport.image_codec import image_cdr, image_topic
 
 Recorded: TypeAlias = Frame | Outgoing
-_WAITING: Final = 64  # of what other threads add
+_WAITING: Final = 256  # of what other threads add
+_HELD: Final = 128  # of these, so that none is forgotten while its time does not come: a clock may have been set
+_POSE_AGE_NS: Final = 10**9  # a pose is told when it has been found, seldom later than that after its pictures
 
 
 class FrameRecorder:
@@ -40,18 +42,19 @@ class FrameRecorder:
     def process(self, message: Recorded) -> None:
         """Records what there is to say about a message."""
         stamp_ns = message.stamp_ns + self._offset_ns
+        self._write_added(stamp_ns if isinstance(message, Odometry) else stamp_ns - _POSE_AGE_NS)
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
             if isinstance(message, Odometry) and self._encode is not None:
                 self._write(self._state(replace(message, stamp_ns=stamp_ns)), stamp_ns)
         except OmnidError:  # a stamp that is no time
             self.unfit += 1
-        while self._added:
-            said, at_ns = self._added.popleft()
-            self._write([said], at_ns)
 
     def add(self, said: Encoded, stamp_ns: int) -> None:
-        """Records a message that is ready, at its Unix time, with the next one that is processed; from any thread."""
+        """Records a message that is ready, at its Unix time, once that has been reached; from any thread.
+
+        Poses tell their state too, at the time of their pictures: statuses shall not go back in time for that.
+        """
         self._added.append((said, stamp_ns))
 
     def finish(self) -> None:
@@ -59,8 +62,15 @@ class FrameRecorder:
         self.close()
 
     def close(self) -> None:
-        """Makes the last file whole; a second call does nothing."""
+        """Writes what was added since and makes the last file whole; a second call does nothing."""
+        self._write_added()
         self._log.close()
+
+    def _write_added(self, until_ns: int | None = None) -> None:
+        """Writes what was added, of times up to the given one."""
+        while self._added and (until_ns is None or self._added[0][1] <= until_ns or len(self._added) > _HELD):
+            said, at_ns = self._added.popleft()
+            self._write([said], at_ns)
 
     def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[Encoded]:
         if isinstance(message, Frame):

@@ -126,6 +126,27 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
 
 
+def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -> None:
+    """A pose tells its state at the time of its pictures, when reports of later times have been made already."""
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), 9, OFFSET_NS),
+                             offset_ns=OFFSET_NS)
+    report = status_report(START_NS + 2, [Status("omnid: test", 0, "fine", {})])
+    recorder.process(frame(-1, "lower"))
+    recorder.add(report, START_NS + 2)
+    for n, state in enumerate(("tracking", "lost", "tracking", "lost")):
+        recorder.process(odometry(n, state))
+    for n in range(200):  # of a clock that was set: held back, but none is forgotten
+        recorder.add(report, START_NS * 2 + n)
+        recorder.process(frame(n, "lower"))
+    recorder.finish()
+    times_ns = []
+    for path in recorded(tmp_path / "log"):
+        with path.open("rb") as file:
+            found = make_reader(file).iter_messages(topics=["/omnid/status"], log_time_order=False)
+            times_ns += [message.log_time - START_NS for _, _, message in found]
+    assert times_ns[:5] == [0, 1, 2, 2, 3] and len(times_ns) == 205
+
+
 def attached(path: Path) -> list[str]:
     with path.open("rb") as file:
         return [attachment.name for attachment in make_reader(file).iter_attachments()]
