@@ -180,6 +180,13 @@ class Daemon:
         """Whether the process runs."""
         return self.process.poll() is None
 
+    @property
+    def steering(self) -> int:
+        """The process that steers."""
+        tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
+        children = [int(word) for task in tasks for word in (task / "children").read_text().split()]
+        return next(pid for pid in children if "helm_process" in Path(f"/proc/{pid}/cmdline").read_text())
+
     def tell(self, line: str) -> None:
         """One line for its standard input."""
         assert self.process.stdin is not None
