@@ -1,0 +1,125 @@
+"""A live run is recorded, and its recording is a log like any other: replayed, it gives the same trajectory again."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from calib.rig_file import parse_rig, rig_toml
+from drivers.mcap_reader import LogReader
+from omnid.recorded_run import read_run
+from tests.replay.command import Command
+from tests.replay.live import Base, Operator, answers, command_line, free_port, started, wait_until
+
+POSES = 18
+IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
+SAID = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/status", "/omnid/drive", *IMAGES}
+COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
+
+
+class Message(NamedTuple):
+    """One message of a recording."""
+
+    topic: str
+    log_ns: int
+    content: Any  # as rosbags gives it
+
+    @property
+    def stamp_ns(self) -> int:
+        """That of its header."""
+        first = self.content.transforms[0] if self.topic == "/tf" else self.content
+        return int(first.header.stamp.sec) * 10**9 + int(first.header.stamp.nanosec)
+
+
+@pytest.fixture(scope="module")
+def recording(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `omnid run` wrote: slow enough for each pair on an idle machine, somebody drives, twin wheels obey."""
+    folder = tmp_path_factory.mktemp("recording")
+    port, base = free_port(), Base(folder)
+    more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={folder / 'kept'}",
+            "--set", "record.free_mb=0")
+    with started(command_line(scene, port, base.port, *more), port) as daemon:
+        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
+        operator = Operator(port)
+        operator.drive(0.3)
+        wait_until(lambda: len(operator.poses) > POSES and base.drives, "poses and motion")
+        operator.close()
+        code, err = daemon.end()
+    base.close()
+    assert code == 0, err
+    (path,) = (folder / "kept").glob("*.mcap")
+    return path
+
+
+@pytest.fixture(scope="module")
+def messages(recording: Path) -> list[Message]:
+    """All of it, as another program reads it."""
+    with AnyReader([recording]) as bag:
+        return [Message(place.topic, at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data
+                in bag.messages()]
+
+
+def of(messages: list[Message], topic: str) -> list[Message]:
+    return [message for message in messages if message.topic == topic]
+
+
+def test_all_that_is_said_is_in_it_with_rig_and_settings(
+    recording: Path, messages: list[Message], scene: Path
+) -> None:
+    assert {message.topic for message in messages} >= SAID
+    reader = LogReader(recording)
+    attached = reader.attachments()
+    reader.close()
+    settings = tomllib.loads(attached["omnid.toml"].decode())
+    assert settings["record"]["enabled"] and settings["motor"]["port"].endswith("motor")
+    ours, theirs = parse_rig(attached["rig.toml"]), parse_rig((scene / "rig.toml").read_bytes(), scene)
+    assert rig_toml(ours).splitlines()[:30] == rig_toml(theirs).splitlines()[:30]
+    assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
+    assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
+    parts = {status.name for message in of(messages, "/omnid/status") for status in message.content.status}
+    assert parts >= {"omnid: odometry", "omnid: wheels", "omnid: lower camera", "omnid: stage stereo"}
+
+
+def test_its_stamps_agree(messages: list[Message]) -> None:
+    """Every message is logged at its own stamp; a pose has that of a picture of the lower camera."""
+    assert all(message.log_ns == message.stamp_ns for message in messages)
+    lower = {message.stamp_ns for message in of(messages, IMAGES[0])}
+    poses = [message.stamp_ns for message in of(messages, "/omnid/odom")]
+    assert set(poses) <= lower and len(poses) > POSES // 2
+    for topic in ("/omnid/pose", "/tf"):
+        assert [message.stamp_ns for message in of(messages, topic)] == poses
+
+
+def test_every_pose_is_told_alike(messages: list[Message]) -> None:
+    """Odometry, PoseStamped and the transform say the same."""
+    told = zip(*(of(messages, topic) for topic in ("/omnid/odom", "/omnid/pose", "/tf")), strict=True)
+    for odom, pose, tf in (tuple(message.content for message in three) for three in told):
+        assert odom.pose.pose == pose.pose
+        edge = next(edge for edge in tf.transforms if edge.child_frame_id == "base_link")
+        position, moved = odom.pose.pose.position, edge.transform.translation
+        assert (position.x, position.y, position.z) == (moved.x, moved.y, moved.z)
+        assert odom.pose.pose.orientation == edge.transform.rotation
+
+
+def test_a_replay_of_it_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
+    """Its own pictures, rig and attachments are all that the replay is given."""
+    again = tmp_path / "again.mcap"
+    assert omnid.replay(recording, "--record", again).code == 0
+    code, out, err = omnid("diff", recording, again, *COMPARABLE)
+    assert code == 0, out + err
+    assert "rig        the same" in out and "record.enabled: A True, B False" in out
+    if read_run(recording).poses.stamps_ns.tolist() == read_run(again).poses.stamps_ns.tolist():
+        assert "to the last bit the same" in out, "not a pair was dropped"
+
+
+def test_a_setting_that_matters_is_found(omnid: Command, tmp_path: Path, recording: Path) -> None:
+    other = tmp_path / "other.mcap"
+    assert omnid.replay(recording, "--record", other, "--method", "paper").code == 0
+    code, out, _ = omnid("diff", recording, other, "--tolerance-mm", 0.1)
+    assert code == 1 and "odometry.method: A 'default', B 'paper'" in out
+    assert re.search(r"more than 0\.1 mm or 0\.1 deg first at \d+\.\d{9} \(\d+\.\d{3} s\): ", out)
