@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-import ast
-import xml.etree.ElementTree as ElementTree
-from collections import defaultdict
-from pathlib import Path
-
 import pytest
 
-from tests.hardware.machine import Guest, Result, run_in_vm
+from tests.hardware.guest_report import names_in, passed, run_tests
+from tests.hardware.machine import Guest, Result
 
 pytestmark = pytest.mark.vm
-SCRIPT = Path(__file__).with_name("guest") / "cameras.py"
-NAMES = [entry.name for entry in ast.parse(SCRIPT.read_text("utf-8")).body
-         if isinstance(entry, ast.FunctionDef) and entry.name.startswith("test_")]
+SCRIPT = "cameras.py"
 
 
 @pytest.fixture(scope="module")
 def result() -> Result:
-    report = "--junitxml=/mnt/job/results/report.xml"
-    command = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10", report]
-    return run_in_vm([*command, "tests/hardware/guest/cameras.py"], Guest(timeout_s=400))
+    return run_tests(SCRIPT, Guest(timeout_s=400))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", names_in(SCRIPT))
 def test_in_the_guest(result: Result, name: str) -> None:
-    cases = defaultdict(list)
-    for case in ElementTree.fromstring(result.files["report.xml"]).iter("testcase"):
-        cases[str(case.get("name")).partition("[")[0]].append(case)
-    assert cases[name], f"it was not run:\n{result.output[-4000:]}"
-    faults = [fault.text for case in cases[name] for fault in case if fault.tag in ("failure", "error", "skipped")]
-    assert not faults, "\n".join(map(str, faults))
+    passed(result, name)

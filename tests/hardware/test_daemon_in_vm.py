@@ -5,7 +5,6 @@ The pictures are those of the sample log, shown by two loopback cameras; ttyS1 l
 
 from __future__ import annotations
 
-import ast
 import json
 import select
 import socket
@@ -13,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -28,14 +26,13 @@ from drivers.simulated_line import SimulatedLine
 from drivers.simulated_motor import LONGEST_ABSENCE_S
 from omnid.log_rig import attached_rig
 from omnid.stages.geometry import with_rims
+from tests.hardware.guest_report import names_in, passed, run_tests
 from tests.hardware.image import ROOT
-from tests.hardware.machine import Guest, Result, run_in_vm
+from tests.hardware.machine import Guest, Result
 
 pytestmark = pytest.mark.vm
-SCRIPT = Path(__file__).with_name("guest") / "daemon.py"
+SCRIPT = "daemon.py"
 SAMPLE = ROOT / "omnid/sample/log.mcap"
-NAMES = [entry.name for entry in ast.parse(SCRIPT.read_text("utf-8")).body
-         if isinstance(entry, ast.FunctionDef) and entry.name.startswith("test_")]
 STEP_S = 0.01
 
 
@@ -122,20 +119,14 @@ def rig_of_the_sample() -> bytes:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    report = "--junitxml=/mnt/job/results/report.xml"
-    command = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10", "-x", report]
     with controller(tmp_path_factory.mktemp("ports")) as base:
         guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=900)
-        return run_in_vm([*command, "tests/hardware/guest/daemon.py"], guest)
+        return run_tests(SCRIPT, guest, "-x")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", names_in(SCRIPT))
 def test_in_the_guest(result: Result, name: str) -> None:
-    cases = [case for case in ElementTree.fromstring(result.files["report.xml"]).iter("testcase")
-             if case.get("name") == name]
-    assert cases, f"it was not run:\n{result.output[-4000:]}"
-    faults = [fault.text for case in cases for fault in case if fault.tag in ("failure", "error", "skipped")]
-    assert not faults, "\n".join(map(str, faults))
+    passed(result, name)
 
 
 def omnid(*words: object) -> subprocess.CompletedProcess[str]:

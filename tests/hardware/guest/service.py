@@ -10,19 +10,16 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-SYSTEMD = Path("/opt/omnid/systemd")
-DROP_INS = Path("/etc/systemd/system/omnid.service.d")
+from tests.hardware.guest.unit import DROP_INS, SYSTEMD, restarted, run, said, show, until
+
 REPORT = Path("/var/lib/omnid/report.json")
 OPEN = "/etc/omnid", "/opt/omnid", "/dev/vda", "/dev/kmsg"  # to everybody: it is the unit that closes them
-LIMIT_S = 400.0  # the clock of a guest on a busy host may run several times too fast
 FIFO, OTHER = os.SCHED_FIFO, os.SCHED_OTHER
 DAEMON = """[Service]
 ExecStart=
@@ -33,23 +30,6 @@ TimeoutStartSec=400
 """
 
 
-def run(*command: str) -> str:
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout.strip()
-
-
-def show(what: str) -> str:
-    return run("systemctl", "show", "omnid", "-p", what, "--value")
-
-
-def until(what: Callable[[], object]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not what():
-        assert time.monotonic() < end_s, run("journalctl", "-u", "omnid", "--no-pager", "-n", "60")
-        time.sleep(0.3)
-
-
 def reported() -> dict[str, Any]:
     """What the daemon that runs now has found."""
     def is_there() -> bool:
@@ -57,17 +37,6 @@ def reported() -> dict[str, Any]:
 
     until(is_there)
     return dict(json.loads(REPORT.read_text()))
-
-
-def restarted(pid: int) -> None:
-    """Waits for another daemon in the place of this one."""
-    until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
-
-
-def said() -> list[tuple[int, str]]:
-    """Priority and text of all that is in the journal of the unit."""
-    lines = run("journalctl", "-u", "omnid", "--no-pager", "-o", "json").splitlines()
-    return [(int(entry["PRIORITY"]), entry["MESSAGE"]) for entry in map(json.loads, lines)]
 
 
 @pytest.fixture(scope="module", autouse=True)
