@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from omnid import __version__
 
-COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "record", "log", "diff", "doctor",
+COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "log", "diff", "doctor",
             "config")
 MODULES = {"eval": "evaluate"}  # eval is a name that Python has taken
 WRONG = 2

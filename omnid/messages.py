@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.klt import Wrapped
+from omnid.core.sight import Features
 from omnid.core.voxel_map import MapPoints
 
 Array = NDArray[np.float64]
@@ -62,6 +63,7 @@ class Odometry:
     inliers: int  # landmarks that agree with the pose
     tracks: int  # landmarks that were found
     depth: Depth
+    features: Features = field(default_factory=Features)  # for whoever looks on; the paper's method gives none
 
 
 @dataclass(frozen=True, slots=True, eq=False)

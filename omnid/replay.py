@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,10 @@ from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.graph import LOSSLESS, NEWEST, Graph, Stream
+from omnid.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.log_rig import attached_rig
 from omnid.outputs.bus import BusSink
-from omnid.outputs.encoded import Encoder
+from omnid.outputs.encoded import Encoder, Outgoing
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.outputs.motor import MotorTick, open_motor
 from omnid.outputs.progress import Progress
@@ -35,10 +36,12 @@ from omnid.settings import dump
 from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
+from omnid.telemetry import Telemetry
 from omnid.transport.bus import Bus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
+Watch: TypeAlias = Callable[[Geometry, Telemetry], Sink[Outgoing]]
 READER_DROPS = ("late", "duplicate", "broken", "broken_records")
 
 
@@ -56,6 +59,8 @@ class Options:
     realtime: bool = False
     quiet: bool = False
     settings: Path | None = None  # where the configuration was read, so that nothing is written over it
+    watch: Watch | None = None  # makes one who is told everything, in the place of a recorder
+    map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
     def files(self) -> list[tuple[str, Path]]:
@@ -136,7 +141,8 @@ class Replay:
         """Opens all outputs: what cannot be opened is said now."""
         options, config = self._options, self._config
         encode = Encoder(place.rig.T_base_rig, config.record.cloud_points)
-        motor = recorder = None
+        motor = None
+        recorder = options.watch(place, self._graph.telemetry) if options.watch else None
         bus = self._bus(encode, closing) if options.publish else None
         if config.motor.port:
             driver, self._twin = open_motor(config.motor, closing)
@@ -145,7 +151,7 @@ class Replay:
             attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
             recorder = Recorder(options.record, attachments, config.bus.robot, encode)
             closing.callback(recorder.close)
-        ends = Ends({"tally": self._tally}, {}, recorder, bus, motor)
+        ends = Ends({"tally": self._tally}, {}, recorder, bus, motor, map_every_s=options.map_every_s)
         if options.tum:
             ends.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from omnid.core.motion_filter import MotionFilter
 from omnid.core.patches import disparity_slopes
 from omnid.core.pose_search import PoseSearch
 from omnid.core.relocalisation import Relocaliser
-from omnid.core.sight import Sight
+from omnid.core.sight import Features, Sight
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -60,6 +60,7 @@ class Ego:
     resets: int
     tracked: int
     agreeing: int
+    features: Features = field(default_factory=Features)
 
 
 class EgoMotion:
@@ -92,13 +93,13 @@ class EgoMotion:
 
     def _begin(self, sight: Sight, usable: Flags, dt_s: float) -> Ego:
         """Starts, or starts again, a map at the present pose if the sight has enough corners."""
-        self._add_keyframe(sight, usable, np.zeros((0, 2)))
+        new = self._add_keyframe(sight, usable, np.zeros((0, 2)))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._doubt(dt_s)
             return self._ego(LOST, 0, 0)
         self._previous, self._refused, self._strange, self._blind_s = sight.lower, 0, 0, 0.0
-        return self._ego(TRACKING, len(self._map), len(self._map))
+        return self._ego(TRACKING, len(self._map), len(self._map), Features(new=new))
 
     def _locate(self, seen: tuple[Sight, Flags], previous: Wrapped, expected: Array, dt_s: float) -> Fit | None:
         """The best supported pose of all guesses: as expected; in doubt, after a turn; after a break, at a keyframe.
@@ -140,8 +141,8 @@ class EgoMotion:
         self._refused = self._strange = 0
         self._blind_s = 0.0
         self._pattern.observe(sight.lower.panorama, self._T)
-        self._refresh_map(sight, usable, fit)
-        return self._ego(DEGRADED if doubtful else TRACKING, fit.tracked, fit.agreeing)
+        features = Features(fit.pixels, fit.rejected, self._refresh_map(sight, usable, fit))
+        return self._ego(DEGRADED if doubtful else TRACKING, fit.tracked, fit.agreeing, features)
 
     def _refuse(self, sight: Sight, usable: Flags, expected: Array, dt_s: float) -> Ego:
         """Goes on as expected, slowing down, with a covariance that grows; starts anew when nothing helps."""
@@ -174,8 +175,8 @@ class EgoMotion:
     def _is_textured(self, sight: Sight, usable: Flags) -> bool:
         return len(corners(sight.lower, usable, 4 * self._limits.min_inliers)) >= 2 * self._limits.min_inliers
 
-    def _refresh_map(self, sight: Sight, usable: Flags, fit: Fit) -> None:
-        """Forgets landmarks that stay away, and adds a keyframe where too few are left."""
+    def _refresh_map(self, sight: Sight, usable: Flags, fit: Fit) -> Array:
+        """Forgets landmarks that stay away, and adds a keyframe where too few are left; the pixels of new landmarks."""
         self._map.saw(sight.lower, fit.landmarks, fit.pixels)
         agreeing, limits = len(fit.landmarks), self._limits
         if limits.keyframes == 1:  # frame to frame: all landmarks are new, for those of before go with their keyframe
@@ -184,10 +185,11 @@ class EgoMotion:
         self._since_keyframe += 1
         sparse = agreeing < limits.refresh * limits.features and self._since_keyframe >= limits.sparse_every
         if sparse or agreeing < limits.refresh * self._most_agreeing or agreeing < limits.sure_inliers:
-            self._add_keyframe(sight, usable, fit.pixels)
+            return self._add_keyframe(sight, usable, fit.pixels)
+        return np.zeros((0, 2))
 
-    def _add_keyframe(self, sight: Sight, usable: Flags, known: Array) -> None:
-        """Fills the gaps between known landmarks with new ones, located by SAD and refined by KLT."""
+    def _add_keyframe(self, sight: Sight, usable: Flags, known: Array) -> Array:
+        """Fills the gaps between known landmarks with new ones, located by SAD and refined by KLT; their pixels."""
         free = clear_around(usable, known, 9)
         points = corners(sight.lower, free, self._limits.features - len(known))
         guess = points[:, 1] + nearby_disparity(sight.disparity, points)
@@ -199,6 +201,7 @@ class EgoMotion:
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.remember(sight, keyframe)
         self._most_agreeing = self._since_keyframe = 0
+        return points[located]
 
     def _inherited(self, fit: Fit) -> Array:
         """Covariance (6, 6) that comes with the keyframes in which the agreeing landmarks are anchored."""
@@ -207,9 +210,9 @@ class EgoMotion:
         parts = [s * A[seq] @ self._map.keyframes[seq].covariance @ A[seq].T for seq, s in share.items()]
         return np.asarray(sum(parts, np.zeros((6, 6))))
 
-    def _ego(self, state: str, tracked: int, agreeing: int) -> Ego:
+    def _ego(self, state: str, tracked: int, agreeing: int, features: Features | None = None) -> Ego:
         return Ego(self._T, self._covariance, self._filter.velocity, self._filter.velocity_covariance, state,
-                   self._resets, tracked, agreeing)
+                   self._resets, tracked, agreeing, features or Features())
 
 
 def _better(a: Fit | None, b: Fit | None) -> Fit | None:

@@ -24,6 +24,7 @@ class Fit:
     agreeing: int
     landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) of the local map
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) where they are seen
+    rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) where others were tracked to
 
     @property
     def share(self) -> float:

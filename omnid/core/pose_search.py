@@ -56,7 +56,9 @@ class PoseSearch:
             return None
         # Both must speak for the pose: the tracks from the last sight, and the patches of the keyframes.
         agreeing_both = min(int(kept.sum()), len(fine.landmarks))
-        return replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=agreeing_both)
+        rejected = tracks.pixels[~np.isin(tracks.index, fine.landmarks)]
+        return replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=agreeing_both,
+                       rejected=rejected)
 
     def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
         """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,3 +19,16 @@ class Sight:
     upper: Wrapped
     disparity: NDArray[np.float32]
     usable: NDArray[np.bool_]  # (H, W)
+
+
+def _nowhere() -> NDArray[np.float64]:
+    return np.zeros((0, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """What became of the features of a sight: pixels (N, 2) column, row in the lower panorama, to be looked at."""
+
+    agreeing: NDArray[np.float64] = field(default_factory=_nowhere)  # landmarks that the pose rests on
+    rejected: NDArray[np.float64] = field(default_factory=_nowhere)  # found, but where the pose does not have them
+    new: NDArray[np.float64] = field(default_factory=_nowhere)  # landmarks from now on

@@ -43,7 +43,8 @@ class OdometryStage:
         covariance = in_axes(T_odom_rig, self._in_rig(ego.covariance))
         velocity = self._to_rig @ ego.velocity
         return Odometry(depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity,
-                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.agreeing, ego.tracked, depth)
+                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.agreeing, ego.tracked, depth,
+                        ego.features)
 
     def _in_rig(self, covariance: Array) -> Array:
         """Covariance (6, 6) of a small motion of the rectified frame, as one of the rig frame."""

@@ -1,0 +1,102 @@
+"""`omnid view`: path, map, pictures with their features, depth and plots, in rerun."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # whoever asks for another command loads none of this
+    from omnid.config import Config
+    from omnid.viewing.places import Place
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `view` to the command line."""
+    parser = subparsers.add_parser("view", help="see a log or a robot: path, map, features, depth, plots (needs rerun)")
+    parser.add_argument("log", type=Path, nargs="?", metavar="LOG", help="a recording, which is shown as it stands, or "
+                        "a log of pictures, which goes through the stages; without one, a robot is listened to")
+    where = parser.add_argument_group("where it is shown; default: a window")
+    where.add_argument("-o", "--output", type=Path, metavar="FILE.rrd", help="a file that `rerun FILE.rrd` opens, here "
+                       "or elsewhere; needs no display")
+    where.add_argument("--web", action="store_true", help="a browser of this machine")
+    _add_log(parser)
+    _add_robot(parser)
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_log(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("a log")
+    group.add_argument("--replay", action="store_true", help="compute anew from the pictures of a recording")
+    group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
+    group.add_argument("--lower", metavar="TOPIC", help="the lower camera's pictures; default: by name")
+    group.add_argument("--upper", metavar="TOPIC", help="the upper camera's pictures; default: by name")
+    group.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("a robot")
+    group.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings, in a recording "
+                       "the only one")
+    group.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
+                       "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+    group.add_argument("--seconds", type=float, metavar="N", help="end after so long; default: with Ctrl-C")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Shows it; 1 where there was no pose to show."""
+    from omnid.config import Config
+    from omnid.settings import load
+
+    _refuse_contradictions(args)
+    _require_rerun()
+    from omnid.viewing.show import check_file, place_for
+
+    config = load(Config, args.config, args.overrides)
+    check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
+               ("the configuration that is read", args.config))
+    place = place_for(args.output, args.web)
+    return _robot(args, config, place) if args.log is None else _log(args, config, place)
+
+
+def _log(args: argparse.Namespace, config: Config, place: Place) -> int:
+    from omnid.viewing.show import Log, show_log
+
+    log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.quiet)
+    return show_log(log, config, args.config, place)
+
+
+def _robot(args: argparse.Namespace, config: Config, place: Place) -> int:
+    from dataclasses import replace
+
+    from omnid.viewing.show import show_robot
+
+    bus = replace(config.bus, robot=args.robot or config.bus.robot, connect=tuple(args.connect or config.bus.connect))
+    return show_robot(bus, args.seconds, place)
+
+
+def _refuse_contradictions(args: argparse.Namespace) -> None:
+    from omnid.errors import OmnidError
+
+    live = {"--connect": args.connect, "--seconds": args.seconds}
+    of_log = {"--replay": args.replay, "--rig": args.rig, "--lower": args.lower, "--upper": args.upper}
+    wrong = [name for name, value in (of_log if args.log is None else live).items() if value]
+    if wrong:
+        instead = "name a LOG as well" if args.log is None else "leave out the LOG to listen to a robot"
+        raise OmnidError(f"{wrong[0]} does not go with {'a robot' if args.log is None else args.log}: {instead}")
+    if args.output is not None and args.web:
+        raise OmnidError("-o and --web: expected one place to show it in; leave one of them out")
+    if args.seconds is not None and not 0 < args.seconds < 1e9:
+        raise OmnidError(f"--seconds {args.seconds} is no time to look for; give seconds above 0, or leave it out")
+
+
+def _require_rerun() -> None:
+    from importlib.util import find_spec
+
+    from omnid.errors import OmnidError
+
+    if find_spec("rerun") is None:
+        raise OmnidError("omnid view draws with rerun, which is not installed here: pip install 'omnid[view]'")

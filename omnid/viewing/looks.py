@@ -1,0 +1,126 @@
+"""How things look: colours, sizes and shapes that can be told apart in grey too. Numbers in, numbers out.
+
+Colours (r, g, b) are those of Okabe and Ito, which the colour-blind tell apart.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+SIGMAS: Final = 3.0  # of the ellipsoid
+VISIBLE_M: Final = 0.05  # a smaller ellipsoid is magnified
+MOST_MAGNIFIED: Final = 1000
+FARTHEST_MM: Final = 65535
+SPOT_PX: Final = 3  # side of what a located pixel becomes in the depth picture
+
+
+class Look(NamedTuple):
+    """A colour and a size in pixels of the screen."""
+
+    colour: Colour
+    size_px: float
+
+
+UNKNOWN: Final = Look((150, 150, 150), 1.5)
+STATES: Final = {  # the worse, the thicker
+    "tracking": Look((86, 180, 233), 1.5),
+    "degraded": Look((230, 159, 0), 3.0),
+    "lost": Look((213, 94, 0), 5.0),
+}
+AGREEING: Final = Look((86, 180, 233), 2.5)  # dots
+REJECTED: Final = Look((213, 94, 0), 5.0)  # crosses
+NEW: Final = Look((240, 228, 66), 4.0)  # squares
+AXES: Final[tuple[Colour, ...]] = ((213, 94, 0), (0, 158, 115), (0, 114, 178))  # x, y, z
+
+
+def state_look(state: str) -> Look:
+    """The look of a way in that state."""
+    return STATES.get(state, UNKNOWN)
+
+
+class Ellipsoid(NamedTuple):
+    """Where a position is in nearly all cases, about the estimate; magnified so that it can be seen."""
+
+    half_m: Array  # (3,) half axes as they are drawn
+    R: Array  # (3, 3) whose columns are the axes; right-handed
+    magnified: int
+
+    @property
+    def largest_m(self) -> float:
+        """The longest half axis as it is."""
+        return float(self.half_m.max()) / self.magnified
+
+
+def ellipsoid(covariance: Array) -> Ellipsoid | None:
+    """The ellipsoid of SIGMAS deviations for a covariance (3, 3) [m^2]; None unless that is finite.
+
+    Its axes are the eigenvectors. What is too small to be seen is drawn 10, 100 or 1000 times as large.
+    """
+    if not np.isfinite(covariance).all():
+        return None
+    variances, axes = np.linalg.eigh(covariance)
+    half_m = SIGMAS * np.sqrt(np.maximum(0.0, variances))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    magnified = magnification(float(half_m.max()))
+    return Ellipsoid(magnified * half_m, axes, magnified)
+
+
+def magnification(size_m: float) -> int:
+    """By how many times, a power of ten, something must be drawn larger to be seen."""
+    if size_m <= 0:
+        return 1
+    wanted = 10 ** max(0, math.ceil(math.log10(VISIBLE_M / size_m)))
+    return int(min(MOST_MAGNIFIED, wanted))
+
+
+def crosses(pixels: Array, half_px: float) -> NDArray[np.float32]:
+    """Lines (2N, 2, 2) that cross at pixels (N, 2)."""
+    corners = np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]], float) * half_px
+    return (pixels[:, None, None, :] + corners).reshape(-1, 2, 2).astype(np.float32)
+
+
+def squares(pixels: Array, half_px: float) -> NDArray[np.float32]:
+    """Closed lines (N, 5, 2) around pixels (N, 2)."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float) * half_px
+    return (pixels[:, None, :] + corners).astype(np.float32)
+
+
+def depth_picture(disparity: NDArray[np.float32], focal_baseline: float) -> NDArray[np.uint16]:
+    """Distances [mm] from the rig's axis (H, W), 0 unknown, each located pixel as a spot; the nearest covers others.
+
+    disparity: (H, W) px, NaN unknown; focal_baseline: of the panorama, px times m.
+    """
+    known = np.nan_to_num(disparity, nan=0.0)
+    spots = np.asarray(cv2.dilate(known, np.ones((SPOT_PX, SPOT_PX), np.uint8)), np.float32)
+    mm = 1e3 * focal_baseline / np.maximum(spots, 1e-3)
+    return np.where(spots > 0, np.minimum(mm, FARTHEST_MM), 0).astype(np.uint16)
+
+
+def depth_range(distance_mm: NDArray[np.uint16]) -> tuple[float, float]:
+    """Nearest and farthest of the known distances [mm], but for the few that are far out."""
+    known = distance_mm[distance_mm > 0]
+    return tuple(np.percentile(known, (1, 95)).tolist()) if known.size else (0.0, 1.0)
+
+
+def evenly(most: int, *rows: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """At most so many of the rows of each array, evenly chosen, the same of all."""
+    step = max(1, -(-len(rows[0]) // most))
+    return tuple(each[::step] for each in rows)
+
+
+def by_height(points: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours (N, 3) of points (N, 3): dark below, light above, but for the few that are far out."""
+    if not len(points):
+        return np.zeros((0, 3), np.uint8)
+    low, high = np.percentile(points[:, 2], (2, 98))
+    share = np.clip((points[:, 2] - low) / max(1e-3, high - low), 0, 1)
+    colours = cv2.applyColorMap((255 * share).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(colours.reshape(-1, 3)[:, ::-1], np.uint8)

@@ -1,0 +1,29 @@
+"""Pictures as they can be put on the board: compressed."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frame import Frame, gray
+from drivers.ros_image import RosImage
+
+COMPRESSED: Final = ("jpeg", "png")
+QUALITY: Final = 85
+
+
+def jpeg(picture: NDArray[np.uint8]) -> bytes:
+    """A picture (H, W) as JPEG."""
+    return cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
+
+
+def compressed(image: RosImage) -> tuple[bytes, str]:
+    """The bytes of a picture message and their kind; what came raw becomes grey JPEG. BrokenFrame where it is broken.
+    """
+    if image.encoding in COMPRESSED:
+        return bytes(image.data), image.encoding
+    return jpeg(gray(Frame(0, image.stamp_ns, "lower", image.encoding, image.data, image.width, image.height,
+                           image.step, image.bigendian))), "jpeg"

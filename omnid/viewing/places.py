@@ -1,0 +1,165 @@
+"""Where the board stands: a file, a window, or a browser of this machine; nothing listens to other machines."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any, Final, Protocol
+from urllib.parse import quote
+
+import rerun as rr
+
+from omnid.errors import OmnidError
+
+NAME: Final = "omnid"
+HERE: Final = "127.0.0.1"
+LIMIT: Final = "2GB"  # of the viewer's memory; it forgets the oldest
+STARTS_S: Final = 30.0
+_PATIENCE_S: Final = 0.05
+_WHOLE_LOG: Final = 2**14  # bytes of what the viewer says that are looked at
+
+
+class Place(Protocol):
+    """Where a board stands."""
+
+    def start(self, layout: Any) -> rr.RecordingStream:
+        """What the board draws on, with what lies where in it; OmnidError where there is none to be had."""
+
+    @property
+    def left(self) -> bool:
+        """Whether nobody looks any more."""
+
+    def leave(self) -> str:
+        """Ends it, once everything is drawn; a line that tells where to find it."""
+
+
+class RrdFile:
+    """A file that `rerun` opens."""
+
+    left = False
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def start(self, layout: Any) -> rr.RecordingStream:
+        """Opens the file."""
+        stream = rr.RecordingStream(NAME)
+        try:
+            stream.save(self._path, layout)
+        except (OSError, RuntimeError) as error:
+            stream.disconnect()
+            raise OmnidError(f"-o {self._path}: cannot be written: {error}; name another file") from error
+        return stream
+
+    def leave(self) -> str:
+        """Where the file is."""
+        return f"{self._path}: look at it with `rerun {self._path}`, here or on another machine"
+
+
+class Viewer:
+    """rerun's own viewer in a process of its own; a window outlives us, the server of a browser's does not."""
+
+    def __init__(self, web: bool) -> None:
+        self._web = web
+        self._process: subprocess.Popen[bytes] | None = None
+        self._url = ""
+        if not web:
+            _require_display()
+
+    def start(self, layout: Any) -> rr.RecordingStream:
+        """Starts the viewer and waits until it listens."""
+        opt_out()
+        port, web_port = _free_port(), _free_port()
+        url = f"rerun+http://{HERE}:{port}/proxy"
+        self._url = f"http://{HERE}:{web_port}/?url={quote(url, safe='')}"
+        served = ["--serve-web", "--web-viewer-port", str(web_port)] if self._web else ["--expect-data-soon"]
+        self._process, said = _started(["--bind", HERE, "--port", str(port), "--memory-limit", LIMIT,
+                                        "--server-memory-limit", LIMIT, "--hide-welcome-screen", *served])
+        _wait_for(port, self._process, said)
+        stream = rr.RecordingStream(NAME)
+        stream.connect_grpc(url, default_blueprint=layout)
+        if self._web:
+            print(f"omnid: look at {self._url} on this machine", file=sys.stderr, flush=True)
+        return stream
+
+    @property
+    def left(self) -> bool:
+        """Whether the viewer has ended."""
+        return self._process is not None and self._process.poll() is not None
+
+    def leave(self) -> str:
+        """A window stays; what a browser looks at is served until Ctrl-C."""
+        if not self._web or self._process is None:
+            return "the window stays until it is closed"
+        print("omnid: that is all; Ctrl-C ends it", file=sys.stderr, flush=True)
+        try:
+            with suppress(KeyboardInterrupt):
+                self._process.wait()
+        finally:
+            self.close()
+        return "no longer served"
+
+    def close(self) -> None:
+        """Ends the viewer, whoever looks."""
+        if self._process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGTERM)
+            self._process.wait()
+
+
+def opt_out() -> None:
+    """Has rerun send nothing about its use, for this user; `rerun analytics enable` takes it back."""
+    with suppress(OSError, subprocess.SubprocessError):
+        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=STARTS_S, check=False)
+
+
+def _require_display() -> None:
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise OmnidError("there is no display here to open a window on: write a file with -o FILE.rrd and open that "
+                         "where there is one, or serve a browser of this machine with --web")
+
+
+def _rerun(words: list[str]) -> list[str]:
+    """The program that comes with rerun's package."""
+    return [sys.executable, "-m", "rerun_cli", *words]
+
+
+def _started(words: list[str]) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+    """The process in a session of its own, that no Ctrl-C of ours ends, and what it says."""
+    said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
+    process = subprocess.Popen(_rerun(words), stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+                               start_new_session=True)
+    return process, said
+
+
+def _wait_for(port: int, process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
+    deadline_s = time.monotonic() + STARTS_S
+    while not _answers(port):
+        if process.poll() is not None or time.monotonic() > deadline_s:
+            raise OmnidError(f"rerun's viewer does not start ({_last_line(said)}): write a file with -o FILE.rrd, or "
+                             "serve a browser with --web")
+        time.sleep(_PATIENCE_S)
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((HERE, port)) == 0
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HERE, 0))
+        return int(probe.getsockname()[1])
+
+
+def _last_line(said: IO[bytes]) -> str:
+    said.seek(max(0, said.seek(0, os.SEEK_END) - _WHOLE_LOG))
+    lines = said.read().decode("utf-8", "replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")

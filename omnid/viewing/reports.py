@@ -1,0 +1,93 @@
+"""What can be drawn of the reports that the parts of a robot give."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import Final, Protocol
+
+from omnid.listening.heard import plain
+from omnid.transport.codec import Status
+from omnid.transport.decode import Report
+from omnid.viewing.looks import STATES
+
+ODOMETRY: Final = "omnid: odometry"
+LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")
+_TIME: Final = re.compile(r"(?P<what>\w+?)_(?P<which>p50|p99)_ms")
+_LANDMARKS: Final = re.compile(r"(\d{1,9}) of (\d{1,9})")
+
+
+def latencies(report: Report) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Names and ms of what took its time: of stages the medians, of all else the 99th percentiles too."""
+    for status in report.statuses:
+        part = plain(status.name.removeprefix("omnid: "))
+        for key, value in status.values.items():
+            found, value_ms = _TIME.fullmatch(key), _number(value)
+            if found and value_ms is not None and not (part.startswith("stage ") and found["which"] == "p99"):
+                yield (part.removeprefix("stage "), f"{found['what']} {found['which']}"), value_ms
+
+
+def state(report: Report) -> str | None:
+    """The state of the odometry, where the report tells one."""
+    found = (status.message for status in report.statuses if status.name == ODOMETRY)
+    return next((message for message in found if message in STATES), None)
+
+
+def landmarks(report: Report) -> tuple[int, int] | None:
+    """How many landmarks agree, and how many were found."""
+    found = _LANDMARKS.fullmatch(report.value(ODOMETRY, "landmarks"))
+    return (int(found[1]), int(found[2])) if found else None
+
+
+class Changes:
+    """What parts say of themselves, where it is not what they said before; in constant memory."""
+
+    def __init__(self, most_parts: int = 100) -> None:
+        self._most_parts = most_parts
+        self._said: dict[str, tuple[int, str]] = {}
+
+    def __call__(self, report: Report) -> Iterator[tuple[str, str]]:
+        """Lines and their levels; the odometry's state is told elsewhere."""
+        for status in report.statuses:
+            if status.name != ODOMETRY and self._is_new(status):
+                told = f"{status.name.removeprefix('omnid: ')}: {status.message or 'no message'}"
+                yield plain(told), LEVELS[status.level % len(LEVELS)]
+
+    def _is_new(self, status: Status) -> bool:
+        before, now = self._said.get(status.name, (0, "")), (status.level, status.message)
+        if status.name in self._said or len(self._said) < self._most_parts:
+            self._said[status.name] = now
+        return now != before
+
+
+class Canvas(Protocol):
+    """What reports are drawn on."""
+
+    def latency(self, stamp_ns: int, name: tuple[str, ...], value_ms: float) -> None:
+        """How long something took, ms."""
+
+    def landmarks(self, stamp_ns: int, agreeing: int, found: int) -> None:
+        """How many were found, and how many of them agree."""
+
+    def line(self, stamp_ns: int, text: str, level: str) -> None:
+        """A line of the log."""
+
+
+def draw(report: Report, changes: Changes, canvas: Canvas) -> None:
+    """Draws all that can be drawn of a report."""
+    for name, value_ms in latencies(report):
+        canvas.latency(report.stamp_ns, name, value_ms)
+    counts = landmarks(report)
+    if counts is not None:
+        canvas.landmarks(report.stamp_ns, *counts)
+    for text, level in changes(report):
+        canvas.line(report.stamp_ns, text, level)
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

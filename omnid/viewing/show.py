@@ -1,0 +1,99 @@
+"""From what is to be shown to where it is shown."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from drivers.mcap_survey import Survey, survey
+from omnid.config import Config
+from omnid.errors import OmnidError
+from omnid.outputs.files import check_outputs
+from omnid.replay import Options, Replay, Topics
+from omnid.transport.bus_config import BusConfig
+from omnid.viewing.board import Board
+from omnid.viewing.computed import MAP_EVERY_S, Computed
+from omnid.viewing.layout import layout
+from omnid.viewing.live import Live
+from omnid.viewing.places import Place, RrdFile, Viewer
+from omnid.viewing.recorded import Recorded, poses_topic
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A log, and how to look at it."""
+
+    path: Path
+    robot: str | None = None
+    replay: bool = False  # from its pictures, though it has poses
+    rig: Path | None = None
+    topics: Topics = (None, None)
+    quiet: bool = False
+
+
+def place_for(out: Path | None, web: bool) -> Place:
+    """The file that is named, else a viewer."""
+    return RrdFile(out) if out is not None else Viewer(web)
+
+
+def check_file(out: Path | None, *read: tuple[str, Path | None]) -> None:
+    """OmnidError where the file cannot be written, or is one of those (what, path) that are read."""
+    if out is not None:
+        check_outputs([("-o", out)], [(what, path) for what, path in read if path is not None])
+
+
+def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> int:
+    """Shows a log: the poses that are recorded in it, else what can be computed from its pictures; the exit code."""
+    found = survey(log.path)
+    topic = None if log.replay else poses_topic(found, log.robot)
+    pictured = topic is None or Recorded.pictures(found, topic) != ""
+    board = Board(partial(place.start, layout(pictured, topic is None)), _most_messages(found, topic))
+    try:
+        code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
+    finally:
+        board.close()
+    return _ended(board, place, code)
+
+
+def show_robot(bus: BusConfig, seconds: float | None, place: Place) -> int:
+    """Shows a robot; the exit code, 1 where not one pose came."""
+    board = Board(partial(place.start, layout(pictures=True, depth=False)))
+    live = Live(board)
+    try:
+        live.follow(bus, place, seconds)
+    finally:
+        board.close()
+    return _ended(board, place, int(not board.poses))
+
+
+def _computed(log: Log, config: Config, settings: Path | None, board: Board) -> int:
+    options = Options(quiet=log.quiet, settings=settings, map_every_s=MAP_EVERY_S,
+                      watch=lambda place, telemetry: Computed(board, place, telemetry))
+    return Replay(log.path, config, options).run(log.rig, log.topics)
+
+
+def _recorded(found: Survey, topic: str, board: Board) -> int:
+    recorded = Recorded(found, topic, board)
+    recorded.show()
+    if recorded.broken or recorded.damaged:
+        print(f"omnid: warning: {found.path}: {recorded.broken} messages and {recorded.damaged} pieces of the file "
+              "cannot be read and are left out", file=sys.stderr)
+    if not board.poses:
+        raise OmnidError(f"{found.path}: topic {topic!r} has no message that is a pose: is the recording cut?")
+    return 0
+
+
+def _most_messages(found: Survey, topic: str | None) -> int:
+    """How many poses there will be at the most."""
+    if topic is not None:
+        return found.topics[topic][1]
+    return max((count for kind, count in found.topics.values() if kind.startswith("sensor_msgs/msg/")), default=0)
+
+
+def _ended(board: Board, place: Place, code: int) -> int:
+    if board.poses:
+        print(f"{board.poses} poses and {board.pictures} pictures shown")
+        print(place.leave())
+    return code
