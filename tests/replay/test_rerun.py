@@ -14,7 +14,7 @@ from calib.rig_file import parse_rig, rig_toml
 from drivers.mcap_reader import LogReader
 from omnid.recorded_run import read_run
 from tests.replay.command import Command
-from tests.replay.live import Base, Operator, answers, command_line, free_port, started, wait_until
+from tests.replay.recorded import recorded_run
 
 POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
@@ -38,22 +38,8 @@ class Message(NamedTuple):
 
 @pytest.fixture(scope="module")
 def recording(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `omnid run` wrote: slow enough for each pair on an idle machine, somebody drives, twin wheels obey."""
-    folder = tmp_path_factory.mktemp("recording")
-    port, base = free_port(), Base(folder)
-    more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={folder / 'kept'}",
-            "--set", "record.free_mb=0")
-    with started(command_line(scene, port, base.port, *more), port) as daemon:
-        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
-        operator = Operator(port)
-        operator.drive(0.3)
-        wait_until(lambda: len(operator.poses) > POSES and base.drives, "poses and motion")
-        operator.close()
-        code, err = daemon.end()
-    base.close()
-    assert code == 0, err
-    (path,) = (folder / "kept").glob("*.mcap")
-    return path
+    """What `omnid run` wrote."""
+    return recorded_run(scene, tmp_path_factory.mktemp("recording"), POSES)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,48 @@
+"""Logs for the programs that others wrote, and where these programs are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.interop.known import Expected, write_known
+from tests.replay.recorded import recorded_run
+
+MARKER = "interop: reads logs with programs that others wrote; run with `python -m pytest -m interop tests/interop`"
+POSES = 12  # of the live run
+
+
+class Known(NamedTuple):
+    """A log and what is in it."""
+
+    path: Path
+    expected: Expected
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Makes the marker known."""
+    config.addinivalue_line("markers", MARKER)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """They run when they are asked for and else not: some are installed from the network first."""
+    if "interop" in config.option.markexpr:
+        return
+    kept = [item for item in items if item.get_closest_marker("interop") is None]
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = kept
+
+
+@pytest.fixture(scope="session", params=("lz4", "none"))
+def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Known:
+    """Known numbers, with chunks as `--record` and as `omnid run` writes them."""
+    path = tmp_path_factory.mktemp("known") / f"{request.param}.mcap"
+    return Known(path, write_known(path, request.param))
+
+
+@pytest.fixture(scope="session")
+def live(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run of the daemon recorded: pictures, poses, map, states, commands to the wheels."""
+    return recorded_run(scene, tmp_path_factory.mktemp("live"), POSES)

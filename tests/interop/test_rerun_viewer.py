@@ -1,0 +1,91 @@
+"""Rerun checks and reads what omnid records (rerun-sdk 0.41.0 here): poses, transforms, points and images as its own
+three-dimensional things, in float32; the rest field by field.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.interop.conftest import Known
+from tests.interop.known import Expected
+from tests.interop.programs import HERE, lines, program, run
+
+pytestmark = pytest.mark.interop
+
+FIELDS = {"/omnid/odom": "nav_msgs.msg.Odometry", "/omnid/status": "diagnostic_msgs.msg.DiagnosticArray",
+          "/omnid/drive": "geometry_msgs.msg.TwistStamped"}
+FLOAT32 = 1e-6  # of numbers around 1
+
+Parts = dict[str, list[dict[str, Any]]]  # topic -> what there is of each of its messages, in order
+
+
+@pytest.fixture
+def parts(known: Known) -> Parts:
+    """The known log as Rerun's own reader gives it."""
+    return read(known.path)
+
+
+def read(log: Path) -> Parts:
+    """All messages of a log; Rerun may split one into several rows."""
+    python = program("rerun", "rerun-sdk").resolve().with_name("python")
+    found: dict[str, dict[int, dict[str, Any]]] = {}
+    for entry in lines([python, HERE / "read_log_rerun.py", log], log.parent):
+        found.setdefault(entry["topic"], {}).setdefault(entry["log_ns"], {}).update(entry["parts"])
+    return {topic: [messages[at_ns] for at_ns in sorted(messages)] for topic, messages in found.items()}
+
+
+def test_every_message_is_there(known: Known, parts: Parts) -> None:
+    assert {topic: len(messages) for topic, messages in parts.items()} == {
+        topic: len(messages) for topic, messages in known.expected.items()}
+
+
+@pytest.mark.parametrize("topic", FIELDS)
+def test_fields_are_those_that_were_written(known: Known, parts: Parts, topic: str) -> None:
+    assert [message[f"{FIELDS[topic]}:message"] for message in parts[topic]] == [
+        [message] for message in known.expected[topic]]
+
+
+def test_poses_and_transforms_are_those_that_were_written(known: Known, parts: Parts) -> None:
+    written: Expected = known.expected
+    for found, pose in zip(parts["/omnid/pose"], written["/omnid/pose"], strict=True):
+        assert found["CoordinateFrame:frame"] == ["odom"]
+        close(found["InstancePoses3D:translations"][0], pose["pose"]["position"])
+        close(found["InstancePoses3D:quaternions"][0], pose["pose"]["orientation"])
+    for found, message in zip(parts["/tf"], written["/tf"], strict=True):
+        (edge,) = message["transforms"]
+        assert found["Transform3D:parent_frame"] == ["odom"] and found["Transform3D:child_frame"] == ["base_link"]
+        close(found["Transform3D:translation"][0], edge["transform"]["translation"])
+        close(found["Transform3D:quaternion"][0], edge["transform"]["rotation"])
+
+
+def test_points_and_pictures_are_those_that_were_written(known: Known, parts: Parts) -> None:
+    for found, cloud in zip(parts["/omnid/cloud"], known.expected["/omnid/cloud"], strict=True):
+        points = np.column_stack([found["Points3D:positions"], found["Points3D:confidence"]])
+        assert points.tolist() == cloud["points"]
+        assert found["sensor_msgs.msg.PointCloud2:data"] == [cloud["data"]]
+    lower, upper = "/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw"
+    for found, image in zip(parts[lower], known.expected[lower], strict=True):
+        assert found["EncodedImage:blob"] == [image["data"]]
+    for found, image in zip(parts[upper], known.expected[upper], strict=True):
+        (shape,) = found["DepthImage:format"]  # so it takes all raw pictures of one channel
+        assert found["DepthImage:buffer"] == [image["data"]] and (shape["width"], shape["height"]) == (32, 24)
+
+
+def test_it_finds_nothing_wrong_with_the_order(known: Known, live: Path, tmp_path: Path) -> None:
+    """`rerun mcap check` exits 0 whatever it finds. With --full it finds fault with how it splits clouds itself."""
+    for log in (known.path, live):
+        said = run([program("rerun", "rerun-sdk"), "mcap", "check", log], tmp_path)
+        assert "PROBLEM" not in said and said.count("\nok ") == 8, said
+
+
+def test_a_live_recording_is_whole(live: Path) -> None:
+    counts = {topic: len(messages) for topic, messages in read(live).items()}
+    assert len(counts) == 8 and counts["/omnid/odom"] == counts["/omnid/pose"] == counts["/tf"] > 5
+
+
+def close(found: list[float], written: dict[str, float]) -> None:
+    np.testing.assert_allclose(found, list(written.values()), atol=FLOAT32)

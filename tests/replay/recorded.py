@@ -1,0 +1,25 @@
+"""A recording that `omnid run` made: somebody drives it, simulated wheels obey."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.replay.live import Base, Operator, answers, command_line, free_port, started, wait_until
+
+
+def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
+    """The recording of so many poses and more, with pictures slow enough that an idle machine drops none."""
+    port, base, kept = free_port(), Base(folder), folder / "kept"
+    more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={kept}", "--set",
+            "record.free_mb=0")
+    with started(command_line(scene, port, base.port, *more), port) as daemon:
+        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
+        operator = Operator(port)
+        operator.drive(0.3)
+        wait_until(lambda: len(operator.poses) > poses and base.drives, "poses and motion")
+        operator.close()
+        code, err = daemon.end()
+    base.close()
+    assert code == 0, err
+    (path,) = kept.glob("*.mcap")
+    return path
