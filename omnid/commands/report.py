@@ -1,0 +1,36 @@
+"""`omnid report`: one HTML page about a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `report` to the command line."""
+    parser = subparsers.add_parser("report", help="one HTML page about a recording: its path, what went wrong")
+    parser.add_argument("log", type=Path, metavar="LOG", help="what `omnid replay --record` or `omnid run` with "
+                        "record.enabled wrote, or any MCAP with nav_msgs/msg/Odometry")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"),
+                        help="default: report.html")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
+    parser.add_argument("--topic", metavar="TOPIC", help="the odometry, where there are several")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Writes the page."""
+    from calib.rig_file import write_file
+    from omnid.core.trajectory import read_tum
+    from omnid.outputs.files import check_outputs
+    from omnid.report.recording import read_recording
+    from omnid.report.report import report_html
+
+    inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
+    check_outputs([("--output", args.output)], inputs)
+    truth = read_tum(args.truth) if args.truth else None
+    recording = read_recording(args.log, args.topic, keep_poses=truth is not None)
+    html = report_html(args.log, recording, truth)
+    write_file(args.output, html.encode())
+    print(f"{args.output}: {recording.poses.poses} poses of {recording.topic}, {len(html) / 1e6:.1f} MB")
+    return 0

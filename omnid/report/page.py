@@ -1,0 +1,42 @@
+"""The pieces of a page that needs nothing beside itself: a head, tables, pictures within the text."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+JPEG_QUALITY: Final = 80
+STYLE: Final = """body{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse}td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1em 0}figcaption{color:#555}
+.bar{background:#d33;height:.7em;display:inline-block}.warn{color:#a40}"""
+
+
+def page(title: str, parts: Sequence[str], style: str = "") -> str:
+    """A whole HTML page of parts, which are HTML; style comes after the usual one."""
+    return (f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta name='viewport' content='width=device-"
+            f"width'><title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
+            f"<body>{''.join(parts)}</body></html>\n")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; cells are HTML."""
+    titles = "".join(f"<th>{title}</th>" for title in head)
+    lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
+
+
+def figure(picture: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
+    """A picture within the page."""
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    source = base64.b64encode(data.tobytes()).decode()
+    image = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

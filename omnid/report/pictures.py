@@ -1,0 +1,59 @@
+"""What the cameras saw: panoramas out of a recording that holds pictures and a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from calib.errors import CalibError
+from calib.panorama import fit_cylinder, remap_tables
+from calib.rig import Rig
+from drivers.errors import DriverError
+from drivers.frame import Frame
+from drivers.mcap_reader import LogReader
+from omnid.errors import OmnidError
+from omnid.report.page import Image
+from omnid.stages.pair import Decoder
+
+WIDTH_PX: Final = 1200
+MOST_HEIGHT_PX: Final = 500
+MOST_FRAMES: Final = 40_000  # that are gone through for a picture: the loss of a long log may be hours away
+
+
+class Wanted(NamedTuple):
+    """A picture that would be good to have: the lower camera's first one from a time on."""
+
+    stamp_ns: int
+    caption: str
+
+
+def panoramas(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[Image, str]]:
+    """Panoramas and their captions, as far as they are found; OmnidError where none can be had."""
+    try:
+        cylinder = fit_cylinder(rig, WIDTH_PX)
+        maps = remap_tables(rig, rig.lower, cylinder)
+        for caption, picture in _found(path, rig, wanted):
+            panorama = cv2.remap(picture, *maps, cv2.INTER_LINEAR)[:MOST_HEIGHT_PX]
+            yield np.asarray(panorama, np.uint8), caption
+    except (CalibError, DriverError) as error:
+        raise OmnidError(str(error)) from error
+
+
+def _found(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[str, Image]]:
+    decode, left = Decoder(rig), sorted(wanted)
+    with closing(LogReader(path)) as reader:
+        for frame in islice(reader.frames(), MOST_FRAMES):
+            if not left:
+                return
+            if _fits(frame, left[0]) and (picture := decode(frame)) is not None:
+                yield left.pop(0).caption, picture
+
+
+def _fits(frame: Frame, wanted: Wanted) -> bool:
+    return frame.camera == "lower" and frame.stamp_ns >= wanted.stamp_ns

@@ -1,0 +1,64 @@
+"""The rig and the settings of a run, in a few lines."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from calib import se3
+from calib.ocam import OcamCamera
+from calib.rig import MountedCamera, Rig
+from omnid.config import Config
+from omnid.settings import dump
+
+_LARGEST: Final = 1 << 18  # bytes of settings
+_MOST: Final = 60
+_LONGEST: Final = 120  # characters of a value
+
+
+def rig_rows(rig: Rig) -> list[tuple[str, str]]:
+    """What the rig is, as name and value."""
+    place = rig.T_base_rig
+    turn = np.rad2deg(se3.rotation_log(place[:3, :3]))
+    at = ", ".join(f"{value:.3g}" for value in place[:3, 3])
+    rows = [("baseline", f"{rig.baseline_m * 1e3:.2f} mm"), ("lower camera", _camera(rig.lower)),
+            ("upper camera", _camera(rig.upper))]
+    if np.allclose(place, np.eye(4)):
+        return [*rows, ("on the robot", "the rig's frame is the robot's")]
+    return [*rows, ("on the robot", f"at {at} m, turned by {', '.join(f'{value:.3g}' for value in turn)} deg")]
+
+
+def _camera(mounted: MountedCamera) -> str:
+    camera = mounted.camera
+    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
+    return f"{model}, {camera.size[0]}x{camera.size[1]} px, {'with a' if mounted.mask else 'without a'} mask"
+
+
+def unusual(settings: bytes) -> list[tuple[str, str, str]] | None:
+    """Name, value and usual value of the settings that differ from omnid's own; None where they cannot be read."""
+    try:
+        given = tomllib.loads(settings[: _LARGEST + 1].decode()) if len(settings) <= _LARGEST else None
+    except (ValueError, RecursionError):
+        return None
+    if given is None:
+        return None
+    usual = dict(_flat(tomllib.loads(dump(Config()))))
+    found = [(name, _shown(value), _shown(usual[name]) if name in usual else "unknown to this omnid")
+             for name, value in _flat(given) if name not in usual or usual[name] != value]
+    return found[:_MOST]
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, object]]:
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"[:_LONGEST], value
+
+
+def _shown(value: object) -> str:
+    said = str(value)
+    return said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."

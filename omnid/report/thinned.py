@@ -1,0 +1,107 @@
+"""What a log of any length comes to in bounded memory, such that no spike is lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+BINS: Final = 500
+LARGEST: Final = 1e9  # what is beyond is no measure of a robot
+_FINEST_S: Final = 1e-3
+_FINEST_M: Final = 0.01
+_CORNERS: Final = 4000
+
+Point = tuple[float, float]  # time [s], value
+
+
+class _Bin(NamedTuple):
+    low: Point
+    high: Point
+
+
+class Thinned:
+    """The course of one quantity: the lowest and the highest value in each of at most BINS spans of time.
+
+    The spans are equally long and double in length whenever there are too many; values may come in any order.
+    """
+
+    def __init__(self) -> None:
+        self._width_s = _FINEST_S
+        self._bins: dict[int, _Bin] = {}
+        self.count = 0
+        self.newest = math.nan
+
+    def add(self, t_s: float, value: float) -> None:
+        """Takes a value; one that is not finite, or absurd, is left out."""
+        if not (abs(value) <= LARGEST and abs(t_s) <= LARGEST):
+            return
+        self.count, self.newest = self.count + 1, value
+        self._put(math.floor(t_s / self._width_s), _Bin((t_s, value), (t_s, value)))
+        while len(self._bins) > BINS:
+            self._widen()
+
+    def points(self) -> list[Point]:
+        """At most two points for each span, in the order of time."""
+        return sorted({point for bin_ in self._bins.values() for point in bin_})
+
+    @property
+    def highest(self) -> float:
+        """The highest value of all; NaN without any."""
+        return max((bin_.high[1] for bin_ in self._bins.values()), default=math.nan)
+
+    def _put(self, key: int, new: _Bin) -> None:
+        old = self._bins.get(key, new)
+        self._bins[key] = _Bin(min(old.low, new.low, key=_value), max(old.high, new.high, key=_value))
+
+    def _widen(self) -> None:
+        bins, self._bins, self._width_s = self._bins, {}, 2 * self._width_s
+        for key, bin_ in bins.items():
+            self._put(key // 2, bin_)
+
+
+_value: Callable[[Point], float] = lambda point: point[1]  # noqa: E731 - a key for min and max
+
+
+class Corner(NamedTuple):
+    """A place on a path."""
+
+    x_m: float
+    y_m: float
+    t_s: float
+    rank: int  # the worst state on the way here
+
+
+class PathTrace:
+    """A path in at most 4000 corners: one for each step of a length that doubles whenever there are too many."""
+
+    def __init__(self) -> None:
+        self._step_m = _FINEST_M
+        self._corners: list[Corner] = []
+        self._newest: Corner | None = None
+
+    def add(self, corner: Corner) -> None:
+        """Takes the next place."""
+        if self._newest is not None and self._newest is not self._last:
+            corner = corner._replace(rank=max(corner.rank, self._newest.rank))
+        self._newest = corner
+        if self._last is None or math.dist(corner[:2], self._last[:2]) >= self._step_m:
+            self._corners.append(corner)
+        while len(self._corners) > _CORNERS:
+            self._coarsen()
+
+    @property
+    def corners(self) -> list[Corner]:
+        """The corners, and the place where it ends."""
+        unfinished = self._newest is not None and self._newest is not self._last
+        return [*self._corners, *([self._newest] if unfinished and self._newest else [])]
+
+    @property
+    def _last(self) -> Corner | None:
+        return self._corners[-1] if self._corners else None
+
+    def _coarsen(self) -> None:
+        corners, self._corners, self._newest = self._corners, [], None
+        self._step_m *= 2
+        for corner in corners:
+            self.add(corner)

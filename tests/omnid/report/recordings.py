@@ -1,0 +1,82 @@
+"""Small recordings of a made-up run, written with the project's codec and with mcap itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib import se3
+from drivers.mcap_writer import LogWriter
+from omnid.transport import codec
+from omnid.transport.codec import Status
+
+START_NS = 1_700_000_000 * 10**9
+PERIOD_NS = 100_000_000
+Entry = tuple[int, str, str, bytes]  # stamp [ns], topic, type, message
+
+
+def at(pose: float) -> int:
+    """The stamp of a pose."""
+    return START_NS + round(pose * PERIOD_NS)
+
+
+def T_odom_base(pose: int) -> np.ndarray:
+    """Poses on a circle, 5 cm and 0.02 rad apart."""
+    return se3.exp([2.5 * math.sin(0.02 * pose), 2.5 * (1 - math.cos(0.02 * pose)), 0, 0, 0, 0]) @ se3.exp(
+        [0, 0, 0, 0, 0, 0.02 * pose])
+
+
+def odom(pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", sigma_m: float = 0.01,
+         speed_mps: float = 0.5) -> Entry:
+    """A pose."""
+    covariance, velocity = np.eye(6) * sigma_m**2, np.array([speed_mps, 0, 0, 0, 0, 0.2])
+    payload = codec.odometry_cdr(at(pose), T_odom_base(pose) if T is None else T, covariance, velocity, covariance)
+    return at(pose), topic, codec.ODOMETRY_SCHEMA, payload
+
+
+def status(pose: float, *statuses: Status) -> Entry:
+    """What the parts said at the time of a pose."""
+    return at(pose), "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(at(pose), statuses)
+
+
+def state(pose: float, name: str, resets: int = 0, landmarks: str = "80 of 100") -> Entry:
+    """The report of a new state, as the recorder writes it right after the first pose in it."""
+    level = ("tracking", "degraded", "lost").index(name)
+    return status(pose, Status("omnid: odometry", level, name,
+                               {"state": name, "resets": str(resets), "landmarks": landmarks}))
+
+
+def drive(pose: float, speed_mps: float) -> Entry:
+    """What the wheels were told."""
+    payload = codec.twist_stamped_cdr(at(pose), "base_link", speed_mps, 0.1)
+    return at(pose), "/omnid/drive", codec.TWIST_SCHEMA, payload
+
+
+def cloud(pose: float, points: np.ndarray, frame: str = "odom") -> Entry:
+    """The map."""
+    payload = codec.point_cloud_cdr(at(pose), frame, points, np.ones(len(points)))
+    return at(pose), "/omnid/cloud", codec.POINT_CLOUD_SCHEMA, payload
+
+
+def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | None = None) -> Path:
+    """A log of these messages in their order; its path."""
+    with LogWriter(path, attachments) as log:
+        for stamp_ns, topic, schema, payload in entries:
+            log.write(topic, schema, payload, stamp_ns)
+    return path
+
+
+def run(count: int = 100, lost: Sequence[int] = (), missing: Sequence[int] = ()) -> list[Entry]:
+    """A run that tracks but for the poses that are lost; those that are missing are not there."""
+    entries: list[Entry] = []
+    before = ""
+    for pose in (k for k in range(count) if k not in missing):
+        entries.append(odom(pose, sigma_m=1.0 if pose in lost else 0.01))
+        now = "lost" if pose in lost else "tracking"
+        if now != before:
+            entries.append(state(pose, now))
+        before = now
+    return entries

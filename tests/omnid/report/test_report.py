@@ -1,0 +1,304 @@
+"""`omnid report`: what a recording says is on the page, what it does not say is named, and nothing of it is run."""
+
+from __future__ import annotations
+
+import random
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.rig_file import rig_toml
+from omnid.cli import main
+from omnid.core.evaluation import evaluate
+from omnid.core.trajectory import Trajectory, read_tum, tum_row
+from omnid.errors import OmnidError
+from omnid.log_rig import attached_rig
+from omnid.report.against_truth import compare
+from omnid.report.recording import Recording, read_recording
+from omnid.report.report import report_html
+from omnid.transport.codec import Status
+from tests.omnid.report.recordings import (
+    T_odom_base,
+    at,
+    cloud,
+    drive,
+    odom,
+    run,
+    save,
+    state,
+    status,
+)
+
+SAMPLE = Path(__file__).parents[3] / "omnid" / "sample"
+EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page: its tags with their attributes, its text, and whether tags match."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def html_of(path: Path, truth: Trajectory | None = None) -> str:
+    return report_html(path, read_recording(path, keep_poses=truth is not None), truth)
+
+
+def told(recording: Recording) -> list[tuple[str, str]]:
+    return [(event.source, event.text) for event in recording.events.in_order()]
+
+
+def assert_harmless(page: Page) -> None:
+    """Nothing that runs, and nothing that is fetched."""
+    names = {tag for tag, _ in page.tags}
+    assert not names & {"script", "iframe", "object", "embed", "link", "base", "form", "foreignobject"}
+    for tag, attributes in page.tags:
+        assert not any(name.startswith("on") for name in attributes), (tag, attributes)
+        for name in ("src", "href", "xlink:href"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,", "data:image/jpeg;base64,"))
+
+
+def test_command_writes_one_whole_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    entries = [*run(100, lost=range(40, 50)), drive(3, 0.4), drive(60, 0.4),
+               cloud(99, np.random.default_rng(1).uniform(-2, 3, (500, 3)))]
+    log, out = save(tmp_path / "log.mcap", entries), tmp_path / "out.html"
+    assert main(["report", str(log), "-o", str(out)]) == 0
+    assert "100 poses of /omnid/odom" in capsys.readouterr().out
+    page = Page(out.read_text("utf-8"))
+    assert_harmless(page)
+    for words in ("Run of omnid", "9.9 s", "4.95 m", "90.0 %", "told to the wheels", "Standard deviation", "lost here",
+                  "of the map's 500 points", "no settings are attached".capitalize()):
+        assert words in page.text, words
+    assert any(tag == "image" for tag, _ in page.tags)  # the map
+    assert "http" not in out.read_text("utf-8")
+
+
+def test_states_are_those_of_the_poses(tmp_path: Path) -> None:
+    recording = read_recording(save(tmp_path / "log.mcap", run(100, lost=range(40, 50))))
+    assert recording.poses.states == {0: 90, 2: 10}
+    assert told(recording) == [("state", "lost"), ("state", "tracking")]
+    assert [round(event.start_s, 6) for event in recording.events.in_order()] == [4.0, 5.0]
+
+
+def test_gaps_resets_and_lost_cameras_are_told(tmp_path: Path) -> None:
+    camera = "omnid: upper camera"
+    entries = [*run(100, missing=range(30, 50)), state(60, "tracking", resets=1),
+               status(61, Status(camera, 0, "streaming", {"drops": "3"}), Status("omnid: wheels", 0, "driving", {})),
+               status(71, Status(camera, 2, "lost since 1.0 s", {"drops": "3"}),
+                      Status("omnid: wheels", 1, "the pose is lost", {"stopped, the pose is lost": "1"})),
+               status(81, Status(camera, 2, "lost since 2.0 s", {"drops": "8"}),
+                      Status("omnid: wheels", 0, "driving", {"stopped, the pose is lost": "1"}))]
+    recording = read_recording(save(tmp_path / "log.mcap", entries))
+    assert told(recording) == [
+        ("poses", "no pose for 2.10 s"), ("state", "odometry began anew, with an unknown gap"),
+        ("upper camera", "lost since 1.0 s"), ("wheels", "the pose is lost"), ("wheels", "stopped, the pose is lost"),
+        ("upper camera", "pictures dropped"), ("wheels", "driving")]
+    assert recording.statuses.resets == 1
+    page = Page(report_html(tmp_path / "log.mcap", recording))
+    assert "pictures dropped, 5 times" in page.text and "upper camera" in page.text
+
+
+def test_reports_that_come_before_the_first_pose_and_too_late(tmp_path: Path) -> None:
+    entries = [status(-20, Status("omnid: odometry", 3, "no pose yet", {}), Status("omnid: pairing", 1, "none", {})),
+               odom(0), state(0, "tracking"), odom(5), state(5, "lost"),
+               state(4, "tracking"), odom(6)]  # a report from before the loss, written after it
+    recording = read_recording(save(tmp_path / "log.mcap", entries))
+    assert recording.poses.states == {0: 1, 2: 2}
+    assert told(recording)[0] == ("pairing", "none") and recording.events.in_order()[0].start_s == -2.0
+
+
+def test_stages_and_latencies_are_shown(tmp_path: Path) -> None:
+    def second(k: int) -> tuple[Status, ...]:
+        odometry = {"landmarks": f"{200 + k} of 300", "capture_to_pose_p50_ms": "81.25", "rate_hz": "9.5",
+                    "capture_to_pose_p99_ms": "163.00"}
+        stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_p99_ms": "44.0",
+                  "work_max_ms": "52.1"}
+        return Status("omnid: odometry", 0, "tracking", odometry), Status("omnid: stage stereo", 0, "", stereo)
+
+    entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
+    text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
+    for words in ("81.2 / 163 ms", "stereo", "31.5", "52.1", "stereo, dropped", "that agree with the pose",
+                  "messages dropped, 9 times"):
+        assert words in text, words
+    assert "No reports of the daemon" not in text
+
+
+def test_what_a_foreign_log_does_not_hold_is_named(tmp_path: Path) -> None:
+    entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
+    text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
+    for words in ("Run of wheels", "does not tell the state", "nobody set them", "no numbers of landmarks",
+                  "No reports of the daemon", "holds no pictures", "no rig.toml is attached", "holds no map",
+                  "holds no commands"):
+        assert words in text, words
+
+
+def test_truth_is_compared_as_eval_does_it(tmp_path: Path) -> None:
+    """The rig stands aside and askew on its base, and the truth has a world of its own."""
+    rig = attached_rig_of_sample()
+    T_base_rig, T_world_odom = se3.exp([0.3, -0.1, 0.5, 0.1, 0.2, 1.0]), se3.exp([5, -3, 1, 0, 0, 2.0])
+    text = rig_toml(type(rig)(rig.lower, rig.upper, T_base_rig, rig.topics)).encode()
+    log = save(tmp_path / "log.mcap", run(100), {"rig.toml": text})
+    drift = [se3.exp([0.001 * k, 0, 0, 0, 0, 0.0005 * k]) for k in range(100)]
+    T_odom_rig = np.array([se3.inverse(T_base_rig) @ T_odom_base(k) @ T_base_rig for k in range(100)])
+    truth = Trajectory(np.array([at(k) for k in range(100)]), T_world_odom @ T_odom_rig @ np.array(drift))
+    recording = read_recording(log, keep_poses=True)
+    found = compare(recording.poses, recording.T_base_rig, truth)
+    expected = evaluate(Trajectory(truth.stamps_ns, T_odom_rig), truth)
+    assert found.metrics.ate_rmse_m == pytest.approx(expected.ate_rmse_m, rel=1e-6)
+    assert found.position_m.highest == pytest.approx(expected.ate_max_m, rel=1e-6)
+    assert found.heading_rad.newest == pytest.approx(expected.heading_end_rad, rel=1e-6)
+    assert found.path[0] == pytest.approx((0, 0), abs=1e-9)
+    assert found.path[-1] == pytest.approx(T_odom_base(99)[:2, 3], abs=0.2)
+    assert "Against the truth" in Page(report_html(log, recording, truth)).text
+
+
+def attached_rig_of_sample():  # type: ignore[no-untyped-def]
+    from drivers.mcap_reader import LogReader
+
+    reader = LogReader(SAMPLE / "log.mcap")
+    rig = attached_rig(reader, SAMPLE / "log.mcap")
+    reader.close()
+    return rig
+
+
+def test_pictures_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = SAMPLE / "log.mcap"
+    assert main(["report", str(log), "-o", str(tmp_path / "out.html")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"omnid replay {log} --record out.mcap" in said
+    assert not (tmp_path / "out.html").exists()
+
+
+def test_panorama_of_a_log_with_pictures(tmp_path: Path) -> None:
+    """The sample's first pictures with poses beside them."""
+    from mcap.reader import make_reader
+
+    entries = run(20)
+    with (SAMPLE / "log.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if message.log_time > at(19):
+                break
+            entries.append((message.log_time, channel.topic, schema.name, message.data))
+    log = save(tmp_path / "log.mcap", entries, {"rig.toml": rig_toml(attached_rig_of_sample()).encode()})
+    page = Page(html_of(log))
+    assert [tag for tag, _ in page.tags].count("img") == 1 and "panorama at the first pose" in page.text
+
+
+def test_which_odometry(tmp_path: Path) -> None:
+    both = [*(odom(k, topic="/a/pose") for k in range(3)), *(odom(k, topic="/b/pose") for k in range(3, 9))]
+    log = save(tmp_path / "log.mcap", both)
+    with pytest.raises(OmnidError, match=r"several odometries.*--topic"):
+        read_recording(log)
+    with pytest.raises(OmnidError, match="no nav_msgs/msg/Odometry on '/c'"):
+        read_recording(log, "/c")
+    assert read_recording(log, "/b/pose").poses.poses == 6
+
+
+def test_a_hostile_log_is_text_and_no_more(tmp_path: Path) -> None:
+    stage = {"processed": EVIL, "dropped": EVIL, "work_p50_ms": EVIL}
+    odometry = {"state": EVIL, "resets": EVIL, "landmarks": EVIL, "capture_to_pose_p50_ms": EVIL}
+    parts = (Status(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}), Status(f"omnid: stage {EVIL}", 1, EVIL, stage),
+             Status("omnid: summary", 0, EVIL, {EVIL: EVIL}), Status("omnid: odometry", 0, EVIL, odometry))
+    settings = f'robot = "{EVIL.replace(chr(34), "")}"\n["<b>"]\nx = 1\n'
+    entries = [*(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
+               (at(2), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(2, *parts)[3]),
+               (at(3), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(3, *parts, *parts)[3])]
+    log = save(tmp_path / "<b>log.mcap", entries, {"omnid.toml": settings.encode(), "rig.toml": EVIL.encode(),
+                                                   EVIL: b""})
+    html = html_of(log)
+    page = Page(html)
+    assert_harmless(page)
+    assert "<b>x" not in html and "<script" not in html and "<b>log" not in html
+    assert page.text.count(EVIL) > 5
+
+
+def test_a_flood_of_everything_stays_small(tmp_path: Path) -> None:
+    rng = random.Random(1)
+    entries = []
+    for k in range(3000):
+        T = se3.exp([rng.uniform(-9, 9), rng.uniform(-9, 9), 0, 0, 0, rng.uniform(-3, 3)])
+        entries.append(odom(k, T, sigma_m=rng.uniform(0.001, 10), speed_mps=rng.uniform(-5, 5)))
+        entries.append(state(k, rng.choice(("tracking", "degraded", "lost")), resets=k))
+        if k % 30 == 0:
+            values = {f"stopped, {rng.randrange(10**6)}" * 20: str(k) for _ in range(70)}
+            entries.append(status(k, *(Status(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
+                                       for n in range(k, k + 9))))
+    entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
+    recording = read_recording(save(tmp_path / "log.mcap", entries))
+    html = report_html(tmp_path / "log.mcap", recording)
+    assert len(html) < 3_000_000
+    assert len(recording.events.in_order()) <= 600 and sum(recording.events.beyond.values()) > 1000
+    assert re.search(r"and \d+ more: ", Page(html).text)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_bytes_give_a_page_or_one_line(tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    points = np.random.default_rng(seed).uniform(-2, 3, (50, 3))
+    entries = [*run(40, lost=range(9, 12)), drive(3, 0.4), cloud(39, points)]
+    spoilt = []
+    for stamp_ns, topic, schema, payload in entries:
+        data = bytearray(payload)
+        for _ in range(rng.randrange(4)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        kept = rng.choice((len(data), len(data), rng.randrange(len(data))))
+        spoilt.append((stamp_ns, topic, schema, bytes(data[:kept])))
+    log = save(tmp_path / "log.mcap", spoilt)
+    whole = bytearray(log.read_bytes())
+    if seed % 2:
+        for _ in range(20):
+            whole[rng.randrange(len(whole))] = rng.randrange(256)
+        log.write_bytes(whole[: rng.randrange(len(whole) // 2, len(whole))])
+    try:
+        assert_harmless(Page(html_of(log)))
+    except OmnidError as error:
+        assert "\n" not in str(error)
+
+
+def test_absurd_poses_are_left_out_and_counted(tmp_path: Path) -> None:
+    far, early = np.eye(4), np.eye(4)
+    far[0, 3] = 1e12
+    stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
+    entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, early)[1:]), odom(12)]
+    recording = read_recording(save(tmp_path / "log.mcap", entries))
+    assert (recording.poses.poses, recording.poses.absurd, recording.unread, recording.poses.late) == (11, 1, 1, 1)
+    text = Page(report_html(tmp_path / "log.mcap", recording)).text
+    assert "2 messages were left out" in text and "1 poses were left out" in text
+
+
+def test_a_single_pose_is_a_report_too(tmp_path: Path) -> None:
+    assert "0.0 s" in Page(html_of(save(tmp_path / "log.mcap", [odom(0)]))).text
+
+
+def test_truth_of_another_time_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, truth = save(tmp_path / "log.mcap", run(9)), tmp_path / "truth.txt"
+    truth.write_text("\n".join(tum_row(k * 10**9, np.eye(4)) for k in range(5)))
+    assert main(["report", str(log), "--truth", str(truth), "-o", str(tmp_path / "out.html")]) == 2
+    assert "do both use the same clock" in capsys.readouterr().err
+    assert read_tum(truth).stamps_ns.size == 5
