@@ -72,6 +72,8 @@ class LiveConfig:
 
     status_s: float = knob(1.0, "between two reports of the state, s", low=0.1, high=60)
     cloud_s: float = knob(2.0, "between two maps on the bus, s; 0: only at the end", low=0, high=3600)
+    check_s: float = knob(5.0, "between two looks at whether the cameras still stand as calibrated, s; 0: none", low=0,
+                          high=3600)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from omnid.outputs.helm import HelmSettings
 from omnid.outputs.helm_link import HelmLink
 from omnid.outputs.helm_messages import Orders
 from omnid.outputs.latency import Latency
+from omnid.outputs.rig_watch import RigWatch
 from omnid.outputs.status import StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
@@ -115,14 +116,15 @@ class Live:
         poses: dict[str, Sink[Odometry]] = {"tally": self._tally, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, self.offset_ns)
+        watch = RigWatch(place.cylinder, config.live.check_s) if config.live.check_s else None
         sinks = Ends(poses=poses, bus=BusSink(bus, encode), helm=helm,
-                     map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
+                     rig=watch, map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
                      record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
         commands = self._commands(bus, helm) if helm else None
         report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
                                       self._tally, self._latency.to_pose, helm.logbook if helm else None, commands,
-                                      TICKERS))
+                                      TICKERS, tuple(part.status for part in (bus, recorder, watch) if part)))
         wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder)])]
         graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
         service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)

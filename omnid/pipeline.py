@@ -9,7 +9,7 @@ from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, Odometry
+from omnid.messages import FramePair, MapUpdate, Odometry, Panoramas
 from omnid.outputs.encoded import Outgoing
 from omnid.outputs.helm_link import HelmLink
 from omnid.outputs.motor import MotorTick
@@ -31,6 +31,7 @@ class Ends:
     bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
     helm: HelmLink | None = None  # of a live robot: it decides by itself, at its own rate, in its own process
+    rig: Sink[Panoramas] | None = None  # looks now and then whether the cameras stand as calibrated
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     pictures: tuple[Stream[Frame], ...] = ()  # that are recorded as well
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
@@ -47,6 +48,8 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     """Joins the stages from the pairs on; gives those that are asked at the end."""
     stereo = Stereo(geometry, config.stereo)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
+    if ends.rig:
+        graph.sink("rig", ends.rig, panoramas, policy=NEWEST, depth=1)
     depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
     spoken: list[Stream[Outgoing]] = [odometry, _commands(graph, odometry, geometry, config, ends)]

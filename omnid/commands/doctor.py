@@ -53,4 +53,4 @@ def examine(config: Config) -> Iterator[Finding]:
     yield from machine.clock()
     rate = 2 * eyes.width_px * eyes.height_px * BYTES_PER_PIXEL * (eyes.rate_hz or 30.0)
     yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
-    yield from wiring.bus(config.bus.listen, config.bus.connect)
+    yield from wiring.bus(config.bus)

@@ -6,7 +6,7 @@ import ipaddress
 import re
 import socket
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -15,7 +15,9 @@ from calib.errors import CalibError
 from calib.rig_file import read_rig
 from omnid.doctor.devices import access, holders, is_ours
 from omnid.doctor.finding import Finding
+from omnid.errors import OmnidError
 from omnid.outputs.motor import SIMULATED
+from omnid.transport.bus_config import BusConfig, checked
 
 _TIMEOUT_S: Final = 2.0
 _MOST_ENDPOINTS: Final = 8
@@ -61,16 +63,28 @@ def rig(path: Path, size_px: tuple[int, int]) -> Iterator[Finding]:
         yield Finding("ok", "rig", f"{path}, {found.baseline_m:.3f} m between the viewpoints")
 
 
-def bus(listen: Sequence[str], connect: Sequence[str]) -> Iterator[Finding]:
-    """Whether the routers answer, and whether strangers may call."""
-    open_ones = [endpoint for endpoint in listen if not _is_local(endpoint)]
-    if open_ones:
-        yield Finding("warning", "bus", f"whoever reaches {', '.join(open_ones)} can drive the robot",
-                      "bus.listen on tcp/127.0.0.1:7447 lets in this machine only")
-    if not connect:
+def bus(config: BusConfig) -> Iterator[Finding]:
+    """Whether the settings can be used, whether strangers may command, and whether the routers answer."""
+    try:
+        checked(config)
+    except OmnidError as error:
+        yield Finding("wrong", "bus", str(error), "the daemon would not start with it")
+    yield from _strangers(config)
+    if not config.connect:
         yield Finding("ok", "router", "none is configured: bus.connect is empty")
-    for endpoint in connect[:_MOST_ENDPOINTS]:
+    for endpoint in config.connect[:_MOST_ENDPOINTS]:
         yield _router(endpoint)
+
+
+def _strangers(config: BusConfig) -> Iterator[Finding]:
+    """Who may drive the robot from elsewhere."""
+    open_ones = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))
+    obeyed = ", ".join((*config.command_names, *config.command_users))
+    if open_ones and obeyed:
+        yield Finding("ok", "bus", f"joined to others at {open_ones}; commands are taken from {obeyed} only")
+    elif open_ones:
+        yield Finding("warning", "bus", f"whoever reaches {open_ones} can drive the robot",
+                      "name in bus.command_names or bus.command_users who may, or keep to tcp/127.0.0.1:7447")
 
 
 def _router(endpoint: str) -> Finding:

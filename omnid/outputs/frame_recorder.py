@@ -12,6 +12,7 @@ from drivers.rotating_log import RecordingState, RotatingLog
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports
+from omnid.transport.codec import ERROR, OK, Status
 from omnid.transport.image_codec import image_cdr, image_topic
 
 Recorded: TypeAlias = Frame | Outgoing
@@ -38,6 +39,15 @@ class FrameRecorder:
     def state(self) -> RecordingState:
         """How the recording is."""
         return self._log.state
+
+    def status(self) -> Status:
+        """How it goes, and what it could not keep beyond its inbox."""
+        state = self.state
+        counts = {name: str(getattr(state, name)) for name in
+                  ("messages", "lost", "refused", "files", "deleted", "stops")}
+        values = {"file": state.file, **counts, "unfit": str(self.unfit)}
+        return Status("omnid: recording", ERROR if state.status == "stopped" else OK, state.problem or state.status,
+                      values)
 
     def process(self, message: Recorded) -> None:
         """Records what there is to say about a message."""

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.rig_check import Matches, RigFinding, Verdict, judge, match, together
 from omnid.messages import Panoramas
-from omnid.transport.codec import Status
+from omnid.transport.codec import ERROR, OK, WARN, Status
 
 Array = NDArray[np.float64]
 
 NAME = "omnid: rig"
-OK, WARN, ERROR = range(3)  # of diagnostic_msgs
 PAIRS = 16  # views that are remembered, and how many new ones make a new finding
 # Fewer different views are no verdict. Two thumbnails that are so alike show one place: some 15 cm of a corridor.
 MIN_PLACES, ALIKE = 6, 0.8

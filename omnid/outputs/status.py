@@ -14,10 +14,9 @@ from omnid.outputs.logbook import Logbook
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
 from omnid.telemetry import Histogram, StageStats, Telemetry
-from omnid.transport.codec import Status
+from omnid.transport.codec import ERROR, OK, STALE, WARN, Status
 from omnid.transport.commands import Commands
 
-OK, WARN, ERROR, STALE = range(4)
 WANDERED_NS = 3_000_000  # of the skew of the cameras: their clocks do not run alike
 SILENT_S = 1.0  # a camera without a picture, or an odometry without a pose, for longer is told
 CALM = ("", IDLE, ASKED, COMMAND_STALE)  # why wheels stand that are as they should be
@@ -54,6 +53,7 @@ class Watched(NamedTuple):
     helm: Logbook | None
     commands: Commands | None
     tickers: frozenset[str]  # their `dropped` are missed deadlines
+    others: tuple[Callable[[], Status], ...] = ()  # parts that speak for themselves
 
 
 class StatusReport:
@@ -68,7 +68,9 @@ class StatusReport:
         self._rates.begin()
         w = self._watched
         helm = [] if w.helm is None else [self._helm(w.helm, w.commands)]
-        return [self._odometry(), self._pairing(), *self._cameras(), *helm, *map(self._stage, w.telemetry.stages)]
+        others = [status() for status in w.others]
+        return [self._odometry(), self._pairing(), *self._cameras(), *helm, *others,
+                *map(self._stage, w.telemetry.stages)]
 
     def _odometry(self) -> Status:
         tally, newest = self._watched.tally, self._watched.tally.newest

@@ -61,12 +61,15 @@ class FrameTransform:
     T_parent_child: Array  # (4, 4)
 
 
+OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/msg/DiagnosticStatus
+
+
 @dataclass(frozen=True, slots=True)
 class Status:
     """What one part has to say of itself."""
 
     name: str
-    level: int  # 0 ok, 1 warning, 2 error, 3 stale
+    level: int  # OK ...
     message: str
     values: Mapping[str, str]
 

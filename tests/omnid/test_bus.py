@@ -19,6 +19,7 @@ from omnid.client import Pose, Robot, Unreachable, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import OK, WARN
 from omnid.transport.note import Note, note_bytes
 from tests.omnid.buses import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
 from tests.omnid.buses import SUBSCRIBER as LISTENER
@@ -175,7 +176,8 @@ def test_a_client_waits_for_its_router() -> None:
         bus.tell("config", "robot = 1")
         bus.join()
         bus.publish("odom", odometry(1))
-        assert bus.lost == 1
+        assert bus.status().level == WARN and bus.status().values["lost"] == "1"
+        assert bus.status().message == f"no router yet at {endpoint}"
         with script(ROUTER, endpoint):
             wait_until(lambda: bus.join() is None and bus.publish("odom", odometry(2)) is None and bus.lost < 20
                        and bus._session is not None)
@@ -185,6 +187,7 @@ def test_a_client_waits_for_its_router() -> None:
                 wait_until(lambda: driver.stop() is None and "cmd/stop" in heard)
                 pose = robot.subscribe(Pose).newest()
                 assert pose is not None and pose.stamp_ns == 10**9 + 2
+            assert (bus.status().level, bus.status().message) == (OK, "open")
 
 
 def test_who_comes_late_is_told_the_newest_at_once() -> None:

@@ -28,6 +28,7 @@ from omnid.doctor.devices import access, holders, memberships
 from omnid.doctor.finding import Finding, verdict
 from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
 from omnid.doctor.wiring import bus, motor, rig
+from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[2]
 NOBODY = 65534
@@ -299,24 +300,28 @@ def test_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [finding.level for finding in programs()] == ["wrong", "ok"]
 
 
+def router(endpoint: str) -> list[Finding]:
+    return [finding for finding in bus(BusConfig(connect=(endpoint,))) if finding.subject == "router"]
+
+
 def test_a_router_that_answers_and_one_that_does_not() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         here = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        assert [finding.level for finding in bus((), (here,))] == ["ok"]
-    (found,) = bus((), (here,))
+        assert [finding.level for finding in router(here)] == ["ok"]
+    (found,) = router(here)
     assert found.level == "warning" and f"{here} does not answer: Connection refused" in found.found
     assert "lan.conf" in found.mend
 
 
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:7447", "unixsock-stream//tmp/x", "nonsense", ""])
 def test_a_router_that_cannot_be_tried(endpoint: str) -> None:
-    (found,) = bus((), (endpoint,))
+    (found,) = router(endpoint)
     assert found.level == "ok" and "is not tried" in found.found
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/no such host:1", "tcp/127.0.0.1:99999", "tcp/" + "x" * 300 + ":1"])
 def test_a_router_that_cannot_be(endpoint: str) -> None:
-    assert [finding.level for finding in bus((), (endpoint,))] == ["warning"]
+    assert [finding.level for finding in router(endpoint)] == ["warning"]
 
 
 @pytest.mark.parametrize(
@@ -326,8 +331,23 @@ def test_a_router_that_cannot_be(endpoint: str) -> None:
      ("tcp/192.168.1.2:7447", False), ("udp/robot.local:7447", False)],
 )
 def test_who_may_call(endpoint: str, local: bool) -> None:
-    found = [finding for finding in bus((endpoint,), ()) if finding.subject == "bus"]
-    assert (found == []) == local
+    for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
+        found = [finding for finding in bus(config) if finding.subject == "bus"]
+        assert (found == []) == local
+        assert all(finding.level == "warning" and "bus.command_users" in finding.mend for finding in found)
+
+
+def test_who_may_command_is_told(tmp_path: Path) -> None:
+    users = tmp_path / "users"
+    users.write_text("anna:secret")
+    config = BusConfig(listen=("tcp/0.0.0.0:7447",), users_file=str(users), command_users=("anna",))
+    (found,) = (finding for finding in bus(config) if finding.subject == "bus")
+    assert found.level == "ok" and "from anna only" in found.found
+
+
+def test_a_bus_that_would_not_start() -> None:
+    (found,) = (finding for finding in bus(BusConfig(command_users=("anna",))) if finding.level == "wrong")
+    assert "bus.users_file" in found.found
 
 
 def test_the_command_checks_everything_and_says_so_by_its_code(

@@ -8,7 +8,6 @@ import random
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Any
 
 import pytest
 
@@ -125,7 +124,8 @@ def test_nothing_moves_without_a_pose_or_without_a_command(bench: Bench) -> None
     assert is_stop(bench.last) and bench.helm.account.reason == fail_safe.POSE_STALE
     bench.see()
     bench.tick()
-    assert is_stop(bench.last) and bench.helm.account.reason == fail_safe.IDLE, "the command came before there was a pose"
+    assert is_stop(bench.last), "the command came before there was a pose"
+    assert bench.helm.account.reason == fail_safe.IDLE
     bench.ask()
     bench.tick()
     assert bench.last.velocity_mps > 0.0
@@ -138,7 +138,8 @@ def test_a_stale_pose_stops(driving: Bench) -> None:
         driving.ask()
 
     slows_down(driving, late)
-    assert driving.helm.account.reason == fail_safe.POSE_STALE and driving.helm.account.stops == {fail_safe.POSE_STALE: 1}
+    assert driving.helm.account.reason == fail_safe.POSE_STALE
+    assert driving.helm.account.stops == {fail_safe.POSE_STALE: 1}
     assert driving.said == ["the wheels stop: the pose is stale"]
 
 
@@ -282,7 +283,8 @@ def test_a_controller_that_stopped_by_itself_starts_from_a_stand(driving: Bench)
     driving.wheels.expired = False
     both(driving)
     driving.tick()
-    assert is_stop(driving.last) and driving.helm.account.stops == {fail_safe.STOPPED: 1} and driving.helm.account.expiries == 1
+    assert is_stop(driving.last) and driving.helm.account.stops == {fail_safe.STOPPED: 1}
+    assert driving.helm.account.expiries == 1
     both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9

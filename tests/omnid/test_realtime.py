@@ -110,7 +110,7 @@ def test_only_the_named_thread_has_priority_and_does_not_pass_it_on() -> None:
 
 @allowed
 def test_priorities_are_those_of_the_configuration() -> None:
-    assert priorities(RealtimeConfig(motor_priority=18, capture_priority=7), "lower", "upper") == {"lower": 7, "upper": 7}
+    assert priorities(RealtimeConfig(capture_priority=7), "lower", "upper") == {"lower": 7, "upper": 7}
     script = """
 def motor():
     ThreadStart({"motor": 18})("motor")

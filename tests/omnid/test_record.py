@@ -25,7 +25,7 @@ from omnid.messages import MapUpdate, Odometry
 from omnid.outputs.encoded import Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.recording import open_recorder, record
-from omnid.transport.codec import Status
+from omnid.transport.codec import ERROR, OK, Status
 from omnid.transport.image_codec import image_cdr, image_topic
 from tests.drivers.mcap_logs import STORE, jpeg
 
@@ -196,6 +196,21 @@ def test_a_disk_that_stands_still_stops_no_camera(tmp_path: Path) -> None:
     stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
     assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
     assert min(seen.times_s) < late.until_s  # the others went on meanwhile
+
+
+def test_how_it_goes_is_told(tmp_path: Path) -> None:
+    config = settings(tmp_path / "log")
+    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
+    assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
+    recorder.process(frame(0, "lower"))
+    told = recorder.status()
+    assert told.message == "recording" and told.values["messages"] == "1" and Path(told.values["file"]).exists()
+    recorder.close()
+    full = replace(config, record=replace(config.record, free_mb=1_000_000))
+    recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder.process(frame(0, "lower"))
+    told = recorder.status()
+    assert told.level == ERROR and told.values["lost"] == "1" and "1000001 wanted" in told.message
 
 
 class Late:

@@ -22,11 +22,11 @@ from omnid.outputs.helm import Arrived, Helm, HelmSettings
 from omnid.outputs.helm_link import heading_of
 from omnid.outputs.latency import Latency
 from omnid.outputs.logbook import Logbook
-from omnid.outputs.status import ERROR, OK, SILENT_S, STALE, WARN, StatusReport, StatusTick, Watched
+from omnid.outputs.status import SILENT_S, StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
 from omnid.telemetry import StageStats, Telemetry
-from omnid.transport.codec import Status, diagnostics_cdr
+from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
 from omnid.transport.commands import Commands
 from tests.scenes import build
 

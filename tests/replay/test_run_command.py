@@ -47,6 +47,16 @@ def test_poses_flow_wheels_obey_and_sigterm_ends_it(tmp_path: Path, scene: Path)
     assert all(line.startswith("omnid: ") for line in err.splitlines())
 
 
+def test_every_part_speaks_for_itself(tmp_path: Path, scene: Path) -> None:
+    settings = ("record.enabled=true", f'record.folder="{tmp_path / "log"}"', "live.check_s=0.1")
+    words = (word for setting in settings for word in ("--set", setting))
+    with robot(scene, tmp_path, *words) as (daemon, operator, _):
+        wait_until(lambda: operator.message("recording") == "recording", "the recording's word")
+        assert operator.message("bus") == "open"
+        wait_until(lambda: operator.values("rig").get("views", "").startswith("1 new"), "a first look at the rig")
+        assert daemon.end()[0] == 0
+
+
 def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
     """The path of the log, forwards and backwards: never further from the start than its end."""
     truth = read_tum(scene / "truth.txt")
