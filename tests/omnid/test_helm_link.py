@@ -98,8 +98,9 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(robot.pid, signal.SIGCONT)
-            robot.link.close()
+            robot.link.end()
             robot.joined()
+            robot.link.close()
 
 
 def slowed_down(base: Base) -> None:
@@ -119,7 +120,7 @@ def test_poses_and_commands_turn_the_wheels_and_the_book_is_kept(robot: Robot) -
     wait_until(lambda: not robot.base.drives, "the stop")
     wait_until(lambda: book.account.stops[fail_safe.ASKED] == 1, "its count")
     assert "the wheels stop: a stop was asked for" in robot.said
-    robot.link.close()
+    robot.link.end()
     robot.joined()
     assert robot.told[-1].velocity_mps == 0.0 and max(command.velocity_mps for command in robot.told) > 0.38
     assert robot.error is None and robot.stats.busy_since_ns == 0
@@ -209,8 +210,9 @@ def _has_open(base: Base) -> bool:
 def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("omnid.outputs.helm_link.END_S", 0.5)
     os.kill(robot.pid, signal.SIGSTOP)
-    robot.link.close()
+    robot.link.end()
     robot.joined()
+    robot.link.close()
     assert robot.link._process.returncode == -signal.SIGKILL and robot.error is None
 
 
