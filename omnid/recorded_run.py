@@ -1,6 +1,6 @@
 """A run out of its recording: poses, states, commands, rig and settings; any MCAP with Odometry will do.
 
-Pictures are passed over unread, and what is kept is 64 bytes a pose, so a recording may be as long as a day.
+Pictures are passed over unread and a pose is kept in 64 bytes, so a recording may be as long as a working day.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, TWIST_SCH
 from omnid.transport.decode import report_from
 
 STATES: Final = ("tracking", "degraded", "lost")
-MOST: Final = 1 << 21  # rows of a series: 19 hours of poses at 30 Hz
+MOST: Final = 1 << 20  # rows of a series: 9 hours of poses at 30 Hz
 _NAME: Final = "omnid: odometry"
 _LISTED: Final = 8
 
