@@ -53,7 +53,8 @@ class OdometryStage:
 
 def in_axes(T_a_b: Array, covariance: Array) -> Array:
     """Covariance (6, 6) [t; r] of a pose T_a_b, given in the axes of b, in the axes of a."""
-    R = np.kron(np.eye(2), T_a_b[:3, :3])
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T_a_b[:3, :3]
     return np.asarray(R @ covariance @ R.T)
 
 

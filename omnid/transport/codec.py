@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,7 @@ SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, D
            VECTOR_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
+CLOUD_BLOCK = 4096  # points moved at once: what is as large as a map leaves holes in memory that nothing else fills
 QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
@@ -107,7 +108,13 @@ def _vector(xyz: ArrayLike) -> ros.geometry_msgs__msg__Vector3:
 
 
 def _quaternion(R: ArrayLike) -> ros.geometry_msgs__msg__Quaternion:
-    return ros.geometry_msgs__msg__Quaternion(*(float(v) for v in se3.quaternion(R)))
+    return ros.geometry_msgs__msg__Quaternion(*_xyzw(np.asarray(R, np.float64).tobytes()))
+
+
+@lru_cache(maxsize=8)
+def _xyzw(R: bytes) -> list[float]:
+    """The quaternion of a rotation; several messages tell of the same one, and one part of the tree never turns."""
+    return list(se3.quaternion(np.frombuffer(R).reshape(3, 3)).tolist())
 
 
 def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
@@ -160,9 +167,13 @@ def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__Transf
     return ros.geometry_msgs__msg__TransformStamped(_header(stamp_ns, edge.parent), edge.child, motion)
 
 
-def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike) -> bytes:
-    """A sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): 16 bytes a point, float32."""
-    packed = _packed(points, confidence)
+def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *,
+                    T_frame_points: Array | None = None) -> bytes:
+    """A sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): 16 bytes a point, float32.
+
+    T_frame_points (4, 4): what brings the points into `frame`; None where they are in it.
+    """
+    packed = _packed(points, confidence, T_frame_points)
     number = ros.sensor_msgs__msg__PointField.FLOAT32
     fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
     message = ros.sensor_msgs__msg__PointCloud2(
@@ -179,12 +190,17 @@ def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: Ar
     return _cdr(message, POINT_CLOUD_SCHEMA)
 
 
-def _packed(points: ArrayLike, confidence: ArrayLike) -> NDArray[np.float32]:
-    """Points and confidence side by side (N, 4), little-endian float32."""
-    points, confidence = np.asarray(points, "<f4").reshape(-1, 3), np.asarray(confidence, "<f4").reshape(-1, 1)
+def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArray[np.float32]:
+    """Points, moved by T in double precision, and confidence side by side (N, 4), little-endian float32."""
+    points, confidence = np.asarray(points).reshape(-1, 3), np.asarray(confidence).reshape(-1)
     if len(points) != len(confidence):
         raise OmnidError(f"{len(points)} points but {len(confidence)} confidences; give one for each point")
-    return np.ascontiguousarray(np.hstack([points, confidence]))
+    packed = np.empty((len(points), 4), "<f4")
+    packed[:, 3] = confidence
+    for start in range(0, len(points), CLOUD_BLOCK):
+        at = slice(start, start + CLOUD_BLOCK)
+        packed[at, :3] = points[at] if T is None else se3.apply(T, points[at])
+    return packed
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
