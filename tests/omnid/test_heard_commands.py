@@ -1,0 +1,53 @@
+"""Commands from the network in a recording: as they came, and nothing that a reader would stumble over."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from omnid.config import Config
+from omnid.outputs.heard_commands import command_as_logged, keeper_of_commands
+from omnid.recording import open_recorder
+from omnid.transport import codec
+from omnid.transport.commands import LONGEST_PAYLOAD
+
+NOW_NS = 1_700_000_000 * 10**9
+
+
+def test_commands_are_recorded_as_they_came(tmp_path: Path) -> None:
+    config = Config()
+    config = replace(config, record=replace(config.record, folder=str(tmp_path / "log"), free_mb=0, file_mb=1))
+    recorder = open_recorder(config, "", lambda *_: None)
+    offset_ns = NOW_NS - time.monotonic_ns()
+    keep = keeper_of_commands(recorder, offset_ns)
+    keep("cmd/heading", codec.heading_cdr(NOW_NS, 0.3, -1.2))
+    keep("cmd/twist", codec.twist_stamped_cdr(NOW_NS, "base_link", 0.4, 0.5))
+    keep("cmd/stop", b"whatever")
+    keep("cmd/heading", b"no heading")
+    recorder.finish()
+    (path,) = (tmp_path / "log").glob("*.mcap")
+    with AnyReader([path]) as bag:
+        found = {place.topic: (at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data in bag.messages()}
+    assert list(found) == ["/omnid/cmd/heading", "/omnid/cmd/twist", "/omnid/cmd/stop"]
+    assert all(0 <= at_ns - NOW_NS < 60 * 10**9 for at_ns, _ in found.values())
+    heading, twist = found["/omnid/cmd/heading"][1].vector, found["/omnid/cmd/twist"][1].twist
+    assert (heading.x, heading.z, twist.linear.x, twist.angular.z) == (0.3, -1.2, 0.4, 0.5)
+
+
+@pytest.mark.parametrize("key", ["cmd", "cmd/", "cmd/speed", "odom", "cmd/heading/more", ""])
+def test_other_keys_are_left_out(key: str) -> None:
+    assert command_as_logged(key, codec.heading_cdr(NOW_NS, 0.3, -1.2)) is None
+
+
+def test_any_bytes_may_come() -> None:
+    numbers = np.random.default_rng(1)
+    for key in ("cmd/heading", "cmd/twist", "cmd/stop"):
+        for size in (0, 1, 3, 4, 5, 40, 64, 200, LONGEST_PAYLOAD):
+            command_as_logged(key, numbers.bytes(size))
+        assert command_as_logged(key, os.urandom(LONGEST_PAYLOAD + 1)) is None
