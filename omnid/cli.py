@@ -12,8 +12,8 @@ from typing import NoReturn
 
 from omnid import __version__
 
-COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "report", "log", "diff",
-            "doctor", "config")
+COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "report", "log",
+            "diff", "doctor", "config")
 MODULES = {"eval": "evaluate"}  # eval is a name that Python has taken
 WRONG = 2
 

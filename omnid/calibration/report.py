@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from html import escape
 
-import cv2
 import numpy as np
 
 from calib.camera import Mask
@@ -20,13 +18,11 @@ from omnid.calibration.drawings import (
     panorama_picture,
     residual_picture,
 )
+from omnid.report.page import figure, page, table
+
+__all__ = ("figure", "page", "report_html", "table")  # the rig's report is made of the same pieces
 
 MAX_SHOWN_VIEWS = 40
-JPEG_QUALITY = 80
-STYLE = """body{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse}td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1em 0}figcaption{color:#555}
-.bar{background:#d33;height:.7em;display:inline-block}.warn{color:#a40}"""
 
 
 def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequence[str], mask: Mask | None) -> str:
@@ -44,12 +40,6 @@ def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequen
                                           "the ray of the centre: what runs along it in the world stands upright"),
              "<h2>Residuals</h2>", *_residuals(found, images)]
     return page("Camera calibration", parts)
-
-
-def page(title: str, parts: Sequence[str]) -> str:
-    """A whole HTML page of parts."""
-    return f"<!DOCTYPE html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>" \
-           f"<body>{''.join(parts)}</body></html>\n"
 
 
 def _head(found: Calibration) -> str:
@@ -82,23 +72,8 @@ def _views(found: Calibration, missing: Sequence[str]) -> str:
     return table(("picture", "mean error [px]", "corners", "confidence", ""), rows) + none
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; cells are HTML."""
-    titles = "".join(f"<th>{title}</th>" for title in head)
-    lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
-    return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
-
-
 def _residuals(found: Calibration, images: Mapping[str, Image]) -> list[str]:
     shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
     return [figure(residual_picture(images[view.name], view.pixels, residuals),
                     f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")
             for view, residuals, error in shown]
-
-
-def figure(picture: Image, caption: str) -> str:
-    """A picture within the page."""
-    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    source = base64.b64encode(data.tobytes()).decode()
-    image = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

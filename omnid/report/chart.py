@@ -30,7 +30,7 @@ WIDTH: Final = 520
 HEIGHT: Final = 190
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 510, 8, 158
 _WIDE_LEFT, _WIDE_RIGHT, _LANE = 124, 1030, 26
-_LANES: Final = 10
+_LANES: Final = 14
 _FILLS: Final = ("class='track box'", "class='r1 box'", "class='r2 box'")
 _UNITS: Final = ((300.0, 1.0, "s"), (10800.0, 60.0, "min"), (float("inf"), 3600.0, "h"))
 
@@ -115,7 +115,7 @@ def chart(title: str, lines: Sequence[Line], clock: Clock, *, unit: str = "", lo
 
 def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock: Clock) -> str:
     """The states as a band, and below it a lane of marks for everyone that something happened to."""
-    sources = list(dict.fromkeys(event.source for event in events if event.source not in ("state", "poses")))[:_LANES]
+    sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda s: ("stage" in s, s))[:_LANES]
     seconds, _ = clock.unit
     x, height = clock.axis(_WIDE_LEFT, _WIDE_RIGHT), 42 + _LANE * len(sources)
     parts = [text((_WIDE_LEFT - 8, 27), "state", "text-anchor='end'"),

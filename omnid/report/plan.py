@@ -194,5 +194,5 @@ def _ends(sheet: _Sheet, corners: Sequence[Corner]) -> Iterator[str]:
 
 STYLE: Final = """.p0,.p1,.p2,.pt,.halo{fill:none;stroke-linejoin:round;stroke:#111;stroke-width:2.6}
 .p1{stroke-dasharray:9 4}.p2{stroke-dasharray:2.5 3.5}.pt{stroke:#666;stroke-width:1.4;stroke-dasharray:5 3}
-.halo{stroke:#fff;stroke-width:6}text.over{paint-order:stroke;stroke:#fff;stroke-width:4px;stroke-linejoin:round}
+.halo{stroke:#fff;stroke-width:6}text.over{paint-order:stroke;stroke:#fff;stroke-width:3px;stroke-linejoin:round}
 .track{fill:#ececec}"""

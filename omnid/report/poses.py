@@ -79,7 +79,7 @@ class PoseCourse:
             return
         if step_s > max(GAP_S, GAP_TIMES * (self._usual_s if self.poses > 2 else step_s)):
             self.gaps = [*self.gaps, (self.end_s, t_s)][-200:]
-            self._events.add(Event(self.end_s, t_s, WARNING, "poses", f"no pose for {step_s:.2f} s"))
+            self._events.add(Event(self.end_s, t_s, WARNING, "poses", f"none for {step_s:.2f} s"))
         elif math.isnan(self._usual_s):
             self._usual_s = step_s
         else:

@@ -58,8 +58,16 @@ def _shares(recording: Recording) -> Iterator[tuple[str, str]]:
         told = poses.poses - poses.states[-1]
         for rank, name in enumerate(STATES):
             count = poses.states[rank]
-            yield name, f"{100 * count / told:.1f} %" if 0 < count < told else "always" if count else "never"
+            yield name, _share(count, told)
         yield "resets", str(recording.statuses.resets)
+
+
+def _share(count: int, of: int) -> str:
+    """Per cent, such that what happened at all does not look like never."""
+    if count in (0, of):
+        return "always" if count else "never"
+    percent = 100 * count / of
+    return f"{percent:.1f} %" if 0.1 <= percent <= 99.9 else "< 0.1 %" if percent < 0.1 else "> 99.9 %"
 
 
 def _duration(seconds: float) -> str:
@@ -81,9 +89,16 @@ def events_table(events: Events, clock: Clock) -> list[str]:
 
 
 def _when(event: Event, clock: Clock) -> str:
-    seconds, unit = clock.unit
-    start, end = (f"{at / seconds:.2f}" for at in (event.start_s, event.end_s))
-    return f"{start} {unit}" if start == end else f"{start} to {end} {unit}"
+    """In seconds, or as h:mm:ss where the charts are in minutes or hours."""
+    short = clock.unit[1] == "s"
+    start, end = (f"{at:.2f}" if short else _hms(at) for at in (event.start_s, event.end_s))
+    said = start if start == end else f"{start} to {end}"
+    return f"{said} s" if short else said
+
+
+def _hms(seconds: float) -> str:
+    sign, whole = "-" if seconds < 0 else "", abs(seconds)
+    return f"{sign}{int(whole // 3600)}:{int(whole // 60) % 60:02}:{whole % 60:04.1f}"
 
 
 def _what(event: Event) -> str:
