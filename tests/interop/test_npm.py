@@ -16,14 +16,15 @@ pytestmark = pytest.mark.interop
 
 
 def read(log: Path) -> tuple[dict[str, Any], Expected]:
-    """The head of the log, and its messages by topic; each must be logged at its own stamp."""
+    """The head of the log, and its messages by topic; what omnid says must be logged at its own stamp."""
     reader = npm_reader()
     head, *messages = lines(["node", reader, log], reader.parent)
     found: Expected = {}
     for entry in messages:
         message = entry["message"]
-        stamp = (message["transforms"][0] if entry["topic"] == "/tf" else message)["header"]["stamp"]
-        assert int(entry["log_ns"]) == stamp["sec"] * 10**9 + stamp["nanosec"]
+        if "/cmd/" not in entry["topic"]:
+            stamp = (message["transforms"][0] if entry["topic"] == "/tf" else message)["header"]["stamp"]
+            assert int(entry["log_ns"]) == stamp["sec"] * 10**9 + stamp["nanosec"]
         found.setdefault(entry["topic"], []).append(message)
     return head, found
 
@@ -40,5 +41,5 @@ def test_a_live_recording_reads_as_by_rosbags(live: Path) -> None:
         for place, _, data in bag.messages():
             expected.setdefault(place.topic, []).append(plain(bag.deserialize(data, place.msgtype)))
     head, found = read(live)
-    assert set(head["attachments"]) == {"rig.toml", "omnid.toml"} and len(found) == 8
+    assert set(head["attachments"]) == {"rig.toml", "omnid.toml"} and len(found) >= 8
     assert found == expected

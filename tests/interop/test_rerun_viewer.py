@@ -79,12 +79,12 @@ def test_it_finds_nothing_wrong_with_the_order(known: Known, live: Path, tmp_pat
     """`rerun mcap check` exits 0 whatever it finds. With --full it finds fault with how it splits clouds itself."""
     for log in (known.path, live):
         said = run([program("rerun", "rerun-sdk"), "mcap", "check", log], tmp_path)
-        assert "PROBLEM" not in said and said.count("\nok ") == 8, said
+        assert "PROBLEM" not in said and said.count("\nok ") >= 8, said
 
 
 def test_a_live_recording_is_whole(live: Path) -> None:
     counts = {topic: len(messages) for topic, messages in read(live).items()}
-    assert len(counts) == 8 and counts["/omnid/odom"] == counts["/omnid/pose"] == counts["/tf"] > 5
+    assert len(counts) >= 8 and counts["/omnid/odom"] == counts["/omnid/pose"] == counts["/tf"] > 5
 
 
 def close(found: list[float], written: dict[str, float]) -> None:

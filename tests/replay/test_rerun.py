@@ -72,8 +72,8 @@ def test_all_that_is_said_is_in_it_with_rig_and_settings(
 
 
 def test_its_stamps_agree(messages: list[Message]) -> None:
-    """Every message is logged at its own stamp; a pose has that of a picture of the lower camera."""
-    assert all(message.log_ns == message.stamp_ns for message in messages)
+    """What omnid says is logged at its own stamp; a pose has that of a picture of the lower camera."""
+    assert all(message.log_ns == message.stamp_ns for message in messages if message.topic in SAID)
     lower = {message.stamp_ns for message in of(messages, IMAGES[0])}
     poses = [message.stamp_ns for message in of(messages, "/omnid/odom")]
     assert set(poses) <= lower and len(poses) > POSES // 2
