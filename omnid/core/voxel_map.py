@@ -20,6 +20,7 @@ _MAX_LOAD, _LOAD_AFTER_EVICTION = 0.7, 0.5
 _BATCH_SHARE = 8  # at most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing always ends
 _OLD_FRAMES = 30  # a point seen once and not again for so many frames was most likely a false match
 _VARIANCE_RANGE_M2 = (1e-8, 1e8)  # no point claims better than 0.1 mm; sums of weights stay far from overflow
+_BLOCK = 4096  # points of a snapshot worked out at once: in passing it takes little more than what it gives
 _HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
 
 
@@ -74,15 +75,23 @@ class VoxelMap:
 
     def points(self, min_frames: int = 2) -> MapPoints:
         """The voxels seen in at least `min_frames` frames, as their mean positions in the order of their keys."""
-        slots = np.flatnonzero((self._keys != _EMPTY) & (self._frames >= min_frames))
+        slots = np.flatnonzero(self._frames >= max(1, min_frames))  # an empty one has no frames
         slots = slots[np.argsort(self._keys[slots])]
-        age = np.minimum(self._newest_seq - self._last_seq[slots], np.iinfo(np.int32).max)
-        return MapPoints(
-            xyz=(self._sums[slots, 1:] / self._sums[slots, :1]).astype(np.float32),
-            confidence=self._confidence(slots).astype(np.float32),
-            frames=self._frames[slots],
-            age=age.astype(np.int32),
-        )
+        count = len(slots)
+        points = MapPoints(np.empty((count, 3), np.float32), np.empty(count, np.float32), self._frames[slots],
+                           np.empty(count, np.int32))
+        for start in range(0, count, _BLOCK):
+            at = slice(start, start + _BLOCK)
+            self._describe(slots[at], points.xyz[at], points.confidence[at], points.age[at])
+        return points
+
+    def _describe(self, slots: NDArray[np.int64], *into: NDArray[np.generic]) -> None:
+        """Writes the mean positions (N, 3), the confidence (N,) and the age (N,) of some slots."""
+        sums = self._sums[slots]
+        age = self._newest_seq - self._last_seq[slots]
+        found = (sums[:, 1:] / sums[:, :1], self._confidence(slots), np.minimum(age, np.iinfo(np.int32).max))
+        for target, values in zip(into, found, strict=True):
+            target[...] = values
 
     def _usable(self, points: NDArray[np.float64], variance_m2: NDArray[np.float64]) -> NDArray[np.bool_]:
         inside = (np.abs(points) < _HALF_SPAN * self._voxel_m).all(axis=1)  # false for NaN and infinity too

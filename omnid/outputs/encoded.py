@@ -8,7 +8,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.voxel_map import MapPoints
 from omnid.messages import MapUpdate, Odometry
@@ -45,8 +44,8 @@ class Encoder:
                 yield Encoded("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
                 points, confidence = _surest(message.points, self._cloud_points)
-                in_odom = se3.apply(self._T_base_rig, points.astype(float))
-                payload = codec.point_cloud_cdr(message.stamp_ns + self.offset_ns, "odom", in_odom, confidence)
+                payload = codec.point_cloud_cdr(message.stamp_ns + self.offset_ns, "odom", points, confidence,
+                                                T_frame_points=self._T_base_rig)
                 yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,26 +18,29 @@ SHORT_RUN = 10  # and one more for so many frames of the run, up to what is aske
 
 
 class Path:
-    """Where the rig was, in bounded memory: every second point is forgotten when it is full."""
+    """Where the rig was, in memory that is there from the start; when it is full, every second point is forgotten."""
 
     def __init__(self, limit: int) -> None:
-        self._limit, self._step, self._seen = limit, 1, 0
-        self._points: list[tuple[float, float]] = []
+        self._points = np.full((limit + 1, 2), np.nan)  # written, so that no page of it is new in the hours to come
+        self._kept, self._step, self._seen = 0, 1, 0
         self._last: tuple[float, float] | None = None
 
     def add(self, x_m: float, y_m: float) -> None:
         """Takes the next point."""
         self._last = (x_m, y_m)
         if self._seen % self._step == 0:
-            self._points.append(self._last)
+            self._points[self._kept] = self._last
+            self._kept += 1
         self._seen += 1
-        if len(self._points) > self._limit:
-            self._points, self._step = self._points[::2], 2 * self._step
+        if self._kept == len(self._points):
+            thinned = self._points[::2].copy()
+            self._kept, self._step = len(thinned), 2 * self._step
+            self._points[: self._kept] = thinned
 
     def xy(self) -> Array:
         """The points (N, 2) kept, and the last one."""
-        ends = () if self._last is None else (self._last,)
-        return np.array(list(chain(self._points, ends)), float).reshape(-1, 2)
+        ends = np.zeros((0, 2)) if self._last is None else np.array([self._last])
+        return np.concatenate([self._points[: self._kept], ends])
 
 
 class Mapping:

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
+from tests.omnid.allocations import taken
 
 STAMP_NS = 1_700_000_123_987_654_321
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -142,6 +143,21 @@ def test_point_cloud() -> None:
     assert message.is_dense and not message.is_bigendian
     rows = message.data.view("<f4").reshape(-1, 4)
     np.testing.assert_array_equal(rows, np.column_stack([points, confidence]))
+
+
+def test_a_point_cloud_is_moved_into_its_frame_and_takes_little_more_than_it_gives() -> None:
+    """The map's cloud goes out every two seconds and grows for hours; what it takes in passing stays with the process.
+    """
+    rng = np.random.default_rng(2)
+    points, confidence = rng.normal(size=(50_000, 3)).astype(np.float32), rng.random(50_000, np.float32)
+
+    def cloud() -> bytes:
+        return codec.point_cloud_cdr(STAMP_NS, "odom", points, confidence, T_frame_points=T_ODOM_BASE)
+
+    rows = read(cloud(), codec.POINT_CLOUD_SCHEMA).data.view("<f4").reshape(-1, 4)
+    moved = se3.apply(T_ODOM_BASE, points).astype(np.float32)
+    np.testing.assert_array_equal(rows, np.column_stack([moved, confidence]))
+    assert taken(cloud).most < 3.5 * len(cloud())  # the points, what rosbags makes of them, and a copy that is bytes
 
 
 def test_empty_point_cloud() -> None:

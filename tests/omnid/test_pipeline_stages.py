@@ -32,6 +32,7 @@ from omnid.stages.odometry import in_axes, of_base
 from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 from tests.conftest import PAIRS
+from tests.omnid.allocations import taken
 from tests.omnid.core.scenery import texture, wrapped
 from tests.scenes import build, make_rig, render_grey
 
@@ -217,6 +218,18 @@ def test_path_is_thinned_but_keeps_its_ends() -> None:
         way.add(float(k), 0.0)
     x = way.xy()[:, 0]
     assert len(x) <= 102 and x[0] == 0 and x[-1] == 9999 and (np.diff(x) <= 128).all()
+
+
+def test_a_path_takes_no_more_memory_as_it_gets_longer() -> None:
+    way = Way(10_000)
+
+    def go_on() -> None:
+        for k in range(9000):
+            way.add(float(k), 0.5)
+
+    assert taken(go_on).held < 1000
+    assert len(way.xy()) == 9001 and way.xy()[0].tolist() == [0.0, 0.5] and way.xy()[-2].tolist() == [8999.0, 0.5]
+    assert Way(100).xy().shape == (0, 2)
 
 
 def test_guidance_turns_towards_the_heading_and_stops_when_lost() -> None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from omnid.core.voxel_map import MapPoints, VoxelMap
 from omnid.errors import OmnidError
+from tests.omnid.allocations import taken
 
 Array = NDArray[np.float64]
 
@@ -179,6 +180,24 @@ def test_snapshot_is_a_copy() -> None:
     kept = as_bytes(before)
     voxels.insert(row(0, 3) + 0.3, var(3), 1)
     assert as_bytes(before) == kept
+
+
+def test_a_snapshot_takes_little_more_than_it_gives() -> None:
+    """A live map gives one every two seconds and grows for hours; what it takes in passing stays with the process."""
+    rng = np.random.default_rng(3)
+    voxels = VoxelMap(voxel_m=0.05)
+    voxels.insert(rng.uniform(-4.0, 4.0, (100_000, 3)), var(100_000), 0)
+    most, held = taken(lambda: voxels.points(1))
+    assert held > 20 * len(voxels) and most < 1.75 * held
+
+
+@pytest.mark.parametrize("count", [4095, 4096, 4097, 8193])
+def test_no_point_is_lost_where_a_snapshot_is_worked_out_in_parts(count: int) -> None:
+    voxels = VoxelMap(voxel_m=1.0)
+    voxels.insert(row(0, count), var(count), 0)
+    points = voxels.points(1)
+    np.testing.assert_array_equal(points.xyz, row(0, count).astype(np.float32))
+    assert (points.age == 0).all() and len(set(points.confidence.tolist())) == 1 and points.confidence[0] > 0
 
 
 @pytest.mark.parametrize(("voxel_m", "capacity"), [(0.0, 64), (np.nan, 64), (-1.0, 64), (0.1, 0), (0.1, 100), (0.1, 8)])
