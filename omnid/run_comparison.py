@@ -29,7 +29,6 @@ from omnid.recorded_run import STATES, Run
 MOST_KEYS: Final = 40  # lines about settings
 ATTACHED: Final = (("settings", "omnid.toml"), ("rig", "rig.toml"))
 NS_PER_S: Final = 1_000_000_000
-UNTOLD: Final = "unknown"
 
 Rows: TypeAlias = Iterator[tuple[str, str]]  # what a line is about and what it says
 
@@ -122,9 +121,7 @@ class Comparison:
 
     def _state_rows(self) -> Rows:
         a, b = self._states
-        told = [f"{name} {changes(run.states.values)} changes, {_resets(run.states)} resets"
-                for name, run in (("A", self._a), ("B", self._b))]
-        yield "states", "; ".join(told)
+        yield "states", f"A {_changes_text(self._a.states)}; B {_changes_text(self._b.states)}"
         if self._told.first is not None:
             row = self._told.first
             yield "", (f"others at {self._told.beyond} poses, first at {self._row(row)}: A {_state(a, row)}, "
@@ -179,8 +176,10 @@ def _drive_text(amounts: np.ndarray) -> str:
     return f"{1e3 * amounts[0]:.3f} mm/s, {math.degrees(amounts[1]):.4f} deg/s"
 
 
-def _resets(states: Series) -> str:
-    return f"{states.values[-1, 1]:.0f}" if states.stamps_ns.size else UNTOLD
+def _changes_text(states: Series) -> str:
+    if not states.stamps_ns.size:
+        return "tells none"
+    return f"{changes(states.values)} changes, {states.values[-1, 1]:.0f} resets"
 
 
 def _state(states: Series, row: int) -> str:
