@@ -94,9 +94,11 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
 
 
 def _require_rerun() -> None:
+    import os
     from importlib.util import find_spec
 
     from omnid.errors import OmnidError
 
     if find_spec("rerun") is None:
         raise OmnidError("omnid view draws with rerun, which is not installed here: pip install 'omnid[view]'")
+    os.environ.setdefault("RUST_LOG", "off")  # what rerun has to tell besides, we tell ourselves

@@ -6,7 +6,6 @@ panorama with its features; depth; plots of speed, turn, landmarks, deviation, l
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import cv2
@@ -20,6 +19,7 @@ from omnid.transport.decode import Cloud, Pose
 from omnid.viewing import looks
 from omnid.viewing.layout import CLOCK
 from omnid.viewing.looks import Look
+from omnid.viewing.places import Place
 from omnid.viewing.thinning import Thinning
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ MOST_CLOUD_POINTS: Final = 50_000
 MOST_RIG_POINTS: Final = 3_000
 MOST_LINES: Final = 1_000  # of the log
 MOST_LATENCIES: Final = 64  # curves
+KEPT_EVERY: Final = 20  # poses, after which all must have arrived
 AXIS_M: Final = 0.3
 PNG_FAST: Final = (cv2.IMWRITE_PNG_COMPRESSION, 3)
 
@@ -48,11 +49,11 @@ LEGEND: Final = f"""
 class Board:
     """Draws what it is given at its stamp; opened at the first of it, so that a run of nothing leaves no trace.
 
-    expected: how many poses there will be, 0 unknown. From one thread only.
+    layout: what lies where. expected: how many poses there will be, 0 unknown. From one thread only.
     """
 
-    def __init__(self, start: Callable[[], rr.RecordingStream], expected: int = 0) -> None:
-        self._start = start
+    def __init__(self, place: Place, layout: Any, expected: int = 0) -> None:
+        self._place, self._layout = place, layout
         self._stream: rr.RecordingStream | None = None
         self._wants = {"pose": Thinning(MOST_POSES, expected), "sight": Thinning(MOST_SIGHTS, expected),
                        "picture": Thinning(MOST_SIGHTS, expected), "cloud": Thinning(MOST_CLOUDS)}
@@ -85,6 +86,8 @@ class Board:
         if pose.note.seq >= 0:
             self.landmarks(pose.stamp_ns, pose.note.inliers, pose.note.tracks)
         self.poses += 1
+        if self.poses % KEPT_EVERY == 0:
+            self._place.keep()
 
     def state(self, stamp_ns: int, state: str) -> None:
         """The state of the odometry, where it changes."""
@@ -141,15 +144,17 @@ class Board:
             self._at(stamp_ns).log("log", rr.TextLog(text, level=level))
 
     def close(self) -> None:
-        """Has everything written; a second call does nothing."""
-        if self._stream is not None:
-            self._stream.flush()
-            self._stream.disconnect()
-            self._stream = None
+        """Has everything arrive, and ends it; a second call does nothing."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            try:
+                self._place.keep()
+            finally:
+                stream.disconnect()
 
     def _opened(self) -> rr.RecordingStream:
         if self._stream is None:
-            self._stream = self._start()
+            self._stream = self._place.start(self._layout)
             _lay_out(self._stream)
         return self._stream
 

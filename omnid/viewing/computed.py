@@ -18,9 +18,9 @@ from omnid.transport.note import Note
 from omnid.viewing.board import Board
 from omnid.viewing.looks import depth_picture
 from omnid.viewing.pictures import jpeg
+from omnid.viewing.reports import STAGES
 
 MAP_EVERY_S: Final = 2.0
-BESIDE: Final = ("record", "tally", "guidance")  # boxes whose time is not that of a pose
 
 
 class Computed:
@@ -79,5 +79,5 @@ class Latencies:
             total_s = count * mean_s if count else 0.0
             before, before_s = self._before.get(stage.name, (0, 0.0))
             self._before[stage.name] = count, total_s
-            if count > before and stage.name not in BESIDE:
+            if count > before and stage.name in STAGES:
                 yield stage.name, 1e3 * (total_s - before_s) / (count - before)

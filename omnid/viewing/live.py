@@ -9,15 +9,14 @@ from contextlib import suppress
 from typing import Final, TypeVar
 
 from drivers.errors import BrokenFrame
-from drivers.ros_image import COMPRESSED_IMAGE, parse_image
-from omnid.client import Cloud, Report, Robot
+from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
+from omnid.client import Cloud, Pose, Report, Robot
 from omnid.errors import OmnidError
-from omnid.listening.heard import Heard, Letter, Mailbox
+from omnid.listening.heard import Letter, Mailbox
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import cloud_from, report_from
+from omnid.transport.decode import cloud_from, pose_from, report_from
 from omnid.viewing import reports
 from omnid.viewing.board import Board
-from omnid.viewing.pictures import compressed
 from omnid.viewing.places import Place
 
 T = TypeVar("T")
@@ -30,7 +29,7 @@ class Live:
 
     def __init__(self, board: Board) -> None:
         self._board, self._changes = board, reports.Changes()
-        self.heard, self.broken = Heard(), 0
+        self.broken = 0
 
     def follow(self, bus: BusConfig, place: Place, seconds: float | None) -> None:
         """Draws until Ctrl-C, until nobody looks any more, or for so many seconds. Unreachable where nobody answers."""
@@ -54,26 +53,37 @@ class Live:
     def take(self, letter: Letter) -> None:
         """Draws a message, if it can be drawn."""
         try:
-            self._draw(letter)
+            message = _read(letter)
         except (OmnidError, BrokenFrame):
             self.broken += 1
-
-    def _draw(self, letter: Letter) -> None:
-        pose = self.heard.take(letter)
-        if pose is not None:
-            self._board.pose(pose)
-            age_ms = 1e-6 * (letter.received_ns - pose.stamp_ns)
-            self._board.latency(pose.stamp_ns, ("here", "age"), age_ms)
-        elif letter.topic == "cloud":
-            self._board.cloud(cloud_from(letter.payload))
-        elif letter.topic == "status":
-            self._report(report_from(letter.payload))
-        elif letter.topic == "panorama" and self._board.wants("picture"):
-            image = parse_image(COMPRESSED_IMAGE, memoryview(letter.payload))
-            self._board.panorama(image.stamp_ns, *compressed(image))
+            return
+        match message:
+            case Pose():
+                self._board.pose(message)
+                self._board.latency(message.stamp_ns, ("age",), 1e-6 * (letter.received_ns - message.stamp_ns))
+            case Report():
+                self._report(message)
+            case Cloud():
+                self._board.cloud(message)
+            case RosImage() if self._board.wants("picture"):
+                self._board.panorama(message.stamp_ns, bytes(message.data), message.encoding)
 
     def _report(self, report: Report) -> None:
         reports.draw(report, self._changes, self._board)
+
+
+def _read(letter: Letter) -> Pose | Report | Cloud | RosImage | None:
+    """The message in a letter, if it is of a kind that can be drawn; OmnidError or BrokenFrame where it is broken."""
+    match letter.topic:
+        case "odom":
+            return pose_from(letter.payload, letter.note, letter.received_ns)
+        case "status":
+            return report_from(letter.payload)
+        case "cloud":
+            return cloud_from(letter.payload)
+        case "panorama":
+            return parse_image(COMPRESSED_IMAGE, memoryview(letter.payload))
+    return None
 
 
 def _newest(robot: Robot, kind: type[T]) -> Iterator[T]:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Final, TypeAlias
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 from drivers.errors import BrokenFrame
 from drivers.mcap_catalog import Catalog
-from drivers.mcap_messages import DataSection
+from drivers.mcap_messages import DataSection, Message
 from drivers.mcap_records import LogFile, RecordError
 from drivers.mcap_survey import Survey
 from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA
-from omnid.transport.decode import Pose, cloud_from, pose_from, report_from
+from omnid.transport.decode import Pose, Report, cloud_from, pose_from, report_from
 from omnid.viewing import reports
 from omnid.viewing.board import Board
 from omnid.viewing.pictures import compressed
 
-Taker: TypeAlias = Callable[[str, memoryview], None]  # of the type and the bytes of a message
 PICTURES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # whichever comes first
 _LISTED: Final = 8
 
@@ -40,12 +40,19 @@ def poses_topic(found: Survey, robot: str | None) -> str | None:
     return mine[0] if mine else None
 
 
+class Way(NamedTuple):
+    """How a message becomes something to see: what reads its bytes, and what draws that."""
+
+    read: Callable[[memoryview], Any]
+    draw: Callable[[Any], None]
+
+
 class Recorded:
     """Draws a recording; broken: messages that could not be read, damaged: pieces of the file."""
 
     def __init__(self, found: Survey, topic: str, board: Board) -> None:
         self._found, self._board = found, board
-        self._takers = self._by_topic(topic)
+        self._ways = self._by_topic(topic)
         self._pending: Pose | None = None  # until its state is known, which is written after it
         self._state, self._changes = "unknown", reports.Changes()
         self.broken = self.damaged = 0
@@ -58,41 +65,40 @@ class Recorded:
 
     def show(self) -> None:
         """Draws all of it."""
-        for kind, topic, data in self._messages():
+        for way, message in self._messages():
             try:
-                self._takers[topic][kind](kind, data)
-            except (OmnidError, BrokenFrame):
+                found = way.read(message.data())
+            except (OmnidError, BrokenFrame, RecordError):
                 self.broken += 1
+                continue
+            way.draw(found)
         self._settle()
 
-    def _by_topic(self, poses: str) -> dict[str, dict[str, Taker]]:
-        """What draws a message, by its topic and type."""
+    def _by_topic(self, poses: str) -> dict[str, dict[str, Way]]:
+        """What becomes of a message, by its topic and type."""
         robot, pictures = poses.removesuffix("odom"), self.pictures(self._found, poses)
         return {
-            poses: {ODOMETRY_SCHEMA: self._pose},
-            f"{robot}cloud": {POINT_CLOUD_SCHEMA: self._cloud},
-            f"{robot}status": {DIAGNOSTICS_SCHEMA: self._report},
-            pictures: {IMAGE: self._picture, COMPRESSED_IMAGE: self._picture},
+            poses: {ODOMETRY_SCHEMA: Way(lambda data: pose_from(bytes(data), b"", 0), self._pose)},
+            f"{robot}cloud": {POINT_CLOUD_SCHEMA: Way(lambda data: cloud_from(bytes(data)), self._board.cloud)},
+            f"{robot}status": {DIAGNOSTICS_SCHEMA: Way(lambda data: report_from(bytes(data)), self._report)},
+            pictures: {kind: Way(partial(self._picture, kind), self._show) for kind in (IMAGE, COMPRESSED_IMAGE)},
         }
 
-    def _messages(self) -> Iterator[tuple[str, str, memoryview]]:
-        """Type, topic and bytes of what can be drawn, in the order of the file."""
+    def _messages(self) -> Iterator[tuple[Way, Message]]:
+        """What can be drawn, in the order of the file."""
         file = LogFile(self._found.path)
         try:
             section = DataSection(file, Catalog())
             for message in section.messages():
                 topic = section.catalog.topic(message.channel_id)
-                if topic is not None and topic.type in self._takers.get(topic.name, {}):
-                    try:
-                        yield topic.type, topic.name, message.data()
-                    except RecordError:
-                        self.broken += 1
+                way = None if topic is None else self._ways.get(topic.name, {}).get(topic.type)
+                if way is not None:
+                    yield way, message
             self.damaged = section.broken + (not section.ended)
         finally:
             file.close()
 
-    def _pose(self, _: str, data: memoryview) -> None:
-        pose = pose_from(bytes(data), b"", 0)
+    def _pose(self, pose: Pose) -> None:
         self._settle()
         self._pending = pose
 
@@ -103,15 +109,20 @@ class Recorded:
             self._board.pose(replace(self._pending, note=note))
         self._pending = None
 
-    def _report(self, _: str, data: memoryview) -> None:
-        report = report_from(bytes(data))
+    def _report(self, report: Report) -> None:
         self._state = reports.state(report) or self._state
+        counts = reports.landmarks(report)
+        if counts is not None:
+            self._board.landmarks(report.stamp_ns, *counts)
         reports.draw(report, self._changes, self._board)
 
-    def _cloud(self, _: str, data: memoryview) -> None:
-        self._board.cloud(cloud_from(bytes(data)))
+    def _picture(self, kind: str, data: memoryview) -> tuple[int, bytes, str] | None:
+        """Stamp, bytes and kind of a picture; None unless it is wanted."""
+        if not self._board.wants("picture"):
+            return None
+        image = parse_image(kind, data)
+        return image.stamp_ns, *compressed(image)
 
-    def _picture(self, kind: str, data: memoryview) -> None:
-        if self._board.wants("picture"):
-            image = parse_image(kind, data)
-            self._board.panorama(image.stamp_ns, *compressed(image))
+    def _show(self, picture: tuple[int, bytes, str] | None) -> None:
+        if picture is not None:
+            self._board.panorama(*picture)

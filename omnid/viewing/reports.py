@@ -12,6 +12,7 @@ from omnid.transport.codec import Status
 from omnid.transport.decode import Report
 from omnid.viewing.looks import STATES
 
+STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")
 ODOMETRY: Final = "omnid: odometry"
 LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")
 _TIME: Final = re.compile(r"(?P<what>\w+?)_(?P<which>p50|p99)_ms")
@@ -19,13 +20,18 @@ _LANDMARKS: Final = re.compile(r"(\d{1,9}) of (\d{1,9})")
 
 
 def latencies(report: Report) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Names and ms of what took its time: of stages the medians, of all else the 99th percentiles too."""
+    """Names and ms of what took its time: of the stages that make a pose the medians, of all that is no stage p99 too.
+    """
     for status in report.statuses:
-        part = plain(status.name.removeprefix("omnid: "))
+        part = status.name.removeprefix("omnid: ")
         for key, value in status.values.items():
             found, value_ms = _TIME.fullmatch(key), _number(value)
-            if found and value_ms is not None and not (part.startswith("stage ") and found["which"] == "p99"):
-                yield (part.removeprefix("stage "), f"{found['what']} {found['which']}"), value_ms
+            if found is None or value_ms is None:
+                continue
+            if not part.startswith("stage "):
+                yield (plain(part), f"{found['what']} {found['which']}"), value_ms
+            elif part.removeprefix("stage ") in STAGES and found["which"] == "p50":
+                yield (part.removeprefix("stage "),), value_ms
 
 
 def state(report: Report) -> str | None:
@@ -67,20 +73,14 @@ class Canvas(Protocol):
     def latency(self, stamp_ns: int, name: tuple[str, ...], value_ms: float) -> None:
         """How long something took, ms."""
 
-    def landmarks(self, stamp_ns: int, agreeing: int, found: int) -> None:
-        """How many were found, and how many of them agree."""
-
     def line(self, stamp_ns: int, text: str, level: str) -> None:
         """A line of the log."""
 
 
 def draw(report: Report, changes: Changes, canvas: Canvas) -> None:
-    """Draws all that can be drawn of a report."""
+    """Draws how long things took, and what has changed."""
     for name, value_ms in latencies(report):
         canvas.latency(report.stamp_ns, name, value_ms)
-    counts = landmarks(report)
-    if counts is not None:
-        canvas.landmarks(report.stamp_ns, *counts)
     for text, level in changes(report):
         canvas.line(report.stamp_ns, text, level)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from drivers.mcap_survey import Survey, survey
@@ -17,7 +18,7 @@ from omnid.viewing.board import Board
 from omnid.viewing.computed import MAP_EVERY_S, Computed
 from omnid.viewing.layout import layout
 from omnid.viewing.live import Live
-from omnid.viewing.places import Place, RrdFile, Viewer
+from omnid.viewing.places import ClosedError, Place, RrdFile, Viewer
 from omnid.viewing.recorded import Recorded, poses_topic
 
 
@@ -49,23 +50,32 @@ def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> i
     found = survey(log.path)
     topic = None if log.replay else poses_topic(found, log.robot)
     pictured = topic is None or Recorded.pictures(found, topic) != ""
-    board = Board(partial(place.start, layout(pictured, topic is None)), _most_messages(found, topic))
-    try:
+    board = Board(place, layout(pictured, depth=topic is None), _most_messages(found, topic))
+    code = 0
+    with _closing(board):
         code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
-    finally:
-        board.close()
     return _ended(board, place, code)
 
 
 def show_robot(bus: BusConfig, seconds: float | None, place: Place) -> int:
     """Shows a robot; the exit code, 1 where not one pose came."""
-    board = Board(partial(place.start, layout(pictures=True, depth=False)))
-    live = Live(board)
-    try:
-        live.follow(bus, place, seconds)
-    finally:
-        board.close()
+    board = Board(place, layout(pictures=True, depth=False))
+    with _closing(board):
+        Live(board).follow(bus, place, seconds)
     return _ended(board, place, int(not board.poses))
+
+
+@contextmanager
+def _closing(board: Board) -> Iterator[None]:
+    """Has all arrive that was drawn, whatever ends it; that somebody closes the window is an end like others."""
+    try:
+        yield
+        board.close()
+    except ClosedError as closed:
+        print(f"omnid: {closed}", file=sys.stderr)
+    finally:
+        with suppress(OmnidError):  # it was told already, or is not what ended it
+            board.close()
 
 
 def _computed(log: Log, config: Config, settings: Path | None, board: Board) -> int:
@@ -95,5 +105,6 @@ def _most_messages(found: Survey, topic: str | None) -> int:
 def _ended(board: Board, place: Place, code: int) -> int:
     if board.poses:
         print(f"{board.poses} poses and {board.pictures} pictures shown")
-        print(place.leave())
+    if board.poses and not place.left:
+        print(place.leave(), flush=True)
     return code
