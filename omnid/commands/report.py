@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 
@@ -22,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     """Writes the page."""
     from calib.rig_file import write_file
     from omnid.core.trajectory import read_tum
-    from omnid.outputs.files import check_outputs
+    from omnid.outputs.files import check_outputs, on_stdout
     from omnid.report.recording import read_recording
     from omnid.report.report import report_html
 
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     truth = read_tum(args.truth) if args.truth else None
     recording = read_recording(args.log, args.topic, keep_poses=truth is not None)
     html = report_html(args.log, recording, truth)
-    write_file(args.output, html.encode())
-    print(f"{args.output}: {recording.poses.poses} poses of {recording.topic}, {len(html) / 1e6:.1f} MB")
+    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    spoken = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
+    print(f"{args.output}: {recording.poses.poses} poses of {recording.topic}, {len(html) / 1e6:.2f} MB", file=spoken)
     return 0

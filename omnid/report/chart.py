@@ -25,6 +25,7 @@ from omnid.report.svg import (
     rectangles,
     text,
 )
+from omnid.report.thinned import Thinned
 
 WIDTH: Final = 520
 HEIGHT: Final = 190
@@ -43,6 +44,11 @@ class Line(NamedTuple):
 
     name: str
     points: Sequence[Point]
+
+
+def line(name: str, course: Thinned) -> Line:
+    """A course as a line."""
+    return Line(name, course.points())
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,28 +48,38 @@ class _Story:
 
     def add(self, event: Event) -> bool:
         """Whether it is told now."""
-        same = self._newest.get(event.kind)
-        joins = event.count > 0 or self._apart_s > _APART_S
-        if same is not None and joins and event.start_s - same.end_s <= self._apart_s:
-            same.take(event)
+        if self._joined(event):
             return True
         if self._full:
             return False
-        self.events.append(event)
-        self._newest[event.kind] = event
+        self._append(event)
         if len(self.events) > MOST_OF_ONE:
             self._shorten()
         return True
+
+    def _joined(self, event: Event) -> bool:
+        """Whether it is now part of the newest one of its kind."""
+        same = self._newest.get(event.kind)
+        joins = event.count > 0 or self._apart_s > _APART_S
+        if same is None or not joins or event.start_s - same.end_s > self._apart_s:
+            return False
+        same.take(event)
+        return True
+
+    def _append(self, event: Event) -> None:
+        self.events.append(event)
+        self._newest[event.kind] = event
 
     def _shorten(self) -> None:
         for _ in range(_MOST_DOUBLINGS):
             self._apart_s *= 2
             events, self.events, self._newest = self.events, [], {}
             for event in events:
-                self.add(event)
+                if not self._joined(event):
+                    self._append(event)
             if len(self.events) <= MOST_OF_ONE // 2:
                 return
-        self._full = len(self.events) >= MOST_OF_ONE
+        self._full = True
 
 
 class Events:

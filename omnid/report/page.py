@@ -34,6 +34,21 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
 
 
+def facts(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values; both are HTML."""
+    return f"<div class='words facts'>{table(('', ''), rows)}</div>"
+
+
+def note(words: str) -> str:
+    """A remark, such as one about what is missing."""
+    return f"<p class='note'>{escape(words)}</p>"
+
+
+def grid(figures: Sequence[str]) -> str:
+    """Figures side by side where there is room."""
+    return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
+
+
 def figure(picture: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
     """A picture within the page."""
     data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]

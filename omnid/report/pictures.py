@@ -41,8 +41,8 @@ def panoramas(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[
         for caption, picture in _found(path, rig, wanted):
             panorama = cv2.remap(picture, *maps, cv2.INTER_LINEAR)[:MOST_HEIGHT_PX]
             yield np.asarray(panorama, np.uint8), caption
-    except (CalibError, DriverError) as error:
-        raise OmnidError(str(error)) from error
+    except (CalibError, DriverError, cv2.error) as error:
+        raise OmnidError(" ".join(str(error).split())) from error
 
 
 def _found(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[str, Image]]:

@@ -13,10 +13,10 @@ from drivers.mcap_survey import State
 from omnid import __version__
 from omnid.core.trajectory import Trajectory
 from omnid.errors import OmnidError
-from omnid.report import chart, plan, sections, svg
+from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.against_truth import Comparison, compare
 from omnid.report.chart import Clock
-from omnid.report.page import figure, page
+from omnid.report.page import figure, note, page
 from omnid.report.pictures import Wanted, panoramas
 from omnid.report.poses import MOST_KEPT
 from omnid.report.recording import Recording
@@ -60,9 +60,9 @@ def report_html(path: Path, recording: Recording, true: Trajectory | None = None
     story = ["<h2>What happened</h2>", chart.timeline(spans, recording.poses.gaps, events, clock),
              *_states_missing(recording), *sections.events_table(recording.events, clock)]
     measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(recording, clock),
-                *sections.sureness(recording, clock), *sections.timing(recording, clock),
-                *sections.parts(recording, clock)]
-    rest = [*_pictures(path, recording), *sections.setup(recording), *sections.contents(recording),
+                *sections.sureness(recording, clock), *health.timing(recording, clock),
+                *health.parts(recording, clock)]
+    rest = [*_pictures(path, recording), *setup.setup(recording), *setup.contents(recording),
             f"<p><small>Made by omnid {__version__}.</small></p>"]
     parts = [*top, *story, *measured, *rest]
     return page(f"{recording.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE)
@@ -106,7 +106,7 @@ def _warnings(recording: Recording, true: Trajectory | None) -> list[str]:
 def _states_missing(recording: Recording) -> list[str]:
     if recording.poses.states[-1] < recording.poses.poses:
         return []
-    return [sections.note("The log does not tell the state of the odometry (…/status of omnid).")]
+    return [note("The log does not tell the state of the odometry (…/status of omnid).")]
 
 
 def _plan(recording: Recording, comparison: Comparison | None) -> plan.Plan:
@@ -135,9 +135,9 @@ def _lost_s(recording: Recording) -> list[float]:
 
 def _pictures(path: Path, recording: Recording) -> list[str]:
     if not recording.pictures:
-        return ["<h2>What the cameras saw</h2>", sections.note("The log holds no pictures.")]
+        return ["<h2>What the cameras saw</h2>", note("The log holds no pictures.")]
     if recording.rig is None:
-        return ["<h2>What the cameras saw</h2>", sections.note(f"Pictures, but {recording.rig_fault}.")]
+        return ["<h2>What the cameras saw</h2>", note(f"Pictures, but {recording.rig_fault}.")]
     start_ns = recording.poses.start_ns
     wanted = [Wanted(start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
     wanted += [Wanted(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
@@ -145,5 +145,5 @@ def _pictures(path: Path, recording: Recording) -> list[str]:
     try:
         shown = [figure(picture, caption, _JPEG_QUALITY) for picture, caption in panoramas(path, recording.rig, wanted)]
     except OmnidError as error:
-        shown = [sections.note(f"The pictures in the log cannot be shown: {error}")]
-    return ["<h2>What the cameras saw</h2>", *(shown or [sections.note("No picture could be decoded.")])]
+        shown = [note(f"The pictures in the log cannot be shown: {error}")]
+    return ["<h2>What the cameras saw</h2>", *(shown or [note("No picture could be decoded.")])]

@@ -1,9 +1,10 @@
-"""The rig and the settings of a run, in a few lines."""
+"""The sections about what a run was made with: rig, settings, file; what comes from the log is escaped here."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from html import escape
 from typing import Any, Final
 
 import numpy as np
@@ -12,14 +13,43 @@ from calib import se3
 from calib.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
+from omnid.report.page import facts, note, table
+from omnid.report.recording import Recording
 from omnid.settings import dump
 
 _LARGEST: Final = 1 << 18  # bytes of settings
 _MOST: Final = 60
+_MOST_TOPICS: Final = 60
 _LONGEST: Final = 120  # characters of a value
 
 
-def rig_rows(rig: Rig) -> list[tuple[str, str]]:
+def setup(recording: Recording) -> list[str]:
+    """The rig, and the settings that are not the usual ones."""
+    rig = [facts([(name, escape(value)) for name, value in _rig_rows(recording.rig)])] if recording.rig else \
+        [note(recording.rig_fault)]
+    settings = recording.attachments.get("omnid.toml")
+    found = None if settings is None else _unusual(settings)
+    if found is None:
+        told = [note("No settings are attached." if settings is None else "The attached settings cannot be read.")]
+    elif not found:
+        told = ["<p>All settings are the usual ones.</p>"]
+    else:
+        rows = [tuple(map(escape, row)) for row in found]
+        told = ["<div class='words scroll'>", table(("setting", "here", "usual"), rows), "</div>"]
+    return ["<h2>Rig and settings</h2>", *rig, *told]
+
+
+def contents(recording: Recording) -> list[str]:
+    """The topics of the file."""
+    topics = list(recording.survey.topics.items())
+    rows = [(escape(name), escape(kind), str(count)) for name, (kind, count) in topics[:_MOST_TOPICS]]
+    more = [note(f"and {len(topics) - _MOST_TOPICS} more topics")] if len(topics) > _MOST_TOPICS else []
+    attached = ", ".join(f"{name} ({size} bytes)" for name, size in recording.survey.attachments.items())
+    return ["<h2>What is in the file</h2>", "<div class='words scroll'>", table(("topic", "type", "messages"), rows),
+            "</div>", *more, f"<p>Attached: {escape(attached or 'nothing')}.</p>"]
+
+
+def _rig_rows(rig: Rig) -> list[tuple[str, str]]:
     """What the rig is, as name and value."""
     place = rig.T_base_rig
     turn = np.rad2deg(se3.rotation_log(place[:3, :3]))
@@ -37,7 +67,7 @@ def _camera(mounted: MountedCamera) -> str:
     return f"{model}, {camera.size[0]}x{camera.size[1]} px, {'with a' if mounted.mask else 'without a'} mask"
 
 
-def unusual(settings: bytes) -> list[tuple[str, str, str]] | None:
+def _unusual(settings: bytes) -> list[tuple[str, str, str]] | None:
     """Name, value and usual value of the settings that differ from omnid's own; None where they cannot be read."""
     try:
         given = tomllib.loads(settings[: _LARGEST + 1].decode()) if len(settings) <= _LARGEST else None

@@ -229,13 +229,14 @@ def test_a_hostile_log_is_text_and_no_more(tmp_path: Path) -> None:
     entries = [*(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
                (at(2), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(2, *parts)[3]),
                (at(3), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(3, *parts, *parts)[3])]
-    log = save(tmp_path / "<b>log.mcap", entries, {"omnid.toml": settings.encode(), "rig.toml": EVIL.encode(),
-                                                   EVIL: b""})
-    html = html_of(log)
+    log = save(tmp_path / "<b>log.mcap", entries, {"omnid.toml": settings.encode(), EVIL: b"",
+                                                   "rig.toml": b'schema = 1\n"<img src=x onerror=y>" = 1\n'})
+    html = html_of(log, Trajectory(np.array([at(k) for k in range(5)]), np.tile(np.eye(4), (5, 1, 1))))
     page = Page(html)
     assert_harmless(page)
     assert "<b>x" not in html and "<script" not in html and "<b>log" not in html
     assert page.text.count(EVIL) > 5
+    assert page.text.count("rig.toml: <img src=x") == 2  # in a remark and in a warning
 
 
 def test_a_flood_of_everything_stays_small(tmp_path: Path) -> None:
