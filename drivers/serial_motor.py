@@ -6,7 +6,6 @@ import contextlib
 import errno
 import math
 import os
-import select
 import termios
 import time
 from dataclasses import replace
@@ -22,6 +21,7 @@ from drivers.motor_protocol import MotorProtocol, Script, T
 CONNECT_TRY_S = 0.2
 STOPS_AT_CLOSE = 3
 READ_LIMIT_BYTES = 4096
+LOOK_S = 0.001  # between two looks at whether an answer has come
 STALE_SHARE = 0.5  # of the watchdog's time: later than that the controller may have stopped before a command arrives
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
@@ -37,14 +37,19 @@ class Silence(DriverError):  # noqa: N818 - it is what was heard
     """No answer within the time; the port is still there."""
 
 
+class Late(Silence):
+    """No answer within the time, but the last one is so young that the controller's watchdog cannot have expired."""
+
+
 class SerialMotor:
     """The base on `port`, for this program alone.
 
     `send` blocks for at most timeout_s, and for the opening of the port where that was gone; `close` for STOPS_AT_CLOSE
-    times that. A command is told once: who sends at a rate sends the next one anyway. After an error, a silence in
-    which the controller's watchdog may have expired, or a new connection, the first thing told is an explicit stop,
-    whatever was asked: the status then says watchdog_expired, and the next command drives. A port that is gone is
-    opened again by a later `send`, with growing waits in between, in which `send` fails at once.
+    times that. A command is told once: who sends at a rate sends the next one anyway. An answer that is Late does no
+    harm. After any other error, a silence in which the controller's watchdog may have expired, or a new connection, the
+    first thing told is an explicit stop, whatever was asked: the status then says watchdog_expired, and the next
+    command drives. A port that is gone is opened again by a later `send`, with growing waits in between, in which
+    `send` fails at once.
     """
 
     def __init__(
@@ -93,10 +98,16 @@ class SerialMotor:
         """Hands the command over and gives the controller's answer; DriverError when it stays silent or is gone."""
         try:
             return self._sent(command, time.monotonic() + self._timeout_s)
-        except DriverError:
+        except DriverError as error:
             self.errors += 1
+            if isinstance(error, Silence) and self._surely_drives():
+                raise Late(str(error)) from None
             self._stop_first = True
             raise
+
+    def _surely_drives(self) -> bool:
+        """Whether the controller cannot have stopped by itself by now."""
+        return self._armed and not self._stop_first and time.monotonic() - self._heard_s <= self._patience_s
 
     def close(self) -> None:
         """Stops the wheels as well as it can and releases the port; a second call does nothing."""
@@ -214,11 +225,19 @@ class SerialMotor:
                 raise Silence from None
 
     def _read(self, deadline_s: float) -> bytes:
-        """What has arrived, or arrives until the deadline."""
+        """What has arrived, or arrives until the deadline.
+
+        It is looked for again and again: whoever waits for a terminal, by select or a read, waits for a thread of the
+        kernel that has no priority, on a busy machine far beyond any timeout.
+        """
         if self._port is None:
             raise Silence
-        readable, _, _ = select.select([self._port.fileno()], [], [], max(0.0, deadline_s - time.monotonic()))
-        return bytes(self._port.read(READ_LIMIT_BYTES)) if readable else b""
+        while not self._port.in_waiting:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                return b""
+            time.sleep(min(left_s, LOOK_S))
+        return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
     def _silence(self, nonsense: int) -> Silence:
         if nonsense:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
+from drivers.serial_motor import Late
 from omnid.core.command_limits import STOP, CommandLimits
 from omnid.core.fail_safe import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
 from omnid.core.heading import Drive, HeadingHold, HeadingLimits, Setpoint
@@ -107,7 +108,7 @@ class Helm:
         self._judge(self._situation(now_ns, late_s, pose, command), now_ns)
         drive, goal_rad = self._steered(now_ns, dt_s, pose, command)
         told = VelocityCommand(now_ns, drive.velocity_mps, goal_rad, drive.yaw_rate_radps)
-        status = self._send(told)
+        status = self._send(told, drive)
         if status is not None:
             self._heed(status, drive)
             sure = pose if self.account.reason in SURE else None
@@ -167,10 +168,14 @@ class Helm:
         drive = self._settings.limits.step(wanted, self._sent, dt_s)
         return drive, self._goal.towards(command.setpoint, heading_rad, drive.yaw_rate_radps * dt_s)
 
-    def _send(self, command: VelocityCommand) -> MotorStatus | None:
+    def _send(self, command: VelocityCommand, drive: Drive) -> MotorStatus | None:
         """The controller's answer; None where it gave none."""
         try:
             status = self._driver.send(command)
+        except Late:
+            self._sent = drive  # it was told, and will have heard: the next step goes on from there
+            self.account.late += 1
+            return None
         except DriverError as error:
             if not self.account.failed:
                 self._report(str(error))

@@ -21,6 +21,7 @@ class Account:
     failed: bool = False  # the controller did not take the last command
     fault: int = 0  # the controller's own number
     sent: int = 0
+    late: int = 0  # commands whose answer did not come in time, but soon
     errors: int = 0
     expiries: int = 0  # how often the controller had stopped by itself
     missed: int = 0  # ticks that were left out

@@ -124,7 +124,8 @@ class StatusReport:
 
     def _helm(self, helm: Logbook, commands: Commands | None) -> Status:
         account = helm.account  # once, for another thread replaces it
-        values = {name: str(getattr(account, name)) for name in ("sent", "errors", "expiries", "fault", "untold")}
+        counts = ("sent", "late", "errors", "expiries", "fault", "untold")
+        values = {name: str(getattr(account, name)) for name in counts}
         values |= {f"stopped, {why}": str(count) for why, count in account.stops.items()}
         values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
         values["tick_late_p999_ms"] = f"{1e3 * helm.lateness.p(0.999):.2f}"

@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motor_protocols import PROTOCOLS
-from drivers.serial_motor import SerialMotor
+from drivers.serial_motor import Late, SerialMotor, Silence
 from drivers.simulated_motor import SimulatedMotor
 from tests.contract.twins import (
     ANSWER_S,
@@ -74,14 +74,34 @@ def test_a_silent_host_is_stopped_and_a_zero_comes_before_motion(name: str) -> N
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_silent_controller_is_an_error_and_then_a_zero_comes_first(name: str) -> None:
-    with motor_and_twin(name, timeout_s=SHORT_S) as (motor, twin):
+    with motor_and_twin(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, twin):
+        heard(motor)
         twin.silent = True
-        with pytest.raises(DriverError, match="gave no answer") as caught:
-            motor.send(FORWARD)
-        assert twin.port in str(caught.value) and "\n" not in str(caught.value) and motor.errors == 1
+        assert until(lambda: type(silence(motor)) is Silence), "late at first, then silent"
+        found = silence(motor)
+        assert "gave no answer" in str(found) and twin.port in str(found) and "\n" not in str(found)
         twin.silent = False
         assert heard(motor).watchdog_expired and twin.state.told_mps == [0.0, 0.0]
         assert until(lambda: heard(motor) is not None and twin.state.told_mps != [0.0, 0.0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_answer_that_is_late_stops_nothing(name: str) -> None:
+    with motor_and_twin(name, timeout_s=SHORT_S) as (motor, twin):
+        assert until(lambda: heard(motor) is not None and twin.state.told_mps != [0.0, 0.0])
+        twin.silent = True
+        found, withheld = silence(motor), motor.withheld
+        assert isinstance(found, Late) and motor.errors >= 1
+        twin.silent = False
+        assert not heard(motor).watchdog_expired and twin.state.told_mps != [0.0, 0.0]
+        assert motor.withheld == withheld
+
+
+def silence(motor: SerialMotor) -> DriverError:
+    """What is raised for a command that is not answered."""
+    with pytest.raises(DriverError) as caught:
+        motor.send(FORWARD)
+    return caught.value
 
 
 @pytest.mark.parametrize("name", NAMES)

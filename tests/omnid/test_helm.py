@@ -13,7 +13,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.serial_motor import SerialMotor
+from drivers.serial_motor import Late, SerialMotor
 from drivers.simulated_motor import SimulatedMotor
 from omnid.core import fail_safe
 from omnid.core.command_limits import CommandLimits
@@ -274,6 +274,34 @@ def test_a_motor_that_fails_voids_what_was_asked(driving: Bench) -> None:
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stand"
     assert driving.said == ["motor on /dev/x gave no answer", f"the wheels stop: {fail_safe.FAILED}",
                             "the motor controller is back"]
+
+
+def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
+    send = driving.wheels.send
+
+    def late(_: VelocityCommand) -> MotorStatus:
+        raise Late("motor on /dev/x gave no answer")
+
+    for wheels in (late, send):
+        driving.wheels.send = wheels  # type: ignore[method-assign]
+        both(driving)
+        driving.tick()
+    assert driving.helm.account.late == 1 and driving.helm.account.errors == 0
+    assert driving.last.velocity_mps == 0.3 and driving.helm.account.reason == "" and driving.said == []
+
+
+def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) -> None:
+    """The stop that was told without an answer is a step of the ramp, and the next goes on from there."""
+    def late(_: VelocityCommand) -> MotorStatus:
+        raise Late("motor on /dev/x gave no answer")
+
+    send, driving.wheels.send = driving.wheels.send, late  # type: ignore[method-assign]
+    driving.helm.end()
+    driving.tick()
+    assert not driving.helm.stands
+    driving.wheels.send = send  # type: ignore[method-assign]
+    driving.tick()
+    assert driving.last.velocity_mps == pytest.approx(0.3 - 2 * LIMITS.deceleration_mps2 * PERIOD_S)
 
 
 def test_a_controller_that_stopped_by_itself_starts_from_a_stand(driving: Bench) -> None:
