@@ -47,7 +47,7 @@ def _losses(statuses: StatusCourse) -> list[Line]:
 def _stage_table(statuses: StatusCourse) -> str:
     rows = [(escape(name), *(escape(values.get(key, "")) for key in ("processed", "rate_hz")),
              _lost(values), *(number(values.get(key, "")) for key in _TIMES)) for name, values in statuses.stages()]
-    head = ("stage", "messages", "a second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
+    head = ("stage", "messages", "per second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
     remark = "<small>At the last report. The work of a camera's stage is its wait for the next picture.</small>"
     return f"<div class='scroll'>{table(head, rows)}</div>{remark}" if rows else ""
 

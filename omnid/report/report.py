@@ -21,6 +21,7 @@ from omnid.report.pictures import Wanted, panoramas
 from omnid.report.poses import MOST_KEPT
 from omnid.report.recording import Recording
 from omnid.report.thinned import Corner
+from omnid.report.timeline import timeline
 
 _MOST_CROSSES: Final = 40
 _BEFORE_S: Final = 30.0  # that are shown of the time before the first pose, where something happened
@@ -57,7 +58,7 @@ def report_html(path: Path, recording: Recording, true: Trajectory | None = None
     top = [svg.hidden(svg.PATTERNS), chart.shades(spans, clock), *_head(path, recording),
            sections.key_figures(recording), *_warnings(recording, true),
            plan.plan_figure(_plan(recording, comparison), clock)]
-    story = ["<h2>What happened</h2>", chart.timeline(spans, recording.poses.gaps, events, clock),
+    story = ["<h2>What happened</h2>", timeline(spans, recording.poses.gaps, events, clock),
              *_states_missing(recording), *sections.events_table(recording.events, clock)]
     measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(recording, clock),
                 *sections.sureness(recording, clock), *health.timing(recording, clock),

@@ -68,7 +68,7 @@ def events_table(events: Events, clock: Clock) -> list[str]:
     beyond = sum(events.beyond.values())
     said = ", ".join(f"{source}: {count}" for source, count in events.beyond.most_common(20))
     more = [note(f"and {beyond} more: {said}")] if beyond else []
-    return ["<div class='events'>", table(("when", "", "who", "what"), rows), "</div>", *more]
+    return ["<div class='events'>", table(("when", "", "who", "what (how often)"), rows), "</div>", *more]
 
 
 def _when(event: Event, clock: Clock) -> str:
@@ -85,9 +85,7 @@ def _hms(seconds: float) -> str:
 
 
 def _what(event: Event) -> str:
-    if not event.count:
-        return event.text
-    return f"{event.text}, {event.count} times" if event.count > 1 else f"{event.text}, once"
+    return f"{event.text} ({event.count})" if event.count else event.text
 
 
 def motion(recording: Recording, clock: Clock) -> list[str]:

@@ -1,0 +1,79 @@
+"""The states of the odometry as a band, and below it what happened to whom."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from omnid.report.chart import Clock, Spans, time_ticks
+from omnid.report.events import ERROR, GOOD, Event
+from omnid.report.svg import Axis, Point, area_key, mark_key, number, rectangles, text
+
+_LEFT, _RIGHT, _BAND, _LANE = 124, 1030, (8, 36), 26
+_LANES: Final = 14
+_FILLS: Final = ("class='track box'", "class='r1 box'", "class='r2 box'")
+_MISSING: Final = "class='none'"
+
+
+def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock: Clock) -> str:
+    """The figure; a lane of marks for everyone that something happened to."""
+    sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda s: ("stage" in s, s))[:_LANES]
+    x, height = clock.axis(_LEFT, _RIGHT), 42 + _LANE * len(sources)
+    parts = [*_band(spans, gaps, (x, clock.unit[0])),
+             *(_reset(x.px(event.start_s / clock.unit[0]), 19) for event in events if _is_reset(event))]
+    for row, source in enumerate(sources):
+        parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], (x, clock.unit[0]))
+    parts += time_ticks(x, float(height), clock)
+    return (f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
+            f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events'>{''.join(parts)}</svg>"
+            "</figure>")
+
+
+def _band(spans: Spans, gaps: Sequence[Point], axis: tuple[Axis, float]) -> Iterator[str]:
+    """What is told of each moment lies above the frame that says that nothing is told."""
+    x, seconds = axis
+    yield text((_LEFT - 8, 27), "state", "text-anchor='end'")
+    for style, found in ((_MISSING, [(x.low * seconds, x.high * seconds)]), *zip(_FILLS, spans, strict=True),
+                         (_MISSING, gaps)):
+        d = rectangles([(x.px(a / seconds), x.px(b / seconds)) for a, b in found], _BAND)
+        yield f"<path {style} d='{d}'/>" if d else ""
+
+
+def _keys(events: Sequence[Event], lanes: bool) -> str:
+    keys = [area_key(style, name) for style, name in zip(
+        (*_FILLS, _MISSING), ("tracking", "degraded", "lost", "no pose, or its state is not told"), strict=True)]
+    if lanes:
+        keys += [mark_key(_mark(level, 17, 6), name) for level, name in enumerate(("news", "warning", "error"))]
+    if any(map(_is_reset, events)):
+        keys.append(mark_key(_reset(17, 12), "reset"))
+    return "".join(keys)
+
+
+def _is_reset(event: Event) -> bool:
+    return event.source == "state" and event.level == ERROR and event.text != "lost"
+
+
+def _reset(x: float, bottom: float) -> str:
+    """A black arrow that points down."""
+    return f"<path d='M{number(x)} {number(bottom)}l-5.5 -11h11z' fill='#000'/>"
+
+
+def _lane(source: str, top: float, events: Sequence[Event], axis: tuple[Axis, float]) -> Iterator[str]:
+    x, seconds = axis
+    middle = top + _LANE / 2
+    yield text((_LEFT - 8, middle + 4), source[:18], "text-anchor='end'")
+    yield f"<path class='grid' d='M{_LEFT} {number(middle)}H{_RIGHT}'/>"
+    for event in events:
+        a, b = x.px(event.start_s / seconds), x.px(event.end_s / seconds)
+        if b - a > 3:
+            yield f"<path d='M{number(a)} {number(middle)}H{number(b)}' stroke='#555' stroke-width='5'/>"
+        yield _mark(event.level, a, middle)
+
+
+def _mark(level: int, x: float, y: float) -> str:
+    """A ring for news that are good, a triangle for a warning, a black square for an error."""
+    if level == GOOD:
+        return f"<circle cx='{number(x)}' cy='{number(y)}' r='4' fill='#fff' stroke='#111'/>"
+    if level == ERROR:
+        return f"<rect x='{number(x - 4.5)}' y='{number(y - 4.5)}' width='9' height='9' fill='#111'/>"
+    return f"<path d='M{number(x)} {number(y - 5.5)}l5.5 10h-11z' fill='#fff' stroke='#111' stroke-width='1.4'/>"
