@@ -122,7 +122,8 @@ def choose_odometry(found: Survey, topic: str | None) -> str:
 
 def _no_odometry(found: Survey) -> str:
     if any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in found.topics.values()):
-        return (f"{found.path}: pictures but no poses: first `omnid replay {found.path} --record out.mcap`, then "
+        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
+        return (f"{found.path}: pictures but no poses: first `omnid replay {found.path}{rig} --record out.mcap`, then "
                 "`omnid report out.mcap`")
     return f"{found.path}: no {ODOMETRY_SCHEMA} in it; there is {_listed(list(found.topics))}"
 
