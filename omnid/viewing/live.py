@@ -20,7 +20,7 @@ from omnid.viewing.board import Board
 from omnid.viewing.places import Place
 
 T = TypeVar("T")
-PATIENCE_S: Final = 5.0
+PATIENCE_S: Final = 2.0
 LOOKS_S: Final = 0.5  # between two looks whether anybody is there still
 
 
