@@ -45,7 +45,7 @@ color:#333}.warn{color:#000;border-left:4px solid #000;padding-left:.7em}table{f
 @media print{@page{margin:14mm}body{font-size:10pt;margin:0;padding:0;max-width:none;-webkit-print-color-adjust:exact;
 print-color-adjust:exact}.plan>svg{max-height:150mm}.events{font-size:8.5pt}
 h2{break-after:avoid}tr{break-inside:avoid}.grid2{grid-template-columns:1fr 1fr}
-.scroll,.events{overflow:visible;max-height:none;border:0}td,th{padding:.1em .5em}}"""
+.scroll{break-inside:avoid}.scroll,.events{overflow:visible;max-height:none;border:0}td,th{padding:.1em .5em}}"""
 
 
 def report_html(path: Path, recording: Recording, true: Trajectory | None = None) -> str:
