@@ -23,6 +23,7 @@ from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
+from omnid.outputs.heard_commands import keeper_of_commands
 from omnid.outputs.helm import HelmSettings
 from omnid.outputs.helm_link import HelmLink
 from omnid.outputs.helm_messages import Orders
@@ -121,11 +122,11 @@ class Live:
                      rig=watch, map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
                      record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
-        commands = self._commands(bus, helm) if helm else None
+        commands = self._commands(bus, helm, recorder) if helm else None
         report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
                                       self._tally, self._latency.to_pose, helm.logbook if helm else None, commands,
                                       TICKERS, tuple(part.status for part in (bus, recorder, watch) if part)))
-        wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder)])]
+        wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder, self.offset_ns)])]
         graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
         service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)
         graph.ticker("watchdog", service.period_s, service)
@@ -154,9 +155,15 @@ class Live:
         ends.callback(recorder.close)
         return recorder
 
-    def _commands(self, bus: Bus, helm: HelmLink) -> Commands:
+    def _commands(self, bus: Bus, helm: HelmLink, recorder: FrameRecorder | None) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
-        bus.hear(commands.take)
+        keep = nothing if recorder is None else keeper_of_commands(recorder, self.offset_ns)
+
+        def take(key: str, payload: bytes) -> None:
+            commands.take(key, payload)  # first: a stop waits for nothing
+            keep(key, payload)
+
+        bus.hear(take)
         return commands
 
     def _publisher(self, bus: Bus) -> Callable[[list[Status]], None]:
@@ -176,11 +183,11 @@ class Live:
         self._graph.stop()
 
 
-def _keeper(recorder: FrameRecorder) -> Callable[[list[Status]], None]:
+def _keeper(recorder: FrameRecorder, offset_ns: int) -> Callable[[list[Status]], None]:
     """What records statuses."""
 
     def keep(statuses: list[Status]) -> None:
-        now_ns = time.time_ns()
+        now_ns = time.monotonic_ns() + offset_ns  # as the stamps of all else, also when the clock has been set
         with suppress(OmnidError):  # a clock may be set to what is no time
             recorder.add(status_report(now_ns, statuses), now_ns)
 

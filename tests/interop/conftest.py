@@ -10,7 +10,6 @@ import pytest
 from tests.interop.known import Expected, write_known
 from tests.replay.recorded import recorded_run
 
-MARKER = "interop: reads logs with programs that others wrote; run with `python -m pytest -m interop tests/interop`"
 POSES = 12  # of the live run
 
 
@@ -19,20 +18,6 @@ class Known(NamedTuple):
 
     path: Path
     expected: Expected
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Makes the marker known."""
-    config.addinivalue_line("markers", MARKER)
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """They run when they are asked for and else not: some are installed from the network first."""
-    if "interop" in config.option.markexpr:
-        return
-    kept = [item for item in items if item.get_closest_marker("interop") is None]
-    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
-    items[:] = kept
 
 
 @pytest.fixture(scope="session", params=("lz4", "none"))
