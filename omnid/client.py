@@ -25,11 +25,12 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.decode import Cloud, Pose, Report, cloud_from, pose_from, report_from
+from omnid.transport.decode import Cloud, Map, Pose, Report, cloud_from, map_from, pose_from, report_from
 from omnid.transport.note import Note
 from omnid.transport.session import Unreachable, open_session
 
-__all__ = ["HERE", "Cloud", "Driver", "Note", "Pose", "Report", "Robot", "Subscription", "Unreachable", "subscribe"]
+__all__ = ["HERE", "Cloud", "Driver", "Map", "Note", "Pose", "Report", "Robot", "Subscription", "Unreachable",
+           "subscribe"]
 
 T = TypeVar("T")
 HERE: Final = "tcp/127.0.0.1:7447"
@@ -37,6 +38,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
     Pose: ("odom", pose_from),
     Report: ("status", report_from),
     Cloud: ("cloud", cloud_from),
+    Map: ("map", map_from),
 }
 _ANSWER_S: Final = 1.0
 _NAP_S: Final = 0.002

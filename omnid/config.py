@@ -124,6 +124,8 @@ class MappingConfig:
     max_sigma_m: float = knob(0.15, "points less certain than this stay out of the map, m", low=0.001, high=100)
     min_frames: int = knob(6, "frames that must have seen a voxel before it is written; fewer in a short run", low=1,
                            high=1000)
+    heights_m: tuple[float, float] = knob((-1.0, 1.5), "of what stands in the way in the grid on the bus, m over the "
+                                          "base at the start", low=-1000, high=1000)
     path_poses: int = knob(100_000, "poses kept for the plan view; beyond, every second is forgotten", low=100,
                            high=10_000_000)
 
@@ -167,7 +169,7 @@ class RecordConfig:
                          high=3600)
     queue: int = knob(20, "messages of each kind that may wait for the disk; the oldest are dropped and counted",
                       low=1, high=1000)
-    cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
+    cloud_points: int = knob(200_000, "most points of the map in a log or on the bus: the most confident ones", low=0,
                              high=10_000_000)
 
     def rotation(self) -> Rotation:

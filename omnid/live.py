@@ -21,7 +21,7 @@ from omnid.graph import NEWEST, Graph, Sink
 from omnid.journal import WARNING
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
-from omnid.outputs.encoded import Encoder, status_report
+from omnid.outputs.encoded import Encoder, clouds_of, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.outputs.heard_commands import keeper_of_commands
 from omnid.outputs.helm import HelmSettings
@@ -108,7 +108,7 @@ class Live:
 
     def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
-        encode = Encoder(place.rig.T_base_rig, config.record.cloud_points, self.offset_ns)
+        encode = Encoder(place.rig.T_base_rig, clouds_of(config), self.offset_ns)
         helm = self._helm(place, ends) if config.motor.port else None
         bus = self._bus(place, ends)
         pair = LivePair(place.rig, config.pair)

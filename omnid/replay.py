@@ -22,7 +22,7 @@ from omnid.errors import OmnidError
 from omnid.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.log_rig import attached_rig
 from omnid.outputs.bus import BusSink
-from omnid.outputs.encoded import Encoder, Outgoing
+from omnid.outputs.encoded import Encoder, Outgoing, clouds_of
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.outputs.motor import MotorTick, open_motor
 from omnid.outputs.progress import Progress
@@ -140,7 +140,7 @@ class Replay:
     def _ends(self, place: Geometry, closing: ExitStack) -> Ends:
         """Opens all outputs: what cannot be opened is said now."""
         options, config = self._options, self._config
-        encode = Encoder(place.rig.T_base_rig, config.record.cloud_points)
+        encode = Encoder(place.rig.T_base_rig, clouds_of(config))
         motor = None
         recorder = options.watch(place, self._graph.telemetry) if options.watch else None
         bus = self._bus(encode, closing) if options.publish else None

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 UNKNOWN, FREE, TAKEN = -1, 0, 100  # of nav_msgs/msg/OccupancyGrid; between: how sure it is that something is there
 MOST_CELLS: Final = 1_000_000

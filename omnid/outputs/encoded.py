@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.motor import VelocityCommand
+from omnid.config import Config
+from omnid.core.occupancy import occupancy
 from omnid.core.voxel_map import MapPoints
 from omnid.messages import MapUpdate, Odometry
 from omnid.stages.odometry import of_base
@@ -25,14 +27,27 @@ class Encoded(NamedTuple):
     payload: bytes
 
 
+class Clouds(NamedTuple):
+    """What is told of the map."""
+
+    points: int  # most points of the cloud: the surest ones
+    heights_m: tuple[float, float] = (-1.0, 1.5)  # of what stands in the way, in the base's frame at the start
+    cell_m: float = 0.05  # of the grid
+
+
+def clouds_of(config: Config) -> Clouds:
+    """The same from the settings."""
+    return Clouds(config.record.cloud_points, config.mapping.heights_m, config.mapping.voxel_m)
+
+
 class Encoder:
     """Turns messages into those of ROS 2; their odom is the base's frame at the first pair, not the rig's.
 
     offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
     """
 
-    def __init__(self, T_base_rig: NDArray[np.float64], cloud_points: int, offset_ns: int = 0) -> None:
-        self._T_base_rig, self._cloud_points, self.offset_ns = T_base_rig, cloud_points, offset_ns
+    def __init__(self, T_base_rig: NDArray[np.float64], clouds: Clouds, offset_ns: int = 0) -> None:
+        self._T_base_rig, self._clouds, self.offset_ns = T_base_rig, clouds, offset_ns
 
     def __call__(self, message: Outgoing) -> Iterator[Encoded]:
         """All that is said about a message."""
@@ -43,10 +58,7 @@ class Encoder:
                 payload = codec.twist_stamped_cdr(stamp_ns + self.offset_ns, "base_link", velocity_mps, yaw_rate_radps)
                 yield Encoded("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
-                points, confidence = _surest(message.points, self._cloud_points)
-                payload = codec.point_cloud_cdr(message.stamp_ns + self.offset_ns, "odom", points, confidence,
-                                                T_frame_points=self._T_base_rig)
-                yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
+                yield from self._map(message)
 
     def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
@@ -57,6 +69,21 @@ class Encoder:
         edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
                  codec.FrameTransform("base_link", "rig", self._T_base_rig)]
         yield Encoded("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+
+    def _map(self, update: MapUpdate) -> Iterator[Encoded]:
+        stamp_ns = update.stamp_ns + self.offset_ns
+        points, confidence = _surest(update.points, self._clouds.points)
+        payload = codec.point_cloud_cdr(stamp_ns, "odom", points, confidence, T_frame_points=self._T_base_rig)
+        yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
+        grid = occupancy(self._moved(points), confidence, self._moved(_level(update.path_xy))[:, :2],
+                         self._clouds.heights_m, self._clouds.cell_m)
+        yield Encoded("map", codec.GRID_SCHEMA, codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m,
+                                                                grid.corner))
+
+    def _moved(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Points (N, 3) of the rig's first frame in the base's: single, for a map is large and a cell is wide."""
+        T = self._T_base_rig.astype(np.float32)
+        return np.asarray(points.astype(np.float32, copy=False) @ T[:3, :3].T + T[:3, 3])
 
 
 class StateReports:
@@ -86,6 +113,11 @@ def summary_report(stamp_ns: int, values: dict[str, str]) -> Encoded:
 def status_report(stamp_ns: int, statuses: Sequence[codec.Status]) -> Encoded:
     """Statuses as one diagnostic message."""
     return Encoded("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
+
+
+def _level(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (N, 2) on the ground, z = 0."""
+    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 def _surest(points: MapPoints, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

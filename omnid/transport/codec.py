@@ -27,8 +27,9 @@ POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
+GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA, TWIST_SCHEMA,
-           VECTOR_SCHEMA)
+           VECTOR_SCHEMA, GRID_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 CLOUD_BLOCK = 4096  # points moved at once: what is as large as a map leaves holes in memory that nothing else fills
@@ -201,6 +202,14 @@ def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArra
         at = slice(start, start + CLOUD_BLOCK)
         packed[at, :3] = points[at] if T is None else se3.apply(T, points[at])
     return packed
+
+
+def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
+    """A nav_msgs/msg/OccupancyGrid of cells (H, W) in the plane z = 0 of `frame`; corner: x, y of cell (0, 0), m."""
+    height, width = cells.shape
+    T_frame_corner = se3.transform(np.eye(3), (*corner, 0.0))
+    info = ros.nav_msgs__msg__MapMetaData(_time(stamp_ns), cell_m, width, height, _pose(T_frame_corner))
+    return _cdr(ros.nav_msgs__msg__OccupancyGrid(_header(stamp_ns, frame), info, cells.reshape(-1)), GRID_SCHEMA)
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[Status]) -> bytes:

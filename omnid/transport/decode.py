@@ -18,6 +18,7 @@ from omnid.transport import codec
 from omnid.transport.codec import NS_PER_S, Status
 from omnid.transport.note import Note, note_from_bytes
 
+ALIGNED = 0.999_999  # w of a quaternion that hardly turns
 Array = NDArray[np.float64]
 
 
@@ -82,6 +83,17 @@ class Cloud:
     confidence: NDArray[np.float32]  # (N,)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """The map from above."""
+
+    stamp_ns: int
+    frame: str
+    cells: NDArray[np.int8]  # (H, W) -1 unknown, 0 free, up to 100 taken; rows from low to high y, columns x
+    cell_m: float
+    corner: tuple[float, float]  # x, y of cell (0, 0), m
+
+
 def pose_from(payload: bytes, note: bytes, received_ns: int | None = None) -> Pose:
     """The pose in an Odometry message and what goes along with it; OmnidError unless it is one.
 
@@ -113,6 +125,18 @@ def cloud_from(payload: bytes, _: bytes = b"") -> Cloud:
         raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point is none of omnid's")
     packed = message.data.view("<f4").reshape(-1, len(codec.CLOUD_FIELDS))
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+
+
+def map_from(payload: bytes, _: bytes = b"") -> Map:
+    """The cells in an OccupancyGrid that lies along its frame's axes; OmnidError unless it is one."""
+    message = codec.message_from_cdr(payload, codec.GRID_SCHEMA)
+    assert isinstance(message, ros.nav_msgs__msg__OccupancyGrid)
+    info, at = message.info, message.info.origin
+    if message.data.size != info.width * info.height or not (info.resolution > 0 and abs(at.orientation.w) > ALIGNED):
+        raise OmnidError(f"a map of {message.data.size} cells, said to be {info.width} x {info.height} of "
+                         f"{info.resolution:g} m, is none of omnid's")
+    return Map(_stamp_ns(message.header), message.header.frame_id, message.data.reshape(info.height, info.width),
+               float(info.resolution), (at.position.x, at.position.y))
 
 
 def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:

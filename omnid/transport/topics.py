@@ -25,6 +25,7 @@ SAID: Final = {
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, late=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, late=True),
+    "map": Topic(codec.GRID_SCHEMA, late=True),
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(PICTURE_SCHEMA),
 }

@@ -23,7 +23,7 @@ from calib import se3
 from omnid.client import Report, Robot, Subscription
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink
-from omnid.outputs.encoded import Encoder
+from omnid.outputs.encoded import Clouds, Encoder
 from omnid.telemetry import Histogram
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
@@ -103,7 +103,7 @@ def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:
 
 
 def sink_on(bus: Bus) -> BusSink:
-    return BusSink(bus, Encoder(np.eye(4), 1000))
+    return BusSink(bus, Encoder(np.eye(4), Clouds(1000)))
 
 
 @pytest.mark.parametrize("way", ["direct", "router"])

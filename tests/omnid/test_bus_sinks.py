@@ -16,7 +16,7 @@ from omnid.client import Robot
 from omnid.core.klt import Wrapped
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
-from omnid.outputs.encoded import Encoder
+from omnid.outputs.encoded import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
 from tests.omnid.buses import free_endpoint, wait_until
@@ -34,7 +34,7 @@ def odometry(seq: int) -> Odometry:
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), 10, OFFSET_NS))
+        sink = BusSink(bus, Encoder(np.eye(4), Clouds(10), OFFSET_NS))
         robot.each(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
     pose = pose_from(*came["odom"])

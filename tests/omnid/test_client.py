@@ -17,12 +17,12 @@ import pytest
 
 import omnid.client
 from calib import se3
-from omnid.client import Cloud, Driver, Pose, Report, Robot, subscribe
+from omnid.client import Cloud, Driver, Map, Pose, Report, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
-from omnid.transport.decode import cloud_from, pose_from, report_from
+from omnid.transport.decode import cloud_from, map_from, pose_from, report_from
 from omnid.transport.note import Note, note_bytes, note_from_bytes
 from tests.omnid.buses import free_endpoint, odometry, script, wait_until
 
@@ -67,12 +67,17 @@ def test_reports_and_clouds_come_back_as_they_were_said() -> None:
     assert (cloud.stamp_ns, cloud.frame) == (6, "odom")
     np.testing.assert_array_equal(cloud.points, points)
     np.testing.assert_array_equal(cloud.confidence, np.arange(50.0))
+    cells = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
+    grid = map_from(codec.grid_cdr(7, "odom", cells, 0.5, (-2.0, 1.0)))
+    assert (grid.stamp_ns, grid.frame, grid.cell_m, grid.corner) == (7, "odom", 0.5, (-2.0, 1.0))
+    np.testing.assert_array_equal(grid.cells, cells)
 
 
 @pytest.mark.parametrize(("kind", "topic", "payload", "decode"), [
     (Pose, "odom", odometry(3), lambda data: pose_from(data, b"")),
     (Report, "status", codec.diagnostics_cdr(5, [Status("a", 1, "so so", {"k": "v"})]), report_from),
     (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), cloud_from),
+    (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), map_from),
 ])
 def test_whatever_comes_is_read_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
     rng = random.Random(2)

@@ -160,6 +160,16 @@ def test_a_point_cloud_is_moved_into_its_frame_and_takes_little_more_than_it_giv
     assert taken(cloud).most < 3.5 * len(cloud())  # the points, what rosbags makes of them, and a copy that is bytes
 
 
+def test_grid() -> None:
+    cells = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
+    message = read(codec.grid_cdr(STAMP_NS, "odom", cells, 0.1, (-2.0, 5.5)), codec.GRID_SCHEMA)
+    info = message.info
+    assert message.header.frame_id == "odom" and message.data.tolist() == list(range(-1, 11))
+    assert (info.width, info.height, info.resolution) == (4, 3, pytest.approx(0.1))
+    origin = info.origin
+    assert (origin.position.x, origin.position.y, origin.position.z, origin.orientation.w) == (-2.0, 5.5, 0.0, 1.0)
+
+
 def test_empty_point_cloud() -> None:
     message = read(codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0)), codec.POINT_CLOUD_SCHEMA)
     assert message.width == 0 and len(message.data) == 0

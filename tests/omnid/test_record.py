@@ -22,7 +22,7 @@ from omnid.core.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.graph import NEWEST, Graph
 from omnid.messages import MapUpdate, Odometry
-from omnid.outputs.encoded import Encoder, status_report
+from omnid.outputs.encoded import Clouds, Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.recording import open_recorder, record
 from omnid.transport.codec import ERROR, OK, Status
@@ -102,7 +102,7 @@ def odometry(seq: int, state: str = "tracking") -> Odometry:
 
 
 def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None:
-    encode = Encoder(np.eye(4), 100, OFFSET_NS)
+    encode = Encoder(np.eye(4), Clouds(100), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode,
                              offset_ns=OFFSET_NS)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
@@ -122,14 +122,14 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
             written_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
             assert START_NS <= written_ns <= START_NS + 3 and stamp_ns == written_ns
     assert counts == {"/omnid/odom": 4, "/omnid/pose": 4, "/tf": 4, "/omnid/drive": 4, "/omnid/status": 3,
-                      "/omnid/cloud": 1}
+                      "/omnid/cloud": 1, "/omnid/map": 1}
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
 
 
 def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -> None:
     """A pose tells its state at the time of its pictures, when reports of later times have been made already."""
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), 9, OFFSET_NS),
-                             offset_ns=OFFSET_NS)
+    encode = Encoder(np.eye(4), Clouds(9), OFFSET_NS)
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=encode, offset_ns=OFFSET_NS)
     report = status_report(START_NS + 2, [Status("omnid: test", 0, "fine", {})])
     recorder.process(frame(-1, "lower"))
     recorder.add(report, START_NS + 2)
@@ -154,7 +154,7 @@ def attached(path: Path) -> list[str]:
 
 def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
     config = settings(tmp_path / "log", file_s=1.0)
-    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), 0))
+    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), Clouds(0)))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
     recorder.finish()
@@ -166,7 +166,7 @@ def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
 
 
 def test_no_message_ends_the_run(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), 0))
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), Clouds(0)))
     for stamp_ns in (-1, 2**31 * 10**9, 2**70, START_NS):
         recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
         recorder.process(replace(odometry(0), stamp_ns=stamp_ns))

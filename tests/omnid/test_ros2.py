@@ -32,6 +32,7 @@ HASHES = {  # as published by ROS 2's own type description service, first digits
 }
 TOPICS = {
     "/omnid/cloud": "sensor_msgs/msg/PointCloud2", "/omnid/drive": "geometry_msgs/msg/TwistStamped",
+    "/omnid/map": "nav_msgs/msg/OccupancyGrid",
     "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
     "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage", "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",

@@ -20,6 +20,7 @@ from omnid.core.trajectory import read_tum
 from omnid.replay import Options, Replay
 from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
+from omnid.transport.decode import map_from
 from tests.conftest import PAIRS
 from tests.drivers.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
@@ -80,9 +81,14 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
         reader = make_reader(file)
         found = [odometry_from_cdr(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
         (cloud,) = [STORE.deserialize_cdr(m.data, s.name) for s, _, m in reader.iter_messages(["/omnid/cloud"])]
+        (grid,) = [map_from(m.data) for _, _, m in reader.iter_messages(["/omnid/map"])]
     assert cloud.header.frame_id == "odom"
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
     np.testing.assert_allclose(points, se3.apply(T_base_rig, read_ply(ply).xyz.astype(float)), atol=1e-5)
+    standing = points[(points[:, 2] > -0.9) & (points[:, 2] < 1.4), :2]  # mapping.heights_m
+    column, row = np.floor((standing - grid.corner) / grid.cell_m + 1e-3).astype(int).T
+    assert len(standing) > 100 and (grid.cells[row, column] > 0).mean() > 0.95, "but for rounding at borders"
+    assert 0.0 < (grid.cells > 0).mean() < 0.5 and (grid.cells == 0).any()
     np.testing.assert_allclose(
         [record.T_odom_base for record in found], T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig), atol=1e-8
     )
@@ -102,7 +108,7 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
         assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
-                      "/rover/cloud": 1, "/rover/status": 2}
+                      "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 2}
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"

@@ -18,7 +18,7 @@ from tests.replay.recorded import recorded_run
 
 POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
-SAID = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/status", "/omnid/drive", *IMAGES}
+SAID = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status", "/omnid/drive", *IMAGES}
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
