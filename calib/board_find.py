@@ -19,14 +19,14 @@ from calib.board_corners import Grey, find_corners, look_at, smoothed
 from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
 from calib.board_order import as_grid, in_order, largest_board, place
 from calib.board_refine import refine
-from calib.board_shape import is_printed, unevenness
+from calib.board_shape import is_printed, is_whole, unevenness
 from calib.camera import Array
 
 Image = NDArray[np.uint8]
 MIN_SIDE_PX = 32
 BLUR_PX = 0.7
-# Of a picture's grids so many are grown and tried.
-TRIED_GRIDS = 4
+# Of a picture's grids so many are grown and tried: those of nearly as many corners as the board has, and the largest.
+TRIED_GRIDS = 5
 # What a corner may lie off its neighbours, in parts of a square; so many must be good, or the whole is no board.
 MAX_UNEVEN = 0.2
 MIN_GOOD = 0.75
@@ -64,24 +64,18 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
         return Search(None)
     blurred = smoothed(image, BLUR_PX)
     for look in _looks(image) if thorough else islice(_looks(image), 1):
-        for looked_at in _grids(look):
+        for looked_at in _grids(look, board):
             grid = grow(blurred, looked_at)
             view = _view(image, grid, board, name)
-            if view is not None and not _larger(seen, board):
+            if view is not None:
                 return Search(view)
             seen = max(seen, largest_board(grid), key=lambda sides: sides[0] * sides[1])
     for grid in _by_opencv(image, board) if thorough else ():
         view = _view(image, grow(blurred, grid), board, name)
-        if view is not None and not _larger(seen, board):
+        if view is not None:
             return Search(view)
     hint = min(seen) >= MIN_HINT_SIDE and seen[0] * seen[1] >= MIN_HINT_CORNERS
     return Search(None, seen if hint else (0, 0))
-
-
-def _larger(seen: tuple[int, int], board: Board) -> bool:
-    """Whether a grid that was seen has room for the board and more: then the board would be a part of another."""
-    asked = sorted((board.columns, board.rows))
-    return sorted(seen) != asked and all(side >= least for side, least in zip(sorted(seen), asked, strict=True))
 
 
 def _looks(image: Image) -> Iterator[_Look]:
@@ -115,11 +109,18 @@ def _unrolled(image: Image, start_rad: float) -> _Look:
     return _Look(strip.astype(np.uint8, copy=False), origin)
 
 
-def _grids(look: _Look) -> Iterator[Grid]:
+def _grids(look: _Look, board: Board) -> Iterator[Grid]:
     """Grids of linked corners, in the pixels of the first picture."""
     blurred = smoothed(look.image, BLUR_PX)
-    for grid in find_grids(blurred, find_corners(look.image))[:TRIED_GRIDS]:
+    for grid in _likeliest(find_grids(blurred, find_corners(look.image)), board):
         yield _back(grow(blurred, grid), look)
+
+
+def _likeliest(grids: list[Grid], board: Board) -> list[Grid]:
+    """Those of about the board's size, and the largest, which may hold it or tell of a wrong count."""
+    size = board.columns * board.rows
+    near = sorted(grids, key=lambda grid: abs(np.log(len(grid) / size)))[:TRIED_GRIDS]
+    return [*near, *(grid for grid in grids[:1] if not any(grid is one for one in near))]
 
 
 def _by_opencv(image: Image, board: Board) -> Iterator[Grid]:
@@ -156,10 +157,10 @@ def _view(image: Image, grid: Grid, board: Board, name: str) -> BoardView | None
     if placed is None:
         return None
     blurred = smoothed(image, BLUR_PX)
-    ordered = in_order(blurred, placed, board)
-    good = _without_strays(blurred, refine(image, ordered))
+    refined = refine(image, in_order(blurred, placed, board))
+    good = _without_strays(blurred, refined)
     part = float(np.isfinite(good[..., 0]).mean())
-    if part < MIN_GOOD or not is_printed(blurred, good):
+    if part < MIN_GOOD or not is_printed(blurred, good) or not is_whole(blurred, refined):
         return None
     return BoardView(name, good.reshape(-1, 2), part * (1 - float(np.nanmean(unevenness(good)))))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from calib.board_corners import Grey, sample
@@ -17,6 +19,10 @@ MIDDLE = np.linspace(0.3, 0.7, 5)
 MIN_STEP = 0.25
 MAX_SPREAD, MIN_STEPS = 0.22, 0.6
 FEW_CORNERS, FEW_MAX_SPREAD, FEW_MIN_STEPS = 20, 0.08, 0.9
+# A board ends: the squares around its corners' own are there, so many of their steps go the right way, and on no side
+# do the squares go on beyond, by so many steps of this part of the usual one. A light margin has a quarter of them.
+MIN_AROUND = 0.85
+MAX_BEYOND, BEYOND_STEP = 0.65, 0.4
 
 
 def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Array | None:
@@ -80,6 +86,39 @@ def is_printed(image: Grey, corners: Array) -> bool:
     few = corners.shape[0] * corners.shape[1] < FEW_CORNERS
     least, most = (FEW_MIN_STEPS, FEW_MAX_SPREAD) if few else (MIN_STEPS, MAX_SPREAD)
     return bool(alternate >= least and np.nanmedian(spread) < most * abs(usual))
+
+
+def is_whole(image: Grey, corners: Array) -> bool:
+    """Whether a board of these corners (rows, columns, 2) ends where it must: brickwork and chequered floors go on."""
+    level = _levels(image, corners)
+    sign = np.where(np.indices(level.shape).sum(axis=0) % 2 == 0, 1.0, -1.0)
+    down, along = np.diff(level, axis=0) * sign[1:], np.diff(level, axis=1) * sign[:, 1:]
+    usual = float(np.nanmedian(np.concatenate([down[2:-2, 2:-2].ravel(), along[2:-2, 2:-2].ravel()])))
+    down, along = down / usual, along / usual
+    beyond = ((along[0, 1:-1], down[0, 1:-1]), (along[-1, 1:-1], down[-1, 1:-1]),
+              (down[1:-1, 0], along[1:-1, 0]), (down[1:-1, -1], along[1:-1, -1]))
+    around = (along[1, 1:-1], along[-2, 1:-1], down[1:-1, 1], down[1:-1, -2], down[1, 1:-1], down[-2, 1:-1],
+              along[1:-1, 1], along[1:-1, -2])
+    goes_on = max(_share(side, BEYOND_STEP) for side in beyond) > MAX_BEYOND
+    return _share(around, MIN_STEP) >= MIN_AROUND and not goes_on
+
+
+def _share(steps: Sequence[Array], least: float) -> float:
+    """The part of the steps that are more than that; what is not known is not."""
+    return float((np.concatenate(list(steps)) > least).mean())
+
+
+def _levels(image: Grey, corners: Array) -> Array:
+    """Mean grey of the squares between corners (rows, columns, 2) and of two more all around; NaN: unknown."""
+    rows, columns = corners.shape[:2]
+    level = np.full((rows + 3, columns + 3), np.nan)
+    x, y = np.meshgrid(MIDDLE, MIDDLE)
+    for row, column in np.ndindex(level.shape):
+        j, i = int(np.clip(row - 2, 0, rows - 1)), int(np.clip(column - 2, 0, columns - 1))
+        mapping = local_mapping(corners, j, i) if np.isfinite(corners[j, i, 0]) else None
+        if mapping is not None:
+            level[row, column] = sample(image, terms(x + column - 2 - i, y + row - 2 - j) @ mapping).mean()
+    return level
 
 
 def _squares(image: Grey, corners: Array) -> tuple[Array, Array]:

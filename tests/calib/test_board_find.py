@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib.board import Board
 from calib.board_find import find_board
+from calib.board_shape import is_whole
 from calib.camera import Array, Mask
 from calib.errors import CalibError
 from calib.ocam import OcamCamera
@@ -119,6 +120,22 @@ def test_no_board_is_found_where_there_is_none() -> None:
     for number, picture in enumerate(pictures):
         search = find_board(picture, Board(4, 3, 0.03))
         assert search.view is None, number
+
+
+def chequers(columns: int, rows: int, margin_px: int) -> NDArray[np.uint8]:
+    """Squares of 12 px and what surrounds them, plain and light."""
+    squares = np.kron(np.indices((rows, columns)).sum(axis=0) % 2, np.ones((12, 12))) * 150 + 40
+    return np.pad(squares, margin_px, constant_values=190).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("columns", "rows", "margin_px", "whole"), [
+    (7, 6, 40, True), (9, 6, 40, False), (7, 9, 40, False), (20, 20, 0, False), (6, 5, 40, False)])
+def test_a_board_ends_where_it_must_and_a_chequered_floor_goes_on(columns: int, rows: int, margin_px: int,
+                                                                  whole: bool) -> None:
+    """6x5 corners looked for two squares from the upper left, in floors, in larger boards, and in too small a one."""
+    corner = 12.0 * (1 + (columns > 8) + (rows > 8)) + margin_px - 0.5
+    grid = np.stack(np.meshgrid(corner + 12 * np.arange(6), corner + 12 * np.arange(5)), axis=-1)
+    assert is_whole(chequers(columns, rows, margin_px).astype(np.float32), grid) is whole
 
 
 @pytest.mark.slow

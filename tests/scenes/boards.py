@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,12 +50,16 @@ def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]
 
 def clutter(rng: np.random.Generator, radius_m: float = 3.0) -> list[Rectangle]:
     """Six noisy walls around the camera."""
+    return six_walls(lambda: np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8), radius_m)
+
+
+def six_walls(paint: Callable[[], NDArray[np.uint8]], radius_m: float) -> list[Rectangle]:
+    """Six square walls around the camera, each painted anew."""
     walls = []
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         side = np.roll(axis, 1) * 2 * radius_m
         below = np.roll(axis, 2) * 2 * radius_m
-        grey = np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8)
-        walls.append(Rectangle(axis * radius_m - side / 2 - below / 2, side, below, grey))
+        walls.append(Rectangle(axis * radius_m - side / 2 - below / 2, side, below, paint()))
     return walls
 
 
@@ -82,12 +86,14 @@ class Studio:
         return Studio(board, MountedCamera(camera, np.eye(4), mask))
 
     def photograph(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
-                   contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0) -> Shot:
-        """The picture taken of the board among noisy walls; shadow: what part of the board is darkened to."""
+                   contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0,
+                   walls: Sequence[Rectangle] | None = None) -> Shot:
+        """The picture taken of the board among noisy walls, or others; shadow: what part of it is darkened to."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
         texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
-        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *clutter(rng)))
+        around = clutter(rng) if walls is None else walls
+        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *around))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
         exposure = Exposure.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
         T_cam_board = self.mounted.T_cam_rig @ T_rig_board
