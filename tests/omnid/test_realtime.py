@@ -28,7 +28,7 @@ PREAMBLE = """
 import gc, json, os, resource, sys, threading, time
 from pathlib import Path
 from omnid.config import RealtimeConfig
-from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread
+from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread, share_heap
 def locked_kb():
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
@@ -207,3 +207,23 @@ def test_capabilities_are_read() -> None:
     mask = next(int(line.split()[1], 16) for line in Path("/proc/self/status").read_text().splitlines()
                 if line.startswith("CapEff"))
     assert [has_capability(number) for number in range(41)] == [bool(mask >> number & 1) for number in range(41)]
+
+
+GLUTTON = """
+def resident_mb():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
+def work():
+    for _ in range(3):
+        data = [b"x" * 60_000 for _ in range(700)]
+lock_memory()
+before = resident_mb()
+thread = threading.Thread(target=work); thread.start(); thread.join()
+print(json.dumps({"kept_mb": resident_mb() - before}))
+"""
+
+
+@pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
+def test_what_a_thread_has_given_back_goes_back_to_the_kernel_though_memory_is_locked() -> None:
+    """42 MB; a heap of the thread's own keeps them."""
+    assert answer("share_heap()" + GLUTTON).kept_mb < 10
