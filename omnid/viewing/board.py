@@ -61,7 +61,7 @@ class Board:
         self._state = ""
         self._lines = 0
         self._latencies: set[tuple[str, ...]] = set()
-        self.poses = self.pictures = 0
+        self.poses = self.offered = self.pictures = 0
 
     def wants(self, kind: str) -> bool:
         """Whether the next pose, sight, picture or cloud is to be drawn at all."""
@@ -75,6 +75,7 @@ class Board:
     def pose(self, pose: Pose) -> None:
         """The robot's place and way, how sure that is, speed and landmarks."""
         self.state(pose.stamp_ns, pose.state)
+        self.offered += 1
         if not self.wants("pose"):
             return
         stream, T = self._at(pose.stamp_ns), pose.T_odom_base

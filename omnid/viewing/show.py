@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from drivers.mcap_survey import Survey, survey
 from omnid.config import Config
@@ -20,6 +21,8 @@ from omnid.viewing.layout import layout
 from omnid.viewing.live import Live
 from omnid.viewing.places import ClosedError, Place, RrdFile, Viewer
 from omnid.viewing.recorded import Recorded, poses_topic
+
+PANORAMA: Final = "Panorama"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +52,8 @@ def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> i
     """Shows a log: the poses that are recorded in it, else what can be computed from its pictures; the exit code."""
     found = survey(log.path)
     topic = None if log.replay else poses_topic(found, log.robot)
-    pictured = topic is None or Recorded.pictures(found, topic) != ""
-    board = Board(place, layout(pictured, depth=topic is None), _most_messages(found, topic))
+    picture = PANORAMA if topic is None else _title(Recorded.pictures(found, topic))
+    board = Board(place, layout(picture, depth=topic is None), _most_messages(found, topic))
     code = 0
     with _closing(board):
         code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
@@ -59,10 +62,15 @@ def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> i
 
 def show_robot(bus: BusConfig, seconds: float | None, place: Place) -> int:
     """Shows a robot; the exit code, 1 where not one pose came."""
-    board = Board(place, layout(pictures=True, depth=False))
+    board = Board(place, layout(PANORAMA, depth=False))
     with _closing(board):
         Live(board).follow(bus, place, seconds)
     return _ended(board, place, int(not board.poses))
+
+
+def _title(topic: str) -> str:
+    """Of the pictures of a topic."""
+    return "" if not topic else PANORAMA if topic.endswith("panorama") else "Lower camera"
 
 
 @contextmanager
@@ -104,7 +112,8 @@ def _most_messages(found: Survey, topic: str | None) -> int:
 
 def _ended(board: Board, place: Place, code: int) -> int:
     if board.poses:
-        print(f"{board.poses} poses and {board.pictures} pictures shown")
+        of_all = f" of {board.offered}" if board.offered > board.poses else ""
+        print(f"{board.poses} poses{of_all} and {board.pictures} pictures shown")
     if board.poses and not place.left:
         print(place.leave(), flush=True)
     return code
