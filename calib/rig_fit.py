@@ -136,22 +136,24 @@ def calibrate_rig(views: Sequence[PairView], board: Board, cameras: Sides, refin
 
 
 def sharpened_rig(found: RigCalibration, images: tuple[Images, Images], refined: bool = True) -> RigCalibration:
-    """The rig from corners looked at anew through the cameras that it found; images by the views' names."""
+    """The rig from corners looked at anew through the cameras that it found; images by the views' names.
+
+    Of an instant that one camera saw alone there need be no image of the other.
+    """
     cameras = (found.lower, found.upper)
     poses = (found.fit.T_cam_board, found.T_upper_lower @ found.fit.T_cam_board)
     views = []
     for k, view in enumerate(found.views):
-        lower, upper = (_sharper(seen, images[side][view.name], cameras[side], (poses[side][k], found.board))
+        lower, upper = (seen and _sharper(seen, images[side][view.name], cameras[side], (poses[side][k], found.board))
                         for side, seen in enumerate(view.seen))
         views.append(PairView(view.name, (lower, upper)))
     again = calibrate_rig(views, found.board, cameras, refined)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def _sharper(seen: BoardView | None, image: NDArray[np.uint8], camera: OmniCamera, place: tuple[Array, Board]
-             ) -> BoardView | None:
+def _sharper(seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera, place: tuple[Array, Board]) -> BoardView:
     T_cam_board, board = place
-    return seen and replace(seen, pixels=refine_with(image, camera, T_cam_board, (board, seen.pixels)))
+    return replace(seen, pixels=refine_with(image, camera, T_cam_board, (board, seen.pixels)))
 
 
 def _is_pair(view: PairView) -> bool:

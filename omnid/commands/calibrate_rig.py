@@ -128,14 +128,15 @@ def _fitted(pictures: PairedPictures, board: Board, given: tuple[CameraFile, Cam
             args: argparse.Namespace) -> RigCalibration:
     """The rig from all boards; the cameras' own fits come first unless they are given."""
     views = _views(pictures, board, tell=not args.quiet)
+    refined = given is None or args.refine_cameras
     if given:
         cameras, rejected = (given[0].camera, given[1].camera), list[Rejected]()
     else:
-        cameras, rejected = _own_cameras(views, pictures, board, args)
-    left_out = {bad.name for bad in rejected}
-    pairs = [view for view in views if view.name not in left_out]
-    refined = given is None or args.refine_cameras
-    found = calibrate_rig(pairs, board, cameras, refined)
+        cameras, views, rejected = _own_cameras(views, pictures, board, args)
+    if not refined:
+        rejected += [Rejected(view.name, f"only the {name} camera saw the board, which with given cameras says nothing")
+                     for view in views for name, seen in zip(SIDES, view.seen[::-1], strict=True) if seen is None]
+    found = calibrate_rig(views, board, cameras, refined)
     found = sharpened_rig(found, pictures.sides, refined)
     return _with_rejected(found, rejected)
 
@@ -164,8 +165,8 @@ def _found(pictures: Pictures, board: Board, how: tuple[str, bool, bool]) -> dic
 
 
 def _own_cameras(views: list[PairView], pictures: PairedPictures, board: Board, args: argparse.Namespace
-                 ) -> tuple[Sides, list[Rejected]]:
-    """Each camera from its own pictures, and the views that it had to leave out."""
+                 ) -> tuple[Sides, list[PairView], list[Rejected]]:
+    """Each camera from its own pictures, those alone among them; the views that are good, and which were left out."""
     model: Model = args.model
     cameras, rejected = [], list[Rejected]()
     for side, name in enumerate(SIDES):
@@ -175,7 +176,15 @@ def _own_cameras(views: list[PairView], pictures: PairedPictures, board: Board, 
         found = sharpened(found, pictures.sides[side], model, args.view)
         cameras.append(found.camera)
         rejected += [Rejected(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
-    return (cameras[0], cameras[1]), rejected
+        views = _without(views, side, {bad.name for bad in found.rejected})
+    return (cameras[0], cameras[1]), views, rejected
+
+
+def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:
+    """The views less what one camera saw at some instants; what the other saw then stays."""
+    kept = [replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None)) if view.name in names
+            else view for view in views]
+    return [view for view in kept if any(view.seen)]
 
 
 def _check_baseline(found: RigCalibration, args: argparse.Namespace) -> list[str]:
@@ -222,5 +231,7 @@ def describe(found: RigCalibration) -> str:
     """One line about a rig: error, pairs, baseline and turn with their deviations."""
     turn = np.rad2deg(np.linalg.norm(se3.rotation_log(found.T_upper_lower[:3, :3])))
     sigma = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
+    alone = len(found.views) - found.pairs
     return (f"baseline {found.baseline_m * 1e3:.2f} mm (deviation {found.baseline_sigma_m * 1e3:.2f}), upper turned "
-            f"by {turn:.3f} deg ({sigma:.3f}), mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs")
+            f"by {turn:.3f} deg ({sigma:.3f}), mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
+            + f", {alone} views of one camera alone" * (alone > 0))

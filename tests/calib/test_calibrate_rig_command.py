@@ -130,6 +130,34 @@ def test_cameras_that_are_given_are_taken_as_they_are(folder: Path, tmp_path: Pa
     assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
 
 
+@pytest.fixture
+def alone(folder: Path, tmp_path: Path) -> Path:
+    """The pairs, of which the lower camera saw one alone, as its picture has no partner, and the upper another."""
+    for path in folder.glob("*.png"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "upper_05.png").unlink()
+    cv2.imwrite(str(tmp_path / "lower_06.png"), np.full((480, 480), 90, np.uint8))
+    return tmp_path
+
+
+def test_what_one_camera_saw_alone_serves_its_own_fit(folder: Path, alone: Path,
+                                                      capsys: pytest.CaptureFixture[str]) -> None:
+    words = [*given(folder), "--refine-cameras", "--report", alone / "report.html"]
+    assert run(alone, "-o", alone / "rig.toml", *words) == 0
+    said = capsys.readouterr()
+    assert said.out.endswith("5 pairs, 2 views of one camera alone\n") and said.err == ""
+    assert "not seen" in (alone / "report.html").read_text() and turn_off_deg(read_rig(alone / "rig.toml")) < 0.05
+
+
+def test_what_one_camera_saw_alone_is_named_where_it_serves_nothing(folder: Path, alone: Path,
+                                                                    capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(alone, "-o", alone / "rig.toml", *given(folder)) == 0
+    said = capsys.readouterr()
+    assert said.out.endswith("5 pairs\n") and turn_off_deg(read_rig(alone / "rig.toml")) < 0.02
+    assert [line[:45] for line in said.err.splitlines()] == ["warning: left out 05: only the lower camera s",
+                                                             "warning: left out 06: only the upper camera s"]
+
+
 def log_of(folder: Path, path: Path) -> None:
     """The pairs as PNG messages, the upper camera 2 ms late, with a lone picture between."""
     store = get_typestore(Stores.ROS2_HUMBLE)
