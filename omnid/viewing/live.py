@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Final, TypeVar
 
 from drivers.errors import BrokenFrame
@@ -13,6 +12,7 @@ from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Pose, Report, Robot
 from omnid.errors import OmnidError
 from omnid.listening.heard import Letter, Mailbox
+from omnid.signals import ended_by_signals
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import cloud_from, pose_from, report_from
 from omnid.viewing import reports
@@ -32,13 +32,16 @@ class Live:
         self.broken = 0
 
     def follow(self, bus: BusConfig, place: Place, seconds: float | None) -> None:
-        """Draws until Ctrl-C, until nobody looks any more, or for so many seconds. Unreachable where nobody answers."""
+        """Draws until a signal, until nobody looks any more, or for so many seconds. Unreachable where nobody answers.
+        """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
-        with suppress(KeyboardInterrupt), Robot(settings=bus, patience_s=PATIENCE_S) as robot:
+        signals: list[int] = []
+        stopping = ended_by_signals(lambda number, _: signals.append(number))
+        with stopping, Robot(settings=bus, patience_s=PATIENCE_S) as robot:
             mailbox = Mailbox()
             robot.each(mailbox.take)
             self._late(robot)
-            while time.monotonic() < end_s and not place.left:
+            while time.monotonic() < end_s and not signals and not place.left:
                 letter = mailbox.next(LOOKS_S)
                 if letter is not None:
                     self.take(letter)

@@ -19,6 +19,7 @@ from urllib.parse import quote
 import rerun as rr
 
 from omnid.errors import OmnidError
+from omnid.signals import ended_by_signals
 
 INSTEAD: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
 NAME: Final = "omnid"
@@ -50,6 +51,9 @@ class Place(Protocol):
 
     def leave(self) -> str:
         """Ends it, once everything is drawn; a line that tells where to find it."""
+
+    def abandon(self) -> None:
+        """Ends it after an error, so that nothing is left running."""
 
 
 class RrdFile:
@@ -84,7 +88,7 @@ class RrdFile:
 
     def _require_room(self) -> None:
         """OmnidError where the disk is nearly full: on one that is, rerun 0.41 waits for ever and not even ends."""
-        free = shutil.disk_usage(self._path.parent).free
+        free = shutil.disk_usage(self._path.resolve().parent).free
         if free < SPARE_BYTES:
             raise OmnidError(f"-o {self._path}: the disk has {free >> 20} MB left, expected {SPARE_BYTES >> 20} MB to "
                              "spare: make room, or name a file on another one")
@@ -92,6 +96,9 @@ class RrdFile:
     def leave(self) -> str:
         """Where the file is."""
         return f"{self._path}: look at it with `rerun {self._path}`, here or on another machine"
+
+    def abandon(self) -> None:
+        """What has been written stays."""
 
 
 class Viewer:
@@ -101,7 +108,6 @@ class Viewer:
         self._web = web
         self._process: subprocess.Popen[bytes] | None = None
         self._stream: rr.RecordingStream | None = None
-        self._url = ""
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the viewer
         if not web:
             _require_display()
@@ -111,7 +117,6 @@ class Viewer:
         opt_out()
         port, web_port = _free_port(), _free_port()
         url = f"rerun+http://{HERE}:{port}/proxy"
-        self._url = f"http://{HERE}:{web_port}/?url={quote(url, safe='')}"
         served = ["--serve-web", "--web-viewer-port", str(web_port)] if self._web else ["--expect-data-soon"]
         self._process = _started(self._said, ["--bind", HERE, "--port", str(port), "--memory-limit", LIMIT,
                                               "--server-memory-limit", LIMIT, "--hide-welcome-screen", *served])
@@ -120,7 +125,8 @@ class Viewer:
         stream.connect_grpc(url, default_blueprint=layout)
         self._stream = stream
         if self._web:
-            print(f"omnid: look at {self._url} on this machine", file=sys.stderr, flush=True)
+            page = f"http://{HERE}:{web_port}/?url={quote(url, safe='')}"
+            print(f"omnid: look at {page} on this machine", file=sys.stderr, flush=True)
         return stream
 
     def keep(self) -> None:
@@ -138,12 +144,9 @@ class Viewer:
         """A window stays; what a browser looks at is served until Ctrl-C."""
         if not self._web or self._process is None:
             return "the window stays until it is closed"
-        print("omnid: that is all; Ctrl-C ends it", file=sys.stderr, flush=True)
-        try:
-            with suppress(KeyboardInterrupt):
-                self._process.wait()
-        finally:
-            self.close()
+        with ended_by_signals(lambda *_: self.abandon()):
+            print("omnid: that is all; Ctrl-C ends it", file=sys.stderr, flush=True)
+            self._process.wait()
         return "no longer served"
 
     def _require_viewer(self) -> None:
@@ -153,12 +156,11 @@ class Viewer:
                 raise OmnidError(f"rerun's viewer has failed ({_last_line(self._said)}): {INSTEAD}")
             raise ClosedError("rerun's viewer was closed")
 
-    def close(self) -> None:
-        """Ends the viewer, whoever looks."""
-        if self._process is not None:
+    def abandon(self) -> None:
+        """Ends what serves a browser; a window stays."""
+        if self._web and self._process is not None:
             with suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGTERM)
-            self._process.wait()
 
 
 def _flush(stream: rr.RecordingStream, fault: str) -> None:

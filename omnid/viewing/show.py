@@ -55,7 +55,7 @@ def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> i
     picture = PANORAMA if topic is None else _title(Recorded.pictures(found, topic))
     board = Board(place, layout(picture, depth=topic is None), _most_messages(found, topic))
     code = 0
-    with _closing(board):
+    with _closing(board, place):
         code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
     return _ended(board, place, code)
 
@@ -63,7 +63,7 @@ def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> i
 def show_robot(bus: BusConfig, seconds: float | None, place: Place) -> int:
     """Shows a robot; the exit code, 1 where not one pose came."""
     board = Board(place, layout(PANORAMA, depth=False))
-    with _closing(board):
+    with _closing(board, place):
         Live(board).follow(bus, place, seconds)
     return _ended(board, place, int(not board.poses))
 
@@ -74,13 +74,16 @@ def _title(topic: str) -> str:
 
 
 @contextmanager
-def _closing(board: Board) -> Iterator[None]:
+def _closing(board: Board, place: Place) -> Iterator[None]:
     """Has all arrive that was drawn, whatever ends it; that somebody closes the window is an end like others."""
     try:
         yield
         board.close()
     except ClosedError as closed:
         print(f"omnid: {closed}", file=sys.stderr)
+    except BaseException:
+        place.abandon()
+        raise
     finally:
         with suppress(OmnidError):  # it was told already, or is not what ended it
             board.close()

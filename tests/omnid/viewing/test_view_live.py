@@ -91,7 +91,8 @@ def test_a_robot_that_is_not_there_is_told(tmp_path: Path) -> None:
     assert not (tmp_path / "x.rrd").exists()
 
 
-def test_a_browser_of_this_machine_is_served_until_ctrl_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_browser_of_this_machine_is_served_until_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     need_rerun()
     with viewing(tmp_path, made(tmp_path / "made.mcap"), "--web") as it:
         assert it.stderr is not None
@@ -101,7 +102,7 @@ def test_a_browser_of_this_machine_is_served_until_ctrl_c(tmp_path: Path) -> Non
         with urllib.request.urlopen(found[0], timeout=DEADLINE_S) as page:
             assert page.status == 200 and b"rerun" in page.read().lower()
         assert "Ctrl-C" in lines[2]
-        it.send_signal(signal.SIGINT)
+        it.send_signal(number)
         said, _ = it.communicate(timeout=DEADLINE_S)
     assert it.returncode == 0 and said.startswith("3 poses")
     for port in map(int, found.groups()):
