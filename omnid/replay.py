@@ -27,7 +27,8 @@ from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs
 from omnid.outputs.motor import MotorTick, open_motor
 from omnid.outputs.progress import Progress
 from omnid.outputs.recorder import Recorder
-from omnid.outputs.summary import counters, summary
+from omnid.outputs.status import stage_status
+from omnid.outputs.summary import QUIET_BOXES, counters, summary
 from omnid.outputs.tally import Tally
 from omnid.outputs.verdict import doubts, found_nothing
 from omnid.pace import Pace
@@ -38,6 +39,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
 from omnid.telemetry import Telemetry
 from omnid.transport.bus import Bus
+from omnid.transport.codec import OK, Status
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
@@ -94,7 +96,7 @@ class Replay:
             pairs = self._graph.stage("pair", pair, self._frames(reader))
             watched = wire(self._graph, pairs, place, self._config, ends)
             if isinstance(ends.recorder, Recorder):
-                ends.recorder.report = lambda tally: counters(tally, self._dropped(reader, pair))
+                ends.recorder.report = lambda tally: self._report(counters(tally, self._dropped(reader, pair)))
             self._show_progress(reader)
             try:
                 with ended_by_signals(self._on_signal):
@@ -191,6 +193,11 @@ class Replay:
             values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
         spoken = sys.stderr if on_stdout(self._options.files) else sys.stdout
         print(summary(values, self._graph.telemetry.summary()), file=spoken)
+
+    def _report(self, values: dict[str, str]) -> list[Status]:
+        """The counts of the run and of its stages, for the log."""
+        boxes = (stats for stats in self._graph.telemetry.stages if stats.name not in QUIET_BOXES)
+        return [Status("omnid: summary", OK, "the run has ended", values), *map(stage_status, boxes)]
 
     def _dropped(self, reader: LogReader, pair: PairSync) -> dict[str, int]:
         """Everything that was lost on the way, by reason; zeros too."""

@@ -105,11 +105,6 @@ class StateReports:
             yield status_report(odometry.stamp_ns + self._offset_ns, [said])
 
 
-def summary_report(stamp_ns: int, values: dict[str, str]) -> Encoded:
-    """The counters of a run as one diagnostic message."""
-    return status_report(stamp_ns, [codec.Status("omnid: summary", 0, "the run has ended", values)])
-
-
 def status_report(stamp_ns: int, statuses: Sequence[codec.Status]) -> Encoded:
     """Statuses as one diagnostic message."""
     return Encoded("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))

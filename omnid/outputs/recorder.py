@@ -8,10 +8,11 @@ from typing import TypeAlias
 
 from drivers.mcap_writer import LogWriter
 from omnid.messages import Odometry
-from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports, summary_report
+from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports, status_report
 from omnid.outputs.tally import Tally
+from omnid.transport.codec import Status
 
-Report: TypeAlias = Callable[[Tally], dict[str, str]]
+Report: TypeAlias = Callable[[Tally], list[Status]]
 
 
 class Recorder:
@@ -26,7 +27,7 @@ class Recorder:
         self._robot, self._encode, self._states = robot, encode, StateReports()
         self._newest_ns = 0
         self._tally = Tally()  # its own: the end of the run may reach others later
-        self.report: Report = lambda _: {}
+        self.report: Report = lambda _: []
 
     def process(self, message: Outgoing) -> None:
         """Adds what there is to say about a message."""
@@ -40,7 +41,7 @@ class Recorder:
         """Makes the file whole."""
         if self._writer is None:
             return
-        self._write([summary_report(self._newest_ns, self.report(self._tally))], self._newest_ns)
+        self._write([status_report(self._newest_ns, self.report(self._tally))], self._newest_ns)
         self.close()
 
     def close(self) -> None:

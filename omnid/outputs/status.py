@@ -137,9 +137,13 @@ class StatusReport:
 
     def _stage(self, stage: StageStats) -> Status:
         missed = "missed" if stage.name in self._watched.tickers else "dropped"
-        values = {"rate_hz": f"{self._rates(stage.name, stage.processed):.1f}", "processed": str(stage.processed),
-                  missed: str(stage.dropped), **_times("work", stage.wall)}
-        return Status(f"omnid: stage {stage.name}", OK, "", values)
+        return stage_status(stage, missed, rate_hz=f"{self._rates(stage.name, stage.processed):.1f}")
+
+
+def stage_status(stage: StageStats, dropped: str = "dropped", **more: str) -> Status:
+    """What the counters of a stage say; dropped: the name of what is lost there."""
+    values = {**more, "processed": str(stage.processed), dropped: str(stage.dropped), **_times("work", stage.wall)}
+    return Status(f"omnid: stage {stage.name}", OK, "", values)
 
 
 def _times(name: str, histogram: Histogram) -> dict[str, str]:

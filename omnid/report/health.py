@@ -14,8 +14,7 @@ from omnid.report.statuses import ODOMETRY, STAGE, SUMMARY, StatusCourse, short
 _FLOW: Final = ("pair", "dewarp", "stereo", "odometry", "mapping", "record")  # whose times are drawn
 _TIMES: Final = ("work_p50_ms", "work_p99_ms", "work_max_ms")
 _NO_STATUS: Final = ("No reports of the daemon's parts are in this log, so rates, times of stages, latencies, drops "
-                     "and camera faults are not known: `omnid replay --record` writes none, `omnid run` with "
-                     "record.enabled does.")
+                     "and camera faults are not known; omnid's own recordings hold them.")
 
 
 def timing(recording: Recording, clock: Clock) -> list[str]:
@@ -23,6 +22,8 @@ def timing(recording: Recording, clock: Clock) -> list[str]:
     statuses = recording.statuses
     if not statuses.reports:
         return ["<h2>Times and losses</h2>", *_summary(statuses), note(_NO_STATUS)]
+    if statuses.reports == 1:  # a replay: it counts up at its end
+        return ["<h2>Times and losses</h2>", *_summary(statuses), _stage_table(statuses)]
     p50, p99 = (statuses.series(ODOMETRY, f"capture_to_pose_{p}_ms") for p in ("p50", "p99"))
     stages = [name for name in _FLOW if statuses.series(STAGE + name, "work_p50_ms").count]
     figures = [

@@ -20,7 +20,7 @@ from omnid.core.trajectory import read_tum
 from omnid.replay import Options, Replay
 from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
-from omnid.transport.decode import map_from
+from omnid.transport.decode import map_from, report_from
 from tests.conftest import PAIRS
 from tests.drivers.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
@@ -104,11 +104,14 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+        told = [report_from(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
                       "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 2}
+    assert told.value("omnid: summary", "poses") == told.value("omnid: stage odometry", "processed") == str(PAIRS)
+    assert float(told.value("omnid: stage stereo", "work_p50_ms")) > 0.1
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
