@@ -20,8 +20,6 @@ from omnid.calibration.drawings import (
 )
 from omnid.report.page import figure, page, table
 
-__all__ = ("figure", "page", "report_html", "table")  # the rig's report is made of the same pieces
-
 MAX_SHOWN_VIEWS = 40
 
 

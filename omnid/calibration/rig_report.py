@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.rig_fit import MOTION_NAMES, RigCalibration
 from omnid.calibration.drawings import ARROW, Image, residual_picture
 from omnid.calibration.pairs import SIDES, PairedPictures
-from omnid.calibration.report import figure, page, table
+from omnid.report.page import figure, page, table
 
 MAX_SHOWN_VIEWS = 20
 LINES = 24  # columns drawn through both panoramas
