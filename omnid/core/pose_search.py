@@ -56,9 +56,10 @@ class PoseSearch:
             return None
         # Both must speak for the pose: the tracks from the last sight, and the patches of the keyframes.
         agreeing_both = min(int(kept.sum()), len(fine.landmarks))
-        rejected = tracks.pixels[~np.isin(tracks.index, fine.landmarks)]
+        others = np.ones(len(self._map), bool)
+        others[fine.landmarks] = False
         return replace(fine, visible=tracks.visible, tracked=len(tracks.index), agreeing=agreeing_both,
-                       rejected=rejected)
+                       rejected=tracks.pixels[others[tracks.index]])
 
     def best_turn(self, sight: Sight, previous: Wrapped, guess: tuple[Array, Array], usable: Flags) -> Array:
         """The guess T_odom_rect with the most forward-backward tracks among turns of the previous pose.
