@@ -122,8 +122,8 @@ def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kin
 
 def test_the_wrong_count_is_told_the_right_one(folder: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(folder / "p0.png", folder / "p1.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
-    assert "a grid of 5x6 was seen in 2: try --corners 5x6" in capsys.readouterr().err
+    assert run(folder / "p0.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
+    assert "a grid of 5x6 was seen in 1: try --corners 5x6" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"], ["--corners", "6x5"]])
