@@ -10,6 +10,7 @@ from drivers.frame import Frame
 from omnid.messages import Odometry
 from omnid.outputs.encoded import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
+from omnid.transport.features_note import features_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.note import Note, note_bytes
 
@@ -42,10 +43,12 @@ class PanoramaSink:
         self._next_ns = 0.0
 
     def process(self, odometry: Odometry) -> None:
-        """Sends the picture that a pose was found in, when it is time."""
+        """Sends the picture that a pose was found in, and beside it its features, when it is time."""
         if odometry.stamp_ns < self._next_ns:
             return
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
-        self._bus.publish("panorama", image_cdr(frame, odometry.stamp_ns + self._offset_ns)[1])
+        features = odometry.features
+        pixels = {"agreeing": features.agreeing, "rejected": features.rejected, "new": features.new}
+        self._bus.publish("panorama", image_cdr(frame, odometry.stamp_ns + self._offset_ns)[1], features_bytes(pixels))

@@ -10,11 +10,13 @@ from typing import Final, TypeVar
 from drivers.errors import BrokenFrame
 from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Pose, Report, Robot
+from omnid.core.sight import Features
 from omnid.errors import OmnidError
 from omnid.listening.heard import Letter, Mailbox
 from omnid.signals import ended_by_signals
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import cloud_from, pose_from, report_from
+from omnid.transport.features_note import features_from_bytes
 from omnid.viewing import reports
 from omnid.viewing.board import Board
 from omnid.viewing.places import Place
@@ -70,6 +72,14 @@ class Live:
                 self._board.cloud(message)
             case RosImage() if self._board.wants("picture"):
                 self._board.panorama(message.stamp_ns, bytes(message.data), message.encoding)
+                self._features(message.stamp_ns, letter.note)
+
+    def _features(self, stamp_ns: int, note: bytes) -> None:
+        """Draws what goes along with a panorama; others than omnid may send pictures without."""
+        try:
+            self._board.features(stamp_ns, Features(**features_from_bytes(note)))
+        except OmnidError:
+            self.broken += bool(note)
 
     def _report(self, report: Report) -> None:
         reports.draw(report, self._changes, self._board)

@@ -9,16 +9,20 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from omnid.client import Robot
 from omnid.core.klt import Wrapped
+from omnid.core.sight import Features
+from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
+from omnid.transport.features_note import MOST, features_bytes, features_from_bytes
 from tests.omnid.buses import free_endpoint, wait_until
 
 OFFSET_NS = 10**18
@@ -28,7 +32,8 @@ PICTURE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), 
 def odometry(seq: int) -> Odometry:
     T = se3.transform(np.eye(3), [1.0, 0.0, 0.0])
     depth = cast("Any", SimpleNamespace(panoramas=SimpleNamespace(lower=Wrapped(PICTURE, 16))))
-    return Odometry(seq, 10**9 * seq, T, np.eye(6), np.zeros(6), np.eye(6), "degraded", 3, 5, 9, depth)
+    features = Features(np.array([[3.4, 5.0], [7.0, 8.6]]), np.array([[1.0, 2.0]]))
+    return Odometry(seq, 10**9 * seq, T, np.eye(6), np.zeros(6), np.eye(6), "degraded", 3, 5, 9, depth, features)
 
 
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
@@ -50,7 +55,7 @@ def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
 def test_panoramas_are_sent_as_often_as_wanted() -> None:
     endpoint, came = free_endpoint(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        robot.each(lambda topic, payload, _: came.append(payload))
+        robot.each(lambda topic, payload, note: came.append((payload, note)))
         wait_until(lambda: PanoramaSink(bus, 0.5, OFFSET_NS).process(odometry(0)) is None and bool(came))
         time.sleep(0.2)
         came.clear()
@@ -60,7 +65,23 @@ def test_panoramas_are_sent_as_often_as_wanted() -> None:
         wait_until(lambda: len(came) >= 4)
     messages = [cast("Any", get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(payload,
                                                                              "sensor_msgs/msg/CompressedImage"))
-                for payload in came]
+                for payload, _ in came]
+    pixels = {kind: found.tolist() for kind, found in features_from_bytes(came[0][1]).items()}
+    assert pixels == {"agreeing": [[3, 5], [7, 9]], "rejected": [[1, 2]], "new": []}
     assert [message.header.stamp.sec for message in messages] == [10**9, 10**9 + 2, 10**9 + 4, 10**9 + 6]
     shown = cv2.imdecode(messages[0].data, cv2.IMREAD_GRAYSCALE)
     assert shown.shape == (64, 128) and np.abs(shown.astype(int) - PICTURE[:, 16:-16]).max() < 20
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"agreeing":3,"rejected":[],"new":[]}',
+                                  b'{"agreeing":[[1]],"rejected":[],"new":[]}', bytes(1 << 18)])
+def test_features_are_some_or_are_refused(data: bytes) -> None:
+    with pytest.raises(OmnidError, match="beside a panorama"):
+        features_from_bytes(data)
+
+
+def test_features_are_bounded_and_somewhere() -> None:
+    many = np.zeros((3 * MOST, 2))
+    assert len(features_from_bytes(features_bytes({"agreeing": many, "rejected": many, "new": many}))["new"]) == MOST
+    wild = b'{"agreeing":[[NaN,1],[1e300,2],[3,4]],"rejected":[],"new":[]}'
+    assert features_from_bytes(wild)["agreeing"].tolist() == [[3.0, 4.0]]

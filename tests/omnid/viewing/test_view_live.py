@@ -25,6 +25,7 @@ from drivers.frame import Frame
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
+from omnid.transport.features_note import features_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.note import Note, note_bytes
 from tests.omnid.buses import DEADLINE_S, free_endpoint
@@ -54,7 +55,9 @@ def say(bus: Bus, number: int) -> None:
     said = [Status("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, said))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
-    bus.publish("panorama", image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1])
+    pixels = {"agreeing": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}
+    bus.publish("panorama", image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1],
+                features_bytes(pixels) if number % 5 else b"nonsense")
 
 
 def test_a_robot_is_drawn_as_it_speaks(tmp_path: Path) -> None:
@@ -78,6 +81,7 @@ def test_a_robot_is_drawn_as_it_speaks(tmp_path: Path) -> None:
     np.testing.assert_allclose(xyz, np.column_stack([0.01 * numbers, 0.5 + 0 * numbers, 0 * numbers]), atol=1e-5)
     assert rows(out, "/state", "StateChange:state")[0].value == ["degraded"]
     assert rows(out, "/latency/odometry", "Scalars:scalars")[0].value == [30.5]
+    assert np.allclose(rows(out, "/panorama/agreeing", "Points2D:positions")[0].value, [[3, 4], [5, 6]])
     assert rows(out, "/panorama", "EncodedImage:blob") and rows(out, "/odom/map", "Points3D:positions")
     assert verified(out)
 
