@@ -32,7 +32,7 @@ from omnid.outputs.rig_watch import RigWatch
 from omnid.outputs.status import StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
-from omnid.realtime import ThreadStart, prepare, priorities, share_heap
+from omnid.realtime import ThreadStart, prepare, priorities
 from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end
 from omnid.service import Status as StatusLine
@@ -73,7 +73,6 @@ class Live:
 
     def run(self) -> int:
         """The exit code, 0 after a signal to end."""
-        share_heap()
         show_stacks_at_the_end()
         compile_serialisers()
         with ended_by_signals(self._on_signal), ExitStack() as ends:

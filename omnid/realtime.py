@@ -29,20 +29,9 @@ CAP_SYS_NICE: Final = 23
 LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
                       "realtime.lock_memory = false")
 _PR_SET_NAME: Final = 15
-_M_ARENA_MAX: Final = -8  # malloc.h of glibc
 _NAME_BYTES: Final = 15
 _EVERYTHING: Final = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, without which untouched stacks take 400 MB
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
-
-
-def share_heap() -> None:
-    """Has all threads that start from now on allocate from one heap.
-
-    glibc gives each thread one of its own otherwise, of which locked pages never go back to the kernel: every thread
-    keeps the most that it ever needed. The one heap shrinks, locked or not.
-    """
-    with suppress(AttributeError):  # another C library
-        _LIBC.mallopt(_M_ARENA_MAX, 1)
 
 
 def prepare(config: RealtimeConfig, opencv_threads: int) -> list[str]:

@@ -32,6 +32,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs until it is told to end."""
+    from omnid.heap import share_heap
+
+    share_heap()  # before anything else: the next line loads numpy, which starts threads
     from omnid.config import Config
     from omnid.journal import say
     from omnid.live import Live

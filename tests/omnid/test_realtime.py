@@ -25,10 +25,11 @@ ROOT = Path(__file__).parents[2]
 NOBODY = 65534
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
 PREAMBLE = """
+from omnid.heap import share_heap
 import gc, json, os, resource, sys, threading, time
 from pathlib import Path
 from omnid.config import RealtimeConfig
-from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread, share_heap
+from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread
 def locked_kb():
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
