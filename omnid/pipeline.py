@@ -52,19 +52,21 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         graph.sink("rig", ends.rig, panoramas, policy=NEWEST, depth=1)
     depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
-    spoken: list[Stream[Outgoing]] = [odometry, _commands(graph, odometry, geometry, config, ends)]
+    spoken: dict[str, Stream[Outgoing]] = {
+        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, ends)}
     mapping = Mapping(config.mapping, ends.map_every_s) if ends.maps or ends.recorder or ends.bus else None
     if mapping:
         maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
-        spoken.append(maps)
+        spoken["bus-map"] = maps
         for name, file in ends.maps.items():
             graph.sink(name, file, maps)
     for name, sink in ends.poses.items():
         graph.sink(name, sink, odometry)
     if ends.recorder:
-        graph.sink("record", ends.recorder, *ends.pictures, *spoken, depth=ends.record_depth)
+        graph.sink("record", ends.recorder, *ends.pictures, *spoken.values(), depth=ends.record_depth)
     if ends.bus:
-        graph.sink("bus", ends.bus, *spoken, policy=NEWEST)
+        for name, stream in spoken.items():  # one each, for a map takes longer than a pose may wait
+            graph.sink(name, ends.bus, stream, policy=NEWEST)
     return Watched(stereo, mapping)
 
 

@@ -25,7 +25,7 @@ LATEST_MS = 20.0  # the motor's tick, 99.9 % of them
 MOTOR_HZ = 50.0
 PERIOD_S = 5.0  # between two looks of the soak
 GROWTH_MB = 8.0  # of the second half over the first: noise of the allocator
-STAGES = ("lower", "upper", "pair", "dewarp", "stereo", "odometry", "mapping", "bus")
+STAGES = ("lower", "upper", "pair", "dewarp", "stereo", "odometry", "mapping", "bus", "bus-drive", "bus-map")
 
 
 @contextmanager
