@@ -82,12 +82,15 @@ class HelmLink:
         self._line.hang_up()
 
     def told(self) -> Iterator[VelocityCommand]:
-        """What the wheels are told, until the process has ended; OmnidError where nobody had asked it to."""
+        """What the wheels are told from now on, until the process has ended; OmnidError where nobody had asked it to."""
+        since_ns = time.monotonic_ns()  # it has stood and ticked since before the stages began
         with suppress(EOFError):
             while not self._overdue():
                 thing = self._line.hear(LOOK_S)
                 if isinstance(thing, Tick):
-                    yield from self._entered(thing)
+                    self.logbook.add(thing)
+                    if thing.command is not None and thing.command.stamp_ns >= since_ns:
+                        yield thing.command
                 elif isinstance(thing, Remark):
                     self._report(thing.text)
         self.logbook.close()
@@ -106,11 +109,6 @@ class HelmLink:
 
     def _say(self, news: Heading | Arrived | None) -> None:
         self._line.say(Heard(self._stop_ns, news))
-
-    def _entered(self, tick: Tick) -> Iterator[VelocityCommand]:
-        self.logbook.add(tick)
-        if tick.command is not None:
-            yield tick.command
 
     def _overdue(self) -> bool:
         return bool(self._ended_ns) and (time.monotonic_ns() - self._ended_ns) * NS > END_S

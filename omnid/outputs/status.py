@@ -141,8 +141,11 @@ class StatusReport:
 
 
 def stage_status(stage: StageStats, dropped: str = "dropped", **more: str) -> Status:
-    """What the counters of a stage say; dropped: the name of what is lost there."""
-    values = {**more, "processed": str(stage.processed), dropped: str(stage.dropped), **_times("work", stage.wall)}
+    """What the counters of a stage say: work is what a message took, cpu what of it was its own; dropped: the name of
+    what is lost there.
+    """
+    values = {**more, "processed": str(stage.processed), dropped: str(stage.dropped), **_times("work", stage.wall),
+              **_times("cpu", stage.cpu)}
     return Status(f"omnid: stage {stage.name}", OK, "", values)
 
 

@@ -69,6 +69,7 @@ def figures(operator: Operator, load: float) -> dict[str, str]:
     missed, untold = operator.values("stage motor")["missed"], wheels["untold"]
     drops = {name: operator.values(f"stage {name}").get("dropped", "?") for name in STAGES}
     lost = " ".join(f"{name} {count}" for name, count in drops.items() if count != "0")
+    told |= {f"publishing cpu {q}": operator.values("stage bus").get(f"cpu_{q}_ms", "") for q in ("p50", "p99")}
     return told | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed, "untold": untold,
                    "dropped": lost or "0", "load": f"{load:.1f}"}
 

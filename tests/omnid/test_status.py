@@ -155,6 +155,12 @@ def test_pictures_that_never_meet_and_pictures_that_are_none(daemon: Daemon) -> 
     assert said.level == WARN and "cannot be decoded" in said.message and said.values["broken"] == "2"
 
 
+def test_a_stage_tells_what_a_message_takes_and_what_of_it_is_its_own(daemon: Daemon) -> None:
+    daemon.stages[0].timed(lambda: time.sleep(0.02))
+    values = daemon.asked()["stage stereo"].values
+    assert float(values["work_p50_ms"]) >= 19 and float(values["cpu_p50_ms"]) < float(values["work_p50_ms"]) / 2
+
+
 def test_wheels(daemon: Daemon) -> None:
     daemon.pose()
     daemon.helm.command(Arrived(time.monotonic_ns(), Setpoint(0.2, None)))
