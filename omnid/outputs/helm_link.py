@@ -82,7 +82,7 @@ class HelmLink:
         self._line.hang_up()
 
     def told(self) -> Iterator[VelocityCommand]:
-        """What the wheels are told from now on, until the process has ended; OmnidError where nobody had asked it to."""
+        """What the wheels are told from now on, until the process ends; OmnidError where nobody had asked it to."""
         since_ns = time.monotonic_ns()  # it has stood and ticked since before the stages began
         with suppress(EOFError):
             while not self._overdue():
