@@ -72,6 +72,8 @@ class LiveConfig:
 
     status_s: float = knob(1.0, "between two reports of the state, s", low=0.1, high=60)
     cloud_s: float = knob(2.0, "between two maps on the bus, s; 0: only at the end", low=0, high=3600)
+    cloud_points: int = knob(50_000, "most points of the map on the bus: the most confident ones", low=0,
+                             high=10_000_000)
     check_s: float = knob(5.0, "between two looks at whether the cameras still stand as calibrated, s; 0: none", low=0,
                           high=3600)
 
@@ -169,7 +171,7 @@ class RecordConfig:
                          high=3600)
     queue: int = knob(20, "messages of each kind that may wait for the disk; the oldest are dropped and counted",
                       low=1, high=1000)
-    cloud_points: int = knob(200_000, "most points of the map in a log or on the bus: the most confident ones", low=0,
+    cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
                              high=10_000_000)
 
     def rotation(self) -> Rotation:

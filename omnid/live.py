@@ -108,17 +108,16 @@ class Live:
 
     def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
-        encode = Encoder(place.rig.T_base_rig, clouds_of(config), self.offset_ns)
         helm = self._helm(place, ends) if config.motor.port else None
         bus = self._bus(place, ends)
         pair = LivePair(place.rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
-        recorder = self._recorder(place, encode, ends) if config.record.enabled else None
+        recorder = self._recorder(place, ends) if config.record.enabled else None
         poses: dict[str, Sink[Odometry]] = {"tally": self._tally, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, self.offset_ns)
         watch = RigWatch(place.cylinder, config.live.check_s) if config.live.check_s else None
-        sinks = Ends(poses=poses, bus=BusSink(bus, encode), helm=helm,
+        sinks = Ends(poses=poses, bus=BusSink(bus, self._encoder(place, config.live.cloud_points)), helm=helm,
                      rig=watch, map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
                      record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
@@ -150,10 +149,14 @@ class Live:
         ends.callback(helm.close)
         return helm
 
-    def _recorder(self, place: Geometry, encode: Encoder, ends: ExitStack) -> FrameRecorder:
+    def _recorder(self, place: Geometry, ends: ExitStack) -> FrameRecorder:
+        encode = self._encoder(place, self._config.record.cloud_points)
         recorder = open_recorder(self._config, rig_toml(place.rig), self._say, encode=encode, offset_ns=self.offset_ns)
         ends.callback(recorder.close)
         return recorder
+
+    def _encoder(self, place: Geometry, points: int) -> Encoder:
+        return Encoder(place.rig.T_base_rig, clouds_of(self._config, points), self.offset_ns)
 
     def _commands(self, bus: Bus, helm: HelmLink, recorder: FrameRecorder | None) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)

@@ -142,7 +142,7 @@ class Replay:
     def _ends(self, place: Geometry, closing: ExitStack) -> Ends:
         """Opens all outputs: what cannot be opened is said now."""
         options, config = self._options, self._config
-        encode = Encoder(place.rig.T_base_rig, clouds_of(config))
+        encode = Encoder(place.rig.T_base_rig, clouds_of(config, config.record.cloud_points))
         motor = None
         recorder = options.watch(place, self._graph.telemetry) if options.watch else None
         bus = self._bus(encode, closing) if options.publish else None

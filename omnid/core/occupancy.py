@@ -14,6 +14,7 @@ Array = NDArray[np.floating]
 
 UNKNOWN, FREE, TAKEN = -1, 0, 100  # of nav_msgs/msg/OccupancyGrid; between: how sure it is that something is there
 MOST_CELLS: Final = 1_000_000
+BLOCK: Final = 4096  # points
 _FARTHEST_M: Final = 1e5
 
 
@@ -31,16 +32,18 @@ def occupancy(points: Array, confidence: Array, path_xy: Array, heights_m: tuple
 
     A cell is as taken as the surest of its points is, and free where the path leads through and nothing stands:
     elsewhere nobody has been, and what lies behind a wall looks like what lies before it. Cells grow by powers of two
-    until there are at most MOST_CELLS of them.
+    until there are at most MOST_CELLS of them. The points are taken block by block: a map is large.
     """
-    low_m, high_m = heights_m
-    stands = _near(points) & (points[:, 2] >= low_m) & (points[:, 2] <= high_m)
-    xy, path = points[stands, :2], path_xy[_near(path_xy)]
-    grid = _empty(np.vstack([xy, path]), cell_m)
+    stands = _near(points) & (points[:, 2] >= heights_m[0]) & (points[:, 2] <= heights_m[1])
+    path = path_xy[_near(path_xy)]
+    grid = _empty(_bounds(points, stands), _bounds(path, np.ones(len(path), bool)), cell_m)
     _walk(grid, path)
-    column, row = _cells(grid, xy).T
-    taken = np.clip(np.ceil(TAKEN * confidence[stands]), 1, TAKEN).astype(np.int8)
-    np.maximum.at(grid.cells.reshape(-1), row * grid.cells.shape[1] + column, taken)  # flat: several times as fast
+    flat = grid.cells.reshape(-1)
+    for start in range(0, len(points), BLOCK):
+        kept = np.flatnonzero(stands[start : start + BLOCK]) + start
+        column, row = _cells(grid, points[kept, :2]).T
+        taken = np.clip(np.ceil(TAKEN * confidence[kept]), 1, TAKEN).astype(np.int8)
+        np.maximum.at(flat, row * grid.cells.shape[1] + column, taken)
     return grid
 
 
@@ -50,10 +53,18 @@ def _near(points: Array) -> NDArray[np.bool_]:
     return np.asarray((np.abs(x) < _FARTHEST_M) & (np.abs(y) < _FARTHEST_M))  # a NaN is not
 
 
-def _empty(xy: Array, cell_m: float) -> Grid:
-    """Unknown cells that hold all of these points, their borders at whole multiples of the cell."""
-    columns = xy.T if len(xy) else np.zeros((2, 1))
-    low, high = (np.array([bound(column) for column in columns], np.float64) for bound in (np.min, np.max))
+def _bounds(points: Array, which: NDArray[np.bool_]) -> Array:
+    """Lowest and highest x and y (2, 2) of some points (N, 2 or more); infinite, the wrong way round, of none."""
+    columns = points[:, 0], points[:, 1]
+    return np.array([[np.min(column, where=which, initial=np.inf) for column in columns],
+                     [np.max(column, where=which, initial=-np.inf) for column in columns]])
+
+
+def _empty(points: Array, path: Array, cell_m: float) -> Grid:
+    """Unknown cells that hold both of these bounds (2, 2), their borders at whole multiples of the cell."""
+    low, high = np.minimum(points[0], path[0]), np.maximum(points[1], path[1])
+    if (low > high).any():
+        low = high = np.zeros(2)
     while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > MOST_CELLS:
         cell_m *= 2
     first = np.floor(low / cell_m)

@@ -35,9 +35,9 @@ class Clouds(NamedTuple):
     cell_m: float = 0.05  # of the grid
 
 
-def clouds_of(config: Config) -> Clouds:
+def clouds_of(config: Config, points: int) -> Clouds:
     """The same from the settings."""
-    return Clouds(config.record.cloud_points, config.mapping.heights_m, config.mapping.voxel_m)
+    return Clouds(points, config.mapping.heights_m, config.mapping.voxel_m)
 
 
 class Encoder:
@@ -72,17 +72,19 @@ class Encoder:
 
     def _map(self, update: MapUpdate) -> Iterator[Encoded]:
         stamp_ns = update.stamp_ns + self.offset_ns
-        points, confidence = _surest(update.points, self._clouds.points)
-        payload = codec.point_cloud_cdr(stamp_ns, "odom", points, confidence, T_frame_points=self._T_base_rig)
+        payload = codec.point_cloud_cdr(stamp_ns, "odom", *_surest(update.points, self._clouds.points),
+                                        T_frame_points=self._T_base_rig)
         yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
-        grid = occupancy(self._moved(points), confidence, self._moved(_level(update.path_xy))[:, :2],
-                         self._clouds.heights_m, self._clouds.cell_m)
+        grid = occupancy(self._moved(update.points.xyz), update.points.confidence,
+                         self._moved(_level(update.path_xy))[:, :2], self._clouds.heights_m, self._clouds.cell_m)
         yield Encoded("map", codec.GRID_SCHEMA, codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m,
                                                                 grid.corner))
 
     def _moved(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Points (N, 3) of the rig's first frame in the base's: single, for a map is large and a cell is wide."""
         T = self._T_base_rig.astype(np.float32)
+        if np.array_equal(T, np.eye(4)):
+            return points.astype(np.float32, copy=False)
         return np.asarray(points.astype(np.float32, copy=False) @ T[:3, :3].T + T[:3, 3])
 
 

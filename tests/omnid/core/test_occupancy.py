@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omnid.core.occupancy import FREE, MOST_CELLS, TAKEN, UNKNOWN, Grid, occupancy
+from tests.omnid.allocations import taken
 
 NOBODY = np.zeros((0, 3)), np.zeros(0)
 
@@ -54,3 +55,11 @@ def test_a_long_way_has_larger_cells() -> None:
     grid = occupancy(*NOBODY, path, (0.0, 1.0), 0.05)
     assert MOST_CELLS / 5 < grid.cells.size <= MOST_CELLS and grid.cell_m == pytest.approx(0.05 * 128)
     assert at(grid, 2500.0, 1500.0) == FREE
+
+
+def test_a_large_map_takes_little_in_passing() -> None:
+    """It is made every two seconds while the map grows for hours; what it takes stays with the process."""
+    rng = np.random.default_rng(3)
+    points = (rng.normal(size=(200_000, 3)) * (5.0, 5.0, 0.3)).astype(np.float32)
+    confidence = rng.random(len(points)).astype(np.float32)
+    assert taken(lambda: occupancy(points, confidence, np.zeros((9, 2)), (-1.0, 1.5), 0.05)).most < 16 * len(points)
