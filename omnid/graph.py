@@ -31,10 +31,8 @@ _WAIT_S: Final = 0.1  # a signal that lands in a foreign thread wakes nobody: th
 class _Inbox:
     """A reader's bounded queue for a number of writers; gives the end once all of them have ended."""
 
-    def __init__(self, stats: StageStats, writers: int, capacity: int, policy: Policy, paces: bool = False) -> None:
-        """paces: who writes here begins nothing new before the reader has taken what came."""
+    def __init__(self, stats: StageStats, writers: int, capacity: int, policy: Policy) -> None:
         self._stats, self._writers, self._capacity, self._policy = stats, writers, capacity, policy
-        self.paces = paces
         self._messages: deque[object] = deque()
         self._changed = threading.Condition()
         self._closed = False
@@ -52,11 +50,6 @@ class _Inbox:
             self._messages.append(message)
             self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
             self._changed.notify_all()
-
-    def await_room(self) -> None:
-        """Waits until what came last has been taken, or the reader is gone."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or not self._messages)
 
     def get(self) -> object:
         with self._changed:
@@ -161,14 +154,9 @@ class Graph:
         self._thread(name, self._run_source, source)
         return source.stream
 
-    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], paces: bool = False) -> Stream[Out]:
-        """What the stage makes of its inputs, which merge into its one inbox.
-
-        paces: with NEWEST, the stages before it begin nothing new until it has taken what they made: where it is
-        slower than they are, what would be forgotten is not made, and what it gets is fresh.
-        """
-        paces = paces and self._policy is NEWEST
-        return self._node(Node(self._add(StageStats(name)), stage), inputs, self._policy, self._depth, paces)
+    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In]) -> Stream[Out]:
+        """What the stage makes of its inputs, which merge into its one inbox."""
+        return self._node(Node(self._add(StageStats(name)), stage), inputs, self._policy, self._depth)
 
     def sink(
         self, name: str, sink: Sink[In], *inputs: Stream[In], policy: Policy | None = None, depth: int | None = None
@@ -228,13 +216,12 @@ class Graph:
         self._require_fresh()
         return self.telemetry.add(stats)
 
-    def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, paces: bool = False
-              ) -> Stream[Any]:
+    def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int) -> Stream[Any]:
         if not inputs or depth < 1:
             raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
         reader: Reader = Direct(node, len(inputs), self._succeeds, self._finish)
         if self._threaded:
-            reader = inbox = _Inbox(node.stats, len(inputs), depth * len(inputs), policy, paces)
+            reader = inbox = _Inbox(node.stats, len(inputs), depth * len(inputs), policy)
             self._inboxes.append(inbox)
             self._thread(node.name, self._run_node, node, inbox)
         for stream in inputs:
@@ -280,16 +267,9 @@ class Graph:
         node.stream.end()
 
     def _drain(self, node: Node, inbox: _Inbox) -> None:
-        ahead = [reader for reader in node.stream.readers if isinstance(reader, _Inbox) and reader.paces]
-        while (message := self._next(inbox, ahead)) is not END:
+        while (message := inbox.get()) is not END:
             node.handle(message)
         self._finish(node)
-
-    def _next(self, inbox: _Inbox, ahead: list[_Inbox]) -> object:
-        """What to work on, once those who set the pace have taken what there was; meanwhile it may be replaced."""
-        for reader in ahead:
-            reader.await_room()
-        return inbox.get()
 
     def _finish(self, node: Node) -> None:
         if not self._hard:

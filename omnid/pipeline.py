@@ -51,7 +51,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if ends.rig:
         graph.sink("rig", ends.rig, panoramas, policy=NEWEST, depth=1)
     depths = graph.stage("stereo", stereo, panoramas)
-    odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths, paces=True)
+    odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
     spoken: dict[str, Stream[Outgoing]] = {
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, ends)}
     mapping = Mapping(config.mapping, ends.map_every_s) if ends.maps or ends.recorder or ends.bus else None

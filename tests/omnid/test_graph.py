@@ -155,53 +155,6 @@ def test_newest_forgets_the_oldest_and_counts_it() -> None:
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
 
-def test_who_sets_the_pace_gets_what_is_fresh_and_nothing_is_made_in_vain() -> None:
-    graph, made, got = Graph(policy=NEWEST, depth=1), Collect(), Collect()
-    at_work, all_sent = threading.Event(), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        yield 0
-        assert at_work.wait(LONG_S)
-        yield 1  # made, and waits there
-        deadline_s = time.monotonic() + LONG_S
-        while made.got != [0, 1] and time.monotonic() < deadline_s:
-            time.sleep(1e-3)
-        yield from range(2, 50)
-        all_sent.set()
-
-    def make(message: int) -> int:
-        made.process(message)
-        return message
-
-    def pace(message: int) -> int:
-        at_work.set()
-        assert all_sent.wait(LONG_S)
-        return message
-
-    makes = graph.stage("make", Apply(make), graph.source("numbers", numbers))
-    graph.sink("end", got, graph.stage("pace", Apply(pace), makes, paces=True), policy=LOSSLESS)
-    graph.run()
-    assert made.got == got.got == [0, 1, 49]
-    assert [(row.stage, row.drops) for row in graph.telemetry.summary() if row.drops] == [("make", 47)]
-
-
-def test_who_waits_for_a_pace_that_is_dead_is_woken() -> None:
-    graph, third = Graph(policy=NEWEST, depth=1), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        yield from range(3)
-        third.set()
-
-    def fail(message: int) -> int:
-        assert third.wait(LONG_S)
-        raise ValueError("cannot")
-
-    makes = graph.stage("make", Apply(lambda number: number), graph.source("numbers", numbers))
-    graph.stage("pace", Apply(fail), makes, paces=True)
-    with pytest.raises(ValueError, match="cannot"):
-        graph.run()
-
-
 @both
 def test_several_sources_merge_into_one_inbox(threaded: bool) -> None:
     graph, sink = Graph(threaded=threaded), Collect()
