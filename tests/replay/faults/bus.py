@@ -10,11 +10,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 from omnid.transport import codec
 from tests.replay.faults.trial import Outcome, Place, driving, ended, goes_on, stands, trial
-from tests.replay.live import Base, Operator, command_line, free_port, wait_until
+from tests.replay.live import ROOT, Base, Operator, command_line, free_port, wait_until
 
 
 @trial("bus port taken at the start")
@@ -79,8 +78,7 @@ time.sleep(600)
 @contextlib.contextmanager
 def commander(port: int) -> Iterator[subprocess.Popen[bytes]]:
     """An operator in a process of its own."""
-    root = Path(__file__).parents[2]
-    with subprocess.Popen([sys.executable, "-c", COMMANDER, str(port)], cwd=root) as process:
+    with subprocess.Popen([sys.executable, "-c", COMMANDER, str(port)], cwd=ROOT) as process:
         try:
             yield process
         finally:
