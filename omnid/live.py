@@ -77,10 +77,10 @@ class Live:
         compile_serialisers()
         with ended_by_signals(self._on_signal), ExitStack() as ends:
             place = self._geometry()
+            self._running = True
             self._wire(place, {name: ends.enter_context(closing(self._open(name))) for name in CAMERAS}, ends)
             for refused in prepare(self._config.realtime, self._config.graph.opencv_threads):
                 self._say(WARNING, refused)
-            self._running = True
             self._graph.run()
         return 0
 
@@ -180,10 +180,14 @@ class Live:
         return publish
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
-        """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once."""
-        if not self._running:
-            raise SystemExit(0)  # nothing flows yet, the wheels stand; whatever is open is closed on the way
+        """The first signal ends the run: the wheels slow down, what waits is finished. A second one ends it at once.
+
+        From where connections are opened on, it only makes a note, by which the run ends as soon as it begins: an
+        exception in the midst of that would leave open what keeps Python from ending.
+        """
         self._graph.stop()
+        if not self._running:
+            raise SystemExit(0)  # the first pictures are waited for; the cameras are closed on the way
 
 
 def _keeper(recorder: FrameRecorder, offset_ns: int) -> Callable[[list[Status]], None]:
