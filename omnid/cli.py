@@ -54,8 +54,8 @@ def _parser(words: Sequence[str]) -> Parser:
 def _guarded(args: argparse.Namespace) -> int:
     from calib.errors import CalibError
     from drivers.errors import DriverError
+    from omnid.engine.logging_setup import ERROR, tell
     from omnid.errors import OmnidError
-    from omnid.journal import ERROR, tell
 
     try:
         code = int(args.run(args))

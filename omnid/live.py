@@ -15,10 +15,13 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Camera, Frame, FrameSource
 from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
+from omnid.engine.flow import nothing
+from omnid.engine.graph import NEWEST, Graph, Sink
+from omnid.engine.logging_setup import WARNING
+from omnid.engine.realtime import ThreadStart, prepare, priorities
+from omnid.engine.signals import ended_by_signals
+from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from omnid.flow import nothing
-from omnid.graph import NEWEST, Graph, Sink
-from omnid.journal import WARNING
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Encoder, clouds_of, status_report
@@ -32,15 +35,12 @@ from omnid.outputs.rig_watch import RigWatch
 from omnid.outputs.status import StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
-from omnid.realtime import ThreadStart, prepare, priorities
 from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end
 from omnid.service import Status as StatusLine
 from omnid.settings import dump
-from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
-from omnid.telemetry import StageStats
 from omnid.transport.bus import Bus
 from omnid.transport.codec import Status, compile_serialisers
 from omnid.transport.commands import Commands

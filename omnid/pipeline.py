@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.graph import NEWEST, Graph, Sink, Stream
+from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, Odometry, Panoramas
 from omnid.outputs.encoded import Outgoing
 from omnid.outputs.helm_link import HelmLink

@@ -10,11 +10,11 @@ from drivers.frame import Camera, FrameSource
 from drivers.log_folder import LogFolder
 from drivers.rotating_log import NOTICE, WARNING, Report, RotatingLog
 from omnid.config import Config
-from omnid.graph import NEWEST, Graph
+from omnid.engine.graph import NEWEST, Graph
+from omnid.engine.signals import ended_by_signals
 from omnid.outputs.encoded import Encoder
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.settings import dump
-from omnid.signals import ended_by_signals
 
 PERIOD_S = 15.0  # between two lines about how it goes
 

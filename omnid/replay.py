@@ -18,8 +18,11 @@ from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
+from omnid.engine.playback_clock import Pace
+from omnid.engine.signals import ended_by_signals
+from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.log_rig import attached_rig
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder, Outgoing, clouds_of
@@ -31,13 +34,10 @@ from omnid.outputs.status import stage_status
 from omnid.outputs.summary import QUIET_BOXES, counters, summary
 from omnid.outputs.tally import Tally
 from omnid.outputs.verdict import doubts, found_nothing
-from omnid.pace import Pace
 from omnid.pipeline import Ends, Watched, wire
 from omnid.settings import dump
-from omnid.signals import ended_by_signals
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
-from omnid.telemetry import Telemetry
 from omnid.transport.bus import Bus
 from omnid.transport.codec import OK, Status
 

@@ -30,7 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints what there is to say; 0 where the runs agree, 1 where they part."""
-    from omnid.journal import WARNING, tell
+    from omnid.engine.logging_setup import WARNING, tell
     from omnid.listening.heard import plain
     from omnid.recorded_run import read_run
     from omnid.run_comparison import Comparison, Tolerance

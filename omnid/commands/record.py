@@ -56,6 +56,6 @@ def _rig(config: Config, *, wanted: bool) -> str:
 
 
 def _say(severity: int, text: str) -> None:
-    from omnid.journal import say
+    from omnid.engine.logging_setup import say
 
     say(severity, text)

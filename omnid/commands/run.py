@@ -32,11 +32,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs until it is told to end."""
-    from omnid.heap import share_heap
+    from omnid.engine.malloc_settings import share_heap
 
     share_heap()  # before anything else: the next line loads numpy, which starts threads
     from omnid.config import Config
-    from omnid.journal import say
+    from omnid.engine.logging_setup import say
     from omnid.live import Live
     from omnid.settings import load
 
@@ -58,7 +58,7 @@ def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
 
 def _devices(config: Config) -> Opener:
     from drivers.v4l2_camera import V4l2Camera
-    from omnid.journal import say
+    from omnid.engine.logging_setup import say
 
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, report=say)
 

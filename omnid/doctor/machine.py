@@ -15,7 +15,7 @@ from typing import Final
 
 from omnid.config import RecordConfig
 from omnid.doctor.finding import Finding
-from omnid.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
+from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 
 PARTS: Final = {"numpy": "numpy", "opencv-python-headless": "cv2", "eclipse-zenoh": "zenoh", "mcap": "mcap",
                 "rosbags": "rosbags", "pyserial": "serial", "filterpy": "filterpy"}  # package: module

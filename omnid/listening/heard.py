@@ -9,8 +9,8 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Final, NamedTuple
 
+from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
-from omnid.telemetry import Histogram
 from omnid.transport.codec import Status
 from omnid.transport.decode import Pose, Report, pose_from, report_from
 

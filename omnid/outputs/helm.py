@@ -15,7 +15,7 @@ from omnid.core.command_limits import STOP, CommandLimits
 from omnid.core.fail_safe import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
 from omnid.core.heading import Drive, HeadingHold, HeadingLimits, Setpoint
 from omnid.core.heading_goal import HeadingGoal
-from omnid.flow import nothing
+from omnid.engine.flow import nothing
 from omnid.outputs.logbook import Account, Tick
 
 SURE = ("", IDLE, COMMAND_STALE)  # reasons for which the pose has been found good

@@ -19,6 +19,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.core.ego_motion import LOST
 from omnid.core.heading import Setpoint
+from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.outputs.helm import NS, Arrived, Heading
@@ -26,7 +27,6 @@ from omnid.outputs.helm_messages import LONGEST_RAMP_S, Heard, Orders, Refused, 
 from omnid.outputs.line import NOTHING, Line, pair
 from omnid.outputs.logbook import Logbook, Tick
 from omnid.stages.odometry import of_base
-from omnid.telemetry import StageStats
 
 START_S: Final = 30.0  # some boards start anew when their port is opened
 END_S: Final = LONGEST_RAMP_S + 2.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
+from omnid.engine.telemetry import Histogram
 from omnid.messages import Odometry
-from omnid.telemetry import Histogram
 
 
 class Latency:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from drivers.motor import VelocityCommand
 from omnid.core.fail_safe import IDLE
-from omnid.telemetry import Histogram, StageStats
+from omnid.engine.telemetry import Histogram, StageStats
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ from drivers.serial_motor import SerialMotor, Silence
 from drivers.simulated_controllers import TWINS
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import MotorConfig
-from omnid.graph import Slot
+from omnid.engine.graph import Slot
 
 SIMULATED = "simulated"
 SILENCE_S = 3.0

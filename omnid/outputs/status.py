@@ -10,10 +10,10 @@ from typing import NamedTuple
 from drivers.frame import Camera
 from drivers.v4l2_ledger import CameraState
 from omnid.core.fail_safe import ASKED, COMMAND_STALE, FAILED, IDLE
+from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.outputs.logbook import Logbook
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
-from omnid.telemetry import Histogram, StageStats, Telemetry
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status
 from omnid.transport.commands import Commands
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from omnid.engine.telemetry import SummaryRow
 from omnid.outputs.tally import Tally
-from omnid.telemetry import SummaryRow
 
 QUIET_BOXES = ("progress", "tally")
 

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from calib import se3
+from omnid.engine.telemetry import Telemetry
 from omnid.messages import MapUpdate, Odometry
 from omnid.outputs.encoded import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
-from omnid.telemetry import Telemetry
 from omnid.transport.decode import Cloud, Pose
 from omnid.transport.note import Note
 from omnid.viewing.board import Board

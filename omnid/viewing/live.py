@@ -11,9 +11,9 @@ from drivers.errors import BrokenFrame
 from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Pose, Report, Robot
 from omnid.core.sight import Features
+from omnid.engine.signals import ended_by_signals
 from omnid.errors import OmnidError
 from omnid.listening.heard import Letter, Mailbox
-from omnid.signals import ended_by_signals
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import cloud_from, pose_from, report_from
 from omnid.transport.features_note import features_from_bytes

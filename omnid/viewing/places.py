@@ -18,8 +18,8 @@ from urllib.parse import quote
 
 import rerun as rr
 
+from omnid.engine.signals import ended_by_signals
 from omnid.errors import OmnidError
-from omnid.signals import ended_by_signals
 
 INSTEAD: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
 NAME: Final = "omnid"

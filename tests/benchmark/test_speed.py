@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.graph import Graph
+from omnid.engine.graph import Graph
 from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.summary import counters, summary
 from omnid.outputs.tally import Tally

@@ -19,9 +19,9 @@ from omnid.core import fail_safe
 from omnid.core.command_limits import CommandLimits
 from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import LONGEST_TICK_S, HeadingLimits, Setpoint
+from omnid.engine.telemetry import StageStats
 from omnid.outputs.helm import Arrived, Heading, Helm, HelmSettings
 from omnid.outputs.logbook import Logbook
-from omnid.telemetry import StageStats
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000

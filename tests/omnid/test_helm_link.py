@@ -26,12 +26,12 @@ from omnid.core import fail_safe
 from omnid.core.command_limits import CommandLimits
 from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import Setpoint
+from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.outputs.helm import HelmSettings
 from omnid.outputs.helm_link import HelmLink, heading_of
 from omnid.outputs.helm_messages import Orders
-from omnid.telemetry import StageStats
 from tests.replay.live import ROOT, Base, wait_until
 
 DEADLINES = Deadlines(pose_s=5.0, command_s=5.0, tick_s=5.0)  # a busy machine is late with everything

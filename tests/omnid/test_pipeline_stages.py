@@ -18,10 +18,10 @@ from drivers.mcap_reader import LogReader
 from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
 from omnid.core.trajectory import read_tum
-from omnid.graph import Graph, Stream
+from omnid.engine.graph import Graph, Stream
+from omnid.engine.playback_clock import Pace
 from omnid.messages import Depth, FramePair, MapUpdate, Odometry, Panoramas
 from omnid.outputs.tally import Tally
-from omnid.pace import Pace
 from omnid.pipeline import Ends, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry

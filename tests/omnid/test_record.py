@@ -19,8 +19,8 @@ from drivers.mcap_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.voxel_map import MapPoints
+from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
-from omnid.graph import NEWEST, Graph
 from omnid.messages import MapUpdate, Odometry
 from omnid.outputs.encoded import Clouds, Encoder, status_report
 from omnid.outputs.frame_recorder import FrameRecorder

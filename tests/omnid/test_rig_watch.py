@@ -14,8 +14,8 @@ from calib.rig_file import read_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
 from omnid.core.rig_check import POINTS
-from omnid.flow import NEWEST
-from omnid.graph import Graph
+from omnid.engine.flow import NEWEST
+from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.outputs.rig_watch import MIN_PLACES, PAIRS, RigWatch
 from omnid.stages.dewarp import Dewarp

@@ -16,10 +16,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from omnid.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.outputs.tally import Tally
 from omnid.service import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
-from omnid.telemetry import StageStats, Telemetry
 
 ROOT = Path(__file__).parents[2]
 LONG_S = 20.0  # a wait that only a broken service exhausts

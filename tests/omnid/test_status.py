@@ -17,6 +17,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.v4l2_ledger import CameraState
 from omnid.config import PairConfig
 from omnid.core.heading import Setpoint
+from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import Odometry
 from omnid.outputs.helm import Arrived, Helm, HelmSettings
 from omnid.outputs.helm_link import heading_of
@@ -25,7 +26,6 @@ from omnid.outputs.logbook import Logbook
 from omnid.outputs.status import SILENT_S, StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
-from omnid.telemetry import StageStats, Telemetry
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
 from omnid.transport.commands import Commands
 from tests.scenes import build

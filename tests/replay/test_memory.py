@@ -15,7 +15,7 @@ from calib.rig_file import parse_rig
 from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.graph import Graph
+from omnid.engine.graph import Graph
 from omnid.messages import Odometry
 from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.tally import Tally

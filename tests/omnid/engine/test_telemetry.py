@@ -9,8 +9,8 @@ import threading
 import numpy as np
 import pytest
 
+from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.errors import OmnidError
-from omnid.telemetry import Histogram, StageStats, Telemetry
 
 
 @pytest.mark.parametrize("duration_s", np.geomspace(1.001e-6, 999.0, 200).tolist())

@@ -16,9 +16,23 @@ from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
+from omnid.engine.flow import (
+    END,
+    LOSSLESS,
+    NEWEST,
+    Direct,
+    Node,
+    Policy,
+    Reader,
+    Sink,
+    Slot,
+    Source,
+    Stage,
+    Stream,
+    nothing,
+)
+from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.errors import OmnidError
-from omnid.flow import END, LOSSLESS, NEWEST, Direct, Node, Policy, Reader, Sink, Slot, Source, Stage, Stream, nothing
-from omnid.telemetry import StageStats, Telemetry
 
 __all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "Stream", "Ticker"]
 

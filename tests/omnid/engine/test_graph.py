@@ -14,8 +14,8 @@ from typing import NoReturn
 
 import pytest
 
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
 from omnid.errors import OmnidError
-from omnid.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
 
 LONG_S = 20.0  # a wait that only a broken graph exhausts
 both = pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])

@@ -17,19 +17,27 @@ from types import SimpleNamespace
 import pytest
 
 from omnid.config import RealtimeConfig
-from omnid.graph import Graph
-from omnid.journal import WARNING
-from omnid.realtime import LOCK_ADVICE, ThreadStart, has_capability, highest_priority, may_lock, name_thread, priorities
+from omnid.engine.graph import Graph
+from omnid.engine.logging_setup import WARNING
+from omnid.engine.realtime import (
+    LOCK_ADVICE,
+    ThreadStart,
+    has_capability,
+    highest_priority,
+    may_lock,
+    name_thread,
+    priorities,
+)
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 NOBODY = 65534
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
 PREAMBLE = """
-from omnid.heap import share_heap
+from omnid.engine.malloc_settings import share_heap
 import gc, json, os, resource, sys, threading, time
 from pathlib import Path
 from omnid.config import RealtimeConfig
-from omnid.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread
+from omnid.engine.realtime import ThreadStart, limit_runs, lock_memory, prepare, raise_thread
 def locked_kb():
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))

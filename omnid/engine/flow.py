@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from omnid.telemetry import StageStats
+from omnid.engine.telemetry import StageStats
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)

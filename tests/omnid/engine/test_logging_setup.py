@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from omnid.journal import ERROR, NOTICE, WARNING, Journal
+from omnid.engine.logging_setup import ERROR, NOTICE, WARNING, Journal
 
-ROOT = Path(__file__).parents[2]
-SPEAK = "from omnid.journal import *; say(WARNING, 'one'); say(ERROR, 'two'); say(NOTICE, 'three')"
+ROOT = Path(__file__).parents[3]
+SPEAK = "from omnid.engine.logging_setup import *; say(WARNING, 'one'); say(ERROR, 'two'); say(NOTICE, 'three')"
 
 
 @dataclass
@@ -150,7 +150,7 @@ def test_nobody_who_reads_is_no_error() -> None:
 def test_what_libraries_log_has_its_priority(pipe: tuple[int, int]) -> None:
     found = os.fstat(pipe[1])
     environment = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
-    script = ("import logging; import omnid.journal; log = logging.getLogger('library'); log.info('by the way')\n"
+    script = ("import logging; import omnid.engine.logging_setup; log = logging.getLogger('library'); log.info('by the way')\n"
               "log.warning('careful, %d', 7); log.critical('broken')")
     assert said(environment, pipe[1], script) == 0
     assert os.read(pipe[0], 1000) == b"<4>library: careful, 7\n<3>library: broken\n"

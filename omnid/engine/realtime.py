@@ -22,7 +22,7 @@ from typing import Final
 import cv2
 
 from omnid.config import RealtimeConfig
-from omnid.journal import WARNING, say
+from omnid.engine.logging_setup import WARNING, say
 
 CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23

@@ -1,0 +1,1 @@
+"""Threads, clocks, queues and process settings; nothing about robots."""
