@@ -15,7 +15,7 @@ from omnid.core.ego_motion import Limits
 from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import HeadingLimits
 from omnid.core.klt import Klt
-from omnid.core.stereo_matching import METHODS, Matching
+from omnid.core.stereo.matcher import METHODS, Matching
 from omnid.settings import Knob, knob
 from omnid.transport.bus_config import BusConfig
 

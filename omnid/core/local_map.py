@@ -11,7 +11,7 @@ from calib import se3
 from omnid.core.klt import Klt, Wrapped, track
 from omnid.core.motion import StereoModel
 from omnid.core.patches import CELL_PX, affine_warps, align, warped_templates
-from omnid.core.triangulation import point_covariance, triangulate, view
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

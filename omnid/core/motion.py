@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.triangulation import triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

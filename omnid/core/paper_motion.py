@@ -20,7 +20,7 @@ from omnid.core.motion import StereoModel
 from omnid.core.motion_filter import MotionFilter
 from omnid.core.paper_registration import Registration, consensus, register
 from omnid.core.sight import Sight
-from omnid.core.triangulation import triangulate
+from omnid.core.stereo.triangulation import triangulate
 from omnid.core.yaw import steps
 from omnid.errors import OmnidError
 

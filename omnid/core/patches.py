@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.klt import Wrapped
 from omnid.core.motion import StereoModel
-from omnid.core.triangulation import triangulate, view
+from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -15,7 +15,7 @@ from omnid.core.fit import Fit
 from omnid.core.local_map import Keyframe
 from omnid.core.motion import StereoModel, gauss_newton, ransac
 from omnid.core.sight import Sight
-from omnid.core.triangulation import point_covariance, triangulate
+from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
-from omnid.core.stereo_matching import Matcher, Matching
-from omnid.core.triangulation import triangulate
+from omnid.core.stereo.matcher import Matcher, Matching
+from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import Depth, Panoramas
 from omnid.stages.geometry import Geometry

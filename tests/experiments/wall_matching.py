@@ -11,7 +11,7 @@ import numpy as np
 from calib import se3
 from calib.camera import Array
 from omnid.config import Config
-from omnid.core.edges import edge_pixels, smooth
+from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.messages import Panoramas
 from omnid.stages.stereo import Stereo
 from tests.experiments import pictures

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from omnid.core.klt import Wrapped
 from omnid.core.motion import StereoModel
 from omnid.core.sight import Sight
-from omnid.core.stereo_matching import Matcher, Matching
+from omnid.core.stereo.matcher import Matcher, Matching
 from tests.scenes import Exposure, Scene, Sensor, render_grey
 
 Array = NDArray[np.float64]

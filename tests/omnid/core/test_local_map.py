@@ -12,7 +12,7 @@ from omnid.core.features import corners
 from omnid.core.klt import Klt, Wrapped
 from omnid.core.local_map import Keyframe, LocalMap
 from omnid.core.motion import StereoModel
-from omnid.core.triangulation import point_covariance, triangulate
+from omnid.core.stereo.triangulation import point_covariance, triangulate
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.motion import StereoModel, gauss_newton, ransac, rigid_fit, whitening
-from omnid.core.triangulation import point_covariance, view
+from omnid.core.stereo.triangulation import point_covariance, view
 from tests.omnid.core.scenery import motion_errors
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from calib.panorama import Cylinder
 from omnid.core.klt import Wrapped
 from omnid.core.motion import StereoModel
 from omnid.core.patches import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
-from omnid.core.triangulation import view
+from omnid.core.stereo.triangulation import view
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]

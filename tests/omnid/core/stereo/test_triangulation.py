@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.triangulation import common_perpendicular, point_covariance, triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import common_perpendicular, point_covariance, triangulate, view, view_jacobian
 
 Array = NDArray[np.float64]
 

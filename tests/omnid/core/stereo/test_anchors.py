@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.disambiguation import CELL_PX, CHUNK, Candidates, Settlement, line_difference
+from omnid.core.stereo.anchors import CELL_PX, CHUNK, Candidates, Settlement, line_difference
 from tests.omnid.core.scenery import texture
 
 Flags = NDArray[np.bool_]

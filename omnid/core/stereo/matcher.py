@@ -13,10 +13,10 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.disambiguation import Candidates, Settlement
-from omnid.core.edges import edge_pixels, smooth
-from omnid.core.sad import NEVER, Costs, Indices, SadVolume, local_minima, subpixel
-from omnid.core.semiglobal import SemiGlobalPrior
+from omnid.core.stereo.anchors import Candidates, Settlement
+from omnid.core.stereo.edges import edge_pixels, smooth
+from omnid.core.stereo.sad import NEVER, Costs, Indices, SadVolume, local_minima, subpixel
+from omnid.core.stereo.semiglobal import SemiGlobalPrior
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.edges import smooth
-from omnid.core.stereo_matching import METHODS, Matcher, Matching
+from omnid.core.stereo.edges import smooth
+from omnid.core.stereo.matcher import METHODS, Matcher, Matching
 from tests.omnid.core.scenery import PAD_PX, Eyes, texture, turned
 from tests.scenes import make_rig, room
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.sad import NEVER, SadVolume, local_minima, subpixel
+from omnid.core.stereo.sad import NEVER, SadVolume, local_minima, subpixel
 from tests.omnid.core.scenery import texture
 
 Image = NDArray[np.uint8]

@@ -1,0 +1,1 @@
+"""Stereo matching of two panoramas along their columns, and triangulation."""
