@@ -11,10 +11,10 @@ from drivers.log_folder import Rotation
 from drivers.motor_protocols import PROTOCOLS
 from drivers.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from omnid.core.command_limits import CommandLimits
-from omnid.core.ego_motion import Limits
 from omnid.core.fail_safe import Deadlines
 from omnid.core.heading import HeadingLimits
-from omnid.core.klt import Klt
+from omnid.core.odometry.odometry import Limits
+from omnid.core.odometry.tracking import Klt
 from omnid.core.stereo.matcher import METHODS, Matching
 from omnid.settings import Knob, knob
 from omnid.transport.bus_config import BusConfig

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.klt import Wrapped
-from omnid.core.sight import Features
+from omnid.core.odometry.stereo_frame import Features
+from omnid.core.odometry.tracking import Wrapped
 from omnid.core.voxel_map import MapPoints
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from omnid.core.ego_motion import LOST
+from omnid.core.odometry.odometry import LOST
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.features import nearby_disparity
-from omnid.core.fit import Fit
-from omnid.core.local_map import Keyframe
-from omnid.core.motion import StereoModel, gauss_newton, ransac
-from omnid.core.sight import Sight
+from omnid.core.odometry.corners import nearby_disparity
+from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.pose_estimate import Fit
+from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
+from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]

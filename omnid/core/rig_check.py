@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from calib.rig_drift import Drift, find_drift
-from omnid.core.features import corners
-from omnid.core.klt import Klt, Wrapped, track
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.tracking import Klt, Wrapped, track
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

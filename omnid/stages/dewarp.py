@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig
-from omnid.core.klt import Wrapped
+from omnid.core.odometry.tracking import Wrapped
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry

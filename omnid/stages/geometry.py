@@ -16,7 +16,7 @@ from calib.rig import MountedCamera, Rig
 from calib.rim import find_rim
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
-from omnid.core.motion import StereoModel
+from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.stages.pair import Decoder
 
 Array = NDArray[np.float64]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import OdometryConfig
-from omnid.core.ego_motion import Ego, EgoMotion
-from omnid.core.sight import Sight
+from omnid.core.odometry.odometry import Ego, EgoMotion
+from omnid.core.odometry.stereo_frame import Sight
 from omnid.messages import Depth, Odometry
 from omnid.stages.geometry import Geometry
 
@@ -75,6 +75,6 @@ def _follower(geometry: Geometry, config: OdometryConfig) -> Follower:
     model = geometry.model(config.noise_px)
     if config.method == "default":
         return EgoMotion(model, config.klt, config.limits)
-    from omnid.core.paper_motion import PaperMotion  # only whoever asks for it pays for it
+    from omnid.core.odometry.paper.paper_odometry import PaperMotion  # only whoever asks for it pays for it
 
     return PaperMotion(model, config.klt, config.tracker, config.reference)

@@ -14,7 +14,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.sight import Features
+from omnid.core.odometry.stereo_frame import Features
 from omnid.transport.decode import Cloud, Pose
 from omnid.viewing import looks
 from omnid.viewing.layout import CLOCK

@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 from drivers.errors import BrokenFrame
 from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Pose, Report, Robot
-from omnid.core.sight import Features
+from omnid.core.odometry.stereo_frame import Features
 from omnid.engine.signals import ended_by_signals
 from omnid.errors import OmnidError
 from omnid.listening.heard import Letter, Mailbox

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from calib.camera import Array
-from omnid.core.features import corners
-from omnid.core.klt import Image, Klt, track
-from omnid.core.yaw import correlation_peaks
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.tracking import Image, Klt, track
+from omnid.core.odometry.yaw_search import correlation_peaks
 from omnid.messages import Panoramas
 from tests.experiments.views import Experiment, look
 from tests.experiments.wall_matching import stereo

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from calib.camera import Array
-from omnid.core.features import corners
-from omnid.core.klt import Klt, flow
-from omnid.core.paper_motion import turned_track
-from omnid.core.sight import Sight
-from omnid.core.yaw import correlation_peaks
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.paper.paper_odometry import turned_track
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt, flow
+from omnid.core.odometry.yaw_search import correlation_peaks
 from tests.experiments.scenes import MOVED_TURNS_DEG, TURNS_DEG
 from tests.experiments.truth import Flags, cast, sees
 from tests.experiments.views import Experiment, Views, look

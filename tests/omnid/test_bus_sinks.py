@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from omnid.client import Robot
-from omnid.core.klt import Wrapped
-from omnid.core.sight import Features
+from omnid.core.odometry.stereo_frame import Features
+from omnid.core.odometry.tracking import Wrapped
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.outputs.bus import BusSink, PanoramaSink

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
 from calib.rig import Rig
-from omnid.core.klt import Wrapped
-from omnid.core.motion import StereoModel
-from omnid.core.sight import Sight
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Wrapped
 from omnid.core.stereo.matcher import Matcher, Matching
 from tests.scenes import Exposure, Scene, Sensor, render_grey
 

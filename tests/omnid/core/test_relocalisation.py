@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.local_map import Keyframe
+from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.relocalisation import Relocaliser
-from omnid.core.sight import Sight
 from tests.omnid.core.scenery import Eyes, motion_errors
 from tests.scenes import corridor
 from tests.scenes.paths import planar_poses

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from calib.panorama import Cylinder
-from omnid.core.features import corners
-from omnid.core.klt import Klt
-from omnid.core.local_map import Keyframe, LocalMap
-from omnid.core.motion import StereoModel
-from omnid.core.pose_search import PoseSearch
-from omnid.core.sight import Sight
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.landmarks import Keyframe, LocalMap
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.pose_search import PoseSearch
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt
 from tests.omnid.core.scenery import texture, wrapped
 
 MODEL = StereoModel(Cylinder(480, 120, 60.0), 0.2)

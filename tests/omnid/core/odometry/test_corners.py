@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.core.features import clear_around, corners, nearby_disparity, rows_in_upper
-from omnid.core.klt import Klt
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
+from omnid.core.odometry.tracking import Klt
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 ALL = np.ones((120, 480), bool)

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.ego_motion import LOST, TRACKING, Ego
-from omnid.core.features import corners, nearby_disparity
-from omnid.core.klt import Klt, flow, track
-from omnid.core.motion import StereoModel
-from omnid.core.motion_filter import MotionFilter
-from omnid.core.paper_registration import Registration, consensus, register
-from omnid.core.sight import Sight
+from omnid.core.odometry.corners import corners, nearby_disparity
+from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.odometry import LOST, TRACKING, Ego
+from omnid.core.odometry.paper.registration import Registration, consensus, register
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt, flow, track
+from omnid.core.odometry.yaw_search import steps
 from omnid.core.stereo.triangulation import triangulate
-from omnid.core.yaw import steps
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.klt import Klt, Wrapped, track
+from omnid.core.odometry.tracking import Klt, Wrapped, track
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

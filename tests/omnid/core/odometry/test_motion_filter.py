@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.motion_filter import MotionFilter
+from omnid.core.odometry.motion_filter import MotionFilter
 from tests.omnid.core.scenery import motion_errors
 
 TWIST = np.array([0.5, -0.1, 0.02, 0.05, -0.03, 0.8])  # m/s, rad/s

@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.ego_motion import LOST, TRACKING
-from omnid.core.features import corners
-from omnid.core.klt import Klt
-from omnid.core.paper_motion import PaperMotion, turned_track
-from omnid.core.paper_registration import consensus, euler_matrix, euler_parameters, register
-from omnid.core.sight import Sight
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.odometry import LOST, TRACKING
+from omnid.core.odometry.paper.paper_odometry import PaperMotion, turned_track
+from omnid.core.odometry.paper.registration import consensus, euler_matrix, euler_parameters, register
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt
 from omnid.errors import OmnidError
 from tests.omnid.core.scenery import Eyes, motion_errors, texture, turned, wrapped
 from tests.scenes.paths import planar_poses

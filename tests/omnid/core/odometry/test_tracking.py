@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.klt import Klt, flow, track
+from omnid.core.odometry.tracking import Klt, flow, track
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.klt import Wrapped
-from omnid.core.motion import StereoModel
-from omnid.core.patches import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.tracking import Wrapped
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.scenery import texture, wrapped
 

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.features import clear_around, corners, nearby_disparity, rows_in_upper
-from omnid.core.fit import Fit
-from omnid.core.fixed_pattern import FixedPattern
-from omnid.core.klt import Klt, Wrapped
-from omnid.core.local_map import Keyframe, LocalMap
-from omnid.core.motion import StereoModel
-from omnid.core.motion_filter import MotionFilter
-from omnid.core.patches import disparity_slopes
-from omnid.core.pose_search import PoseSearch
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
+from omnid.core.odometry.landmarks import Keyframe, LocalMap
+from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.patch_alignment import disparity_slopes
+from omnid.core.odometry.pose_estimate import Fit
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.pose_search import PoseSearch
+from omnid.core.odometry.static_mask import FixedPattern
+from omnid.core.odometry.stereo_frame import Features, Sight
+from omnid.core.odometry.tracking import Klt, Wrapped
 from omnid.core.relocalisation import Relocaliser
-from omnid.core.sight import Features, Sight
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.motion import StereoModel, gauss_newton, ransac, rigid_fit, whitening
+from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac, rigid_fit, whitening
 from omnid.core.stereo.triangulation import point_covariance, view
 from tests.omnid.core.scenery import motion_errors
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.features import corners
-from omnid.core.klt import Klt, Wrapped
-from omnid.core.local_map import Keyframe, LocalMap
-from omnid.core.motion import StereoModel
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.landmarks import Keyframe, LocalMap
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.tracking import Klt, Wrapped
 from omnid.core.stereo.triangulation import point_covariance, triangulate
 from tests.omnid.core.scenery import texture, turned, wrapped
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.fixed_pattern import FixedPattern
+from omnid.core.odometry.static_mask import FixedPattern
 from tests.omnid.core.scenery import texture, turned
 
 Image = NDArray[np.uint8]

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.klt import Klt, Wrapped, track
-from omnid.core.motion import StereoModel
-from omnid.core.patches import CELL_PX, affine_warps, align, warped_templates
+from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, warped_templates
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.tracking import Klt, Wrapped, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 
 Array = NDArray[np.float64]

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.features import rows_in_upper
-from omnid.core.fit import Fit
-from omnid.core.klt import Klt, Wrapped
-from omnid.core.local_map import LocalMap, Tracks
-from omnid.core.motion import Estimate, StereoModel, gauss_newton, ransac
-from omnid.core.sight import Sight
-from omnid.core.yaw import correlation_peaks, steps
+from omnid.core.odometry.corners import rows_in_upper
+from omnid.core.odometry.landmarks import LocalMap, Tracks
+from omnid.core.odometry.pose_estimate import Fit
+from omnid.core.odometry.pose_estimation import Estimate, StereoModel, gauss_newton, ransac
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt, Wrapped
+from omnid.core.odometry.yaw_search import correlation_peaks, steps
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.klt import Wrapped
-from omnid.core.motion import StereoModel
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.tracking import Wrapped
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]

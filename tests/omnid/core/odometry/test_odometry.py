@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.ego_motion import DEGRADED, LOST, TRACKING, Ego, EgoMotion, Limits
-from omnid.core.klt import Klt
-from omnid.core.sight import Sight
+from omnid.core.odometry.odometry import DEGRADED, LOST, TRACKING, Ego, EgoMotion, Limits
+from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.tracking import Klt
 from tests.omnid.core.scenery import Eyes, motion_errors
 from tests.scenes import corridor
 from tests.scenes.paths import planar_poses

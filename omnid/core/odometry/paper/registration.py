@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.motion import rigid_fit
+from omnid.core.odometry.pose_estimation import rigid_fit
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

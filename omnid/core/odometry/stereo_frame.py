@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.klt import Wrapped
+from omnid.core.odometry.tracking import Wrapped
 
 
 @dataclass(frozen=True, slots=True)
