@@ -19,7 +19,7 @@ from omnid.core.odometry.pose_search import PoseSearch
 from omnid.core.odometry.static_mask import FixedPattern
 from omnid.core.odometry.stereo_frame import Features, Sight
 from omnid.core.odometry.tracking import Klt, Wrapped
-from omnid.core.relocalisation import Relocaliser
+from omnid.core.places.relocalisation import Relocaliser
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import Sight
-from omnid.core.relocalisation import Relocaliser
+from omnid.core.places.relocalisation import Relocaliser
 from tests.omnid.core.scenery import Eyes, motion_errors
 from tests.scenes import corridor
 from tests.scenes.paths import planar_poses

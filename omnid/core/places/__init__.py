@@ -1,0 +1,1 @@
+"""Recognition of places seen before, and the pose they give."""
