@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import Wrapped
-from omnid.core.voxel_map import MapPoints
 
 Array = NDArray[np.float64]
 

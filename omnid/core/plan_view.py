@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.trajectory import POSITION_LIMIT_M
-from omnid.core.voxel_map import MapPoints
 
 Image = NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omnid.core.voxel_map import MapPoints
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("confidence", "<f4"), ("frames", "<i4"), ("age", "<i4")])

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.core.occupancy import occupancy
-from omnid.core.voxel_map import MapPoints
+from omnid.core.mapping.occupancy_grid import occupancy
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate, Odometry
 from omnid.stages.odometry import of_base
 from omnid.transport import codec

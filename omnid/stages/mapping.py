@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import MappingConfig
+from omnid.core.mapping.voxel_map import VoxelMap
 from omnid.core.odometry.odometry import TRACKING
-from omnid.core.voxel_map import VoxelMap
 from omnid.messages import MapUpdate, Odometry
 
 Array = NDArray[np.float64]

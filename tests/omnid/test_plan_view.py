@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.plan_view import plan_view
-from omnid.core.voxel_map import MapPoints
 
 MARGIN_PX = 64
 NO_PATH = np.empty((0, 2))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.ply import read_ply, write_ply
-from omnid.core.voxel_map import MapPoints
 from omnid.errors import OmnidError
 
 

@@ -18,7 +18,7 @@ from drivers.frame import Camera, Frame, gray
 from drivers.mcap_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.core.voxel_map import MapPoints
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, Odometry

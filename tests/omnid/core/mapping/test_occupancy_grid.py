@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.core.occupancy import FREE, MOST_CELLS, TAKEN, UNKNOWN, Grid, occupancy
+from omnid.core.mapping.occupancy_grid import FREE, MOST_CELLS, TAKEN, UNKNOWN, Grid, occupancy
 from tests.omnid.allocations import taken
 
 NOBODY = np.zeros((0, 3)), np.zeros(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.voxel_map import MapPoints, VoxelMap
+from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.errors import OmnidError
 from tests.omnid.allocations import taken
 

@@ -1,0 +1,1 @@
+"""The map of a run: points fused in voxels, and the occupancy grid."""
