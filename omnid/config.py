@@ -10,9 +10,9 @@ from drivers.differential_drive import DifferentialDrive
 from drivers.log_folder import Rotation
 from drivers.motor_protocols import PROTOCOLS
 from drivers.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
-from omnid.core.command_limits import CommandLimits
-from omnid.core.fail_safe import Deadlines
-from omnid.core.heading import HeadingLimits
+from omnid.core.control.heading_controller import HeadingLimits
+from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.velocity_limits import CommandLimits
 from omnid.core.odometry.odometry import Limits
 from omnid.core.odometry.tracking import Klt
 from omnid.core.stereo.matcher import METHODS, Matching

@@ -11,10 +11,10 @@ from typing import NamedTuple
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.serial_motor import Late
-from omnid.core.command_limits import STOP, CommandLimits
-from omnid.core.fail_safe import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
-from omnid.core.heading import Drive, HeadingHold, HeadingLimits, Setpoint
-from omnid.core.heading_goal import HeadingGoal
+from omnid.core.control.heading_controller import Drive, HeadingHold, HeadingLimits, Setpoint
+from omnid.core.control.heading_goal import HeadingGoal
+from omnid.core.control.safety_rules import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
+from omnid.core.control.velocity_limits import STOP, CommandLimits
 from omnid.engine.flow import nothing
 from omnid.outputs.logbook import Account, Tick
 
@@ -55,7 +55,7 @@ class HelmSettings:
 class Helm:
     """Takes poses and commands, the newest of which count, and drives with each call.
 
-    It stops, with the deceleration of its limits, for every reason of omnid.core.fail_safe. A stop voids all commands
+    It stops, with the deceleration of its limits, for every reason of omnid.core.control.safety_rules. A stop voids all commands
     that came before it: only one that comes later moves the wheels again. For one thread.
     """
 

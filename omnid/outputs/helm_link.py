@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from omnid.core.heading import Setpoint
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.odometry.odometry import LOST
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError

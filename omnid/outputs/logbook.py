@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from drivers.motor import VelocityCommand
-from omnid.core.fail_safe import IDLE
+from omnid.core.control.safety_rules import IDLE
 from omnid.engine.telemetry import Histogram, StageStats
 
 

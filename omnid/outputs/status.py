@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from drivers.frame import Camera
 from drivers.v4l2_ledger import CameraState
-from omnid.core.fail_safe import ASKED, COMMAND_STALE, FAILED, IDLE
+from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.outputs.logbook import Logbook
 from omnid.outputs.tally import Tally

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motor import VelocityCommand, stop_command
 from omnid.config import GuidanceConfig
-from omnid.core.heading import Drive, HeadingHold, Setpoint
+from omnid.core.control.heading_controller import Drive, HeadingHold, Setpoint
 from omnid.core.odometry.odometry import LOST
 from omnid.messages import Odometry
 from omnid.stages.odometry import of_base

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from omnid.core.heading import Setpoint
+from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport.codec import heading_from_cdr, twist_from_cdr
 

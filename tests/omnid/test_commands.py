@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from omnid.core.heading import Setpoint
+from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD, Commands
 

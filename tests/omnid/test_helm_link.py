@@ -22,10 +22,10 @@ from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.config import MotorConfig, RealtimeConfig
-from omnid.core import fail_safe
-from omnid.core.command_limits import CommandLimits
-from omnid.core.fail_safe import Deadlines
-from omnid.core.heading import Setpoint
+from omnid.core.control import safety_rules as fail_safe
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.velocity_limits import CommandLimits
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry

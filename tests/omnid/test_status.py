@@ -16,7 +16,7 @@ from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.v4l2_ledger import CameraState
 from omnid.config import PairConfig
-from omnid.core.heading import Setpoint
+from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import Odometry
 from omnid.outputs.helm import Arrived, Helm, HelmSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import time
 
-from omnid.core.fail_safe import FAILED
+from omnid.core.control.safety_rules import FAILED
 from tests.replay.faults.trial import Outcome, Place, driving, ended, goes_on, stands, trial
 from tests.replay.live import command_line, free_port, wait_until
 

@@ -9,7 +9,7 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-from omnid.core.fail_safe import POSE_STALE
+from omnid.core.control.safety_rules import POSE_STALE
 from omnid.transport import codec
 from tests.replay.faults.trial import SPOILT, Outcome, Place, driving, goes_on, stands, trial
 from tests.replay.live import PATIENCE_S, Base, Operator, robot, wait_until

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from omnid.core.heading import Setpoint, wrap_angle
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
 
 LEAD_RAD = 0.5  # how far a turn at a rate may be ahead of a base that does not follow
 

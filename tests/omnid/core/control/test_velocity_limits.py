@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from omnid.core.command_limits import STOP, CommandLimits
-from omnid.core.heading import LONGEST_TICK_S, Drive
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Drive
+from omnid.core.control.velocity_limits import STOP, CommandLimits
 from omnid.errors import OmnidError
 
 LIMITS = CommandLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,

@@ -8,7 +8,14 @@ from dataclasses import replace
 
 import pytest
 
-from omnid.core.heading import LONGEST_TICK_S, Drive, HeadingHold, HeadingLimits, Setpoint, wrap_angle
+from omnid.core.control.heading_controller import (
+    LONGEST_TICK_S,
+    Drive,
+    HeadingHold,
+    HeadingLimits,
+    Setpoint,
+    wrap_angle,
+)
 from omnid.errors import OmnidError
 
 DT_S = 0.05

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import pytest
 
-from omnid.core import fail_safe
-from omnid.core.fail_safe import Deadlines, Situation, reason_to_stop
+from omnid.core.control import safety_rules as fail_safe
+from omnid.core.control.safety_rules import Deadlines, Situation, reason_to_stop
 
 DEADLINES = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
 GOOD = Situation(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, late_s=0.01)

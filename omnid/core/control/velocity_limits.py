@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-from omnid.core.heading import LONGEST_TICK_S, Drive
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Drive
 from omnid.errors import OmnidError
 
 STOP = Drive()

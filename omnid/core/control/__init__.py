@@ -1,0 +1,1 @@
+"""Control laws and safety rules of the base; no numpy, no I/O, no clock."""
