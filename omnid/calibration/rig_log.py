@@ -16,7 +16,7 @@ from drivers.errors import DriverError
 from drivers.mcap_reader import LogReader
 from omnid.calibration.pairs import SIDES, paired
 from omnid.config import PanoramaConfig
-from omnid.core.rig_check import RigCheck, RigFinding
+from omnid.core.rig.rig_check import RigCheck, RigFinding
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp

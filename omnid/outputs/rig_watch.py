@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.rig_check import Matches, RigFinding, Verdict, judge, match, together
+from omnid.core.rig.rig_check import Matches, RigFinding, Verdict, judge, match, together
 from omnid.messages import Panoramas
 from omnid.transport.codec import ERROR, OK, WARN, Status
 

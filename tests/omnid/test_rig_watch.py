@@ -13,7 +13,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
-from omnid.core.rig_check import POINTS
+from omnid.core.rig.rig_check import POINTS
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas

@@ -1,0 +1,1 @@
+"""What panoramas say about the calibration of the rig."""
