@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     """Replays the sample and prints its errors."""
     from omnid.config import Config
     from omnid.core.evaluation import evaluate, format_metrics
-    from omnid.core.trajectory import read_tum
+    from omnid.formats.tum import read_tum
     from omnid.replay import Options, Replay
     from omnid.settings import load
 

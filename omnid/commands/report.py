@@ -22,7 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Writes the page."""
     from calib.rig_file import write_file
-    from omnid.core.trajectory import read_tum
+    from omnid.formats.tum import read_tum
     from omnid.outputs.files import check_outputs, on_stdout
     from omnid.report.recording import read_recording
     from omnid.report.report import report_html

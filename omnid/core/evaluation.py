@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.trajectory import Trajectory
 from omnid.errors import OmnidError
+from omnid.formats.tum import Trajectory
 
 
 @dataclass(frozen=True, slots=True)

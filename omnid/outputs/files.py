@@ -11,10 +11,10 @@ from typing import TypeAlias
 
 import cv2
 
-from omnid.core.plan_view import plan_view
-from omnid.core.ply import write_ply
-from omnid.core.trajectory import tum_row
 from omnid.errors import OmnidError
+from omnid.formats.plan_view import plan_view
+from omnid.formats.ply import write_ply
+from omnid.formats.tum import tum_row
 from omnid.messages import MapUpdate, Odometry
 
 Named: TypeAlias = Sequence[tuple[str, Path]]

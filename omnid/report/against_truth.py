@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.evaluation import Metrics, evaluate
-from omnid.core.trajectory import Trajectory
+from omnid.formats.tum import Trajectory
 from omnid.report.poses import PoseCourse
 from omnid.report.thinned import Corner, PathTrace, Point, Thinned
 

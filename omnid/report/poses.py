@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.trajectory import POSITION_LIMIT_M, Trajectory
+from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.report.thinned import Corner, PathTrace, Thinned
 from omnid.transport.codec import OdometryRecord

@@ -11,8 +11,8 @@ import numpy as np
 
 from drivers.mcap_survey import State
 from omnid import __version__
-from omnid.core.trajectory import Trajectory
 from omnid.errors import OmnidError
+from omnid.formats.tum import Trajectory
 from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.against_truth import Comparison, compare
 from omnid.report.chart import Clock

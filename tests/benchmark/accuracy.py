@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from omnid.core.evaluation import Metrics, evaluate
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 
 HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\n|---|---|---|---|---|---|---|---|"
 

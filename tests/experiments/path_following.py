@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from omnid.core.evaluation import evaluate
-from omnid.core.trajectory import Trajectory, read_tum
+from omnid.formats.tum import Trajectory, read_tum
 from tests.benchmark.accuracy import omnid
 from tests.experiments import pictures
 from tests.experiments.views import Experiment

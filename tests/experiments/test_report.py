@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from tests.experiments import path_following, turn_tracking, wall_matching
 from tests.experiments.report import RESULTS, about, report, text
 from tests.experiments.scenes import build

@@ -11,8 +11,8 @@ import numpy as np
 from calib import se3
 from calib.camera import Array
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.ply import read_ply
-from omnid.core.trajectory import Trajectory, read_tum
+from omnid.formats.ply import read_ply
+from omnid.formats.tum import Trajectory, read_tum
 from tests.benchmark.accuracy import omnid
 from tests.experiments import pictures
 from tests.experiments.path_following import PAPER, against_truth

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from omnid.recorded_run import read_run
 from tests.interop.conftest import Known
 from tests.interop.programs import program, run

@@ -13,8 +13,8 @@ import pytest
 
 from calib import se3
 from omnid.core.evaluation import evaluate, format_metrics
-from omnid.core.trajectory import Trajectory, read_tum, tum_row
 from omnid.errors import OmnidError
+from omnid.formats.tum import Trajectory, read_tum, tum_row
 
 STEP_NS = 100_000_000
 

@@ -17,7 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib import se3
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from omnid.listening.heard import Heard, Letter, Mailbox
 from omnid.listening.screen import Screen, line, table
 from omnid.transport import codec

@@ -17,9 +17,9 @@ from drivers.frame import Camera, Frame
 from drivers.mcap_reader import LogReader
 from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
-from omnid.core.trajectory import read_tum
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import Pace
+from omnid.formats.tum import read_tum
 from omnid.messages import Depth, FramePair, MapUpdate, Odometry, Panoramas
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire

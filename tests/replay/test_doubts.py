@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.rig_file import read_rig, write_rig
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from tests.conftest import PAIRS
 from tests.drivers.mcap_logs import IMAGE, LOWER, UPPER, Entry, image, write_log
 from tests.replay.command import Command

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from omnid.core.evaluation import Metrics, evaluate
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from tests.replay.command import Command
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from tests.replay.command import Command
 from tests.replay.live import PATIENCE_S, ROOT, answers, free_port, robot, started, wait_until
 

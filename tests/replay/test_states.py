@@ -8,7 +8,7 @@ import numpy as np
 from mcap.reader import make_reader
 
 from calib import se3
-from omnid.core.trajectory import Trajectory, read_tum
+from omnid.formats.tum import Trajectory, read_tum
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
 from tests.drivers.mcap_logs import STORE

@@ -17,8 +17,8 @@ from calib.rig_file import rig_toml
 from drivers.mcap_reader import LogReader
 from omnid.cli import main
 from omnid.core.evaluation import evaluate
-from omnid.core.trajectory import Trajectory, read_tum, tum_row
 from omnid.errors import OmnidError
+from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.log_rig import attached_rig
 from omnid.report.against_truth import compare
 from omnid.report.recording import Recording, read_recording

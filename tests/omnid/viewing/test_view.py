@@ -12,7 +12,7 @@ import pytest
 from calib import se3
 from drivers.frame import Frame
 from drivers.mcap_writer import LogWriter
-from omnid.core.trajectory import read_tum
+from omnid.formats.tum import read_tum
 from omnid.transport import codec
 from omnid.transport.codec import Status
 from omnid.transport.image_codec import image_cdr

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.trajectory import Trajectory, read_tum, tum_row
 from omnid.errors import OmnidError
+from omnid.formats.tum import Trajectory, read_tum, tum_row
 
 GOOD = "1700000000.099999905 1 2 3 0 0 0 1\n"
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.trajectory import POSITION_LIMIT_M
+from omnid.formats.tum import POSITION_LIMIT_M
 
 Image = NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.plan_view import plan_view
+from omnid.formats.plan_view import plan_view
 
 MARGIN_PX = 64
 NO_PATH = np.empty((0, 2))

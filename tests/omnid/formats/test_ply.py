@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.ply import read_ply, write_ply
 from omnid.errors import OmnidError
+from omnid.formats.ply import read_ply, write_ply
 
 
 def some_points(count: int) -> MapPoints:

@@ -1,0 +1,1 @@
+"""Files that other programs read: TUM trajectories, PLY maps, PNG plan views."""
