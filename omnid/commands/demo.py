@@ -21,8 +21,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Replays the sample and prints its errors."""
     from omnid.config import Config
-    from omnid.core.evaluation import evaluate, format_metrics
     from omnid.formats.tum import read_tum
+    from omnid.recordings.evaluation import evaluate, format_metrics
     from omnid.replay import Options, Replay
     from omnid.settings import load
 

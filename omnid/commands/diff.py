@@ -32,8 +32,8 @@ def run(args: argparse.Namespace) -> int:
     """Prints what there is to say; 0 where the runs agree, 1 where they part."""
     from omnid.engine.logging_setup import WARNING, tell
     from omnid.listening.heard import plain
-    from omnid.recorded_run import read_run
-    from omnid.run_comparison import Comparison, Tolerance
+    from omnid.recordings.comparison import Comparison, Tolerance
+    from omnid.recordings.run_reader import read_run
 
     limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
     a, b = (read_run(path, args.topic) for path in (args.a, args.b))

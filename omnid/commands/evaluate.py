@@ -17,8 +17,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the errors."""
-    from omnid.core.evaluation import evaluate, format_metrics
     from omnid.formats.tum import read_tum
+    from omnid.recordings.evaluation import evaluate, format_metrics
 
     print(format_metrics(evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3)))
     return 0

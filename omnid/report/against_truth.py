@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.evaluation import Metrics, evaluate
 from omnid.formats.tum import Trajectory
+from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.report.poses import PoseCourse
 from omnid.report.thinned import Corner, PathTrace, Point, Thinned
 

@@ -11,8 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from omnid.core.evaluation import Metrics, evaluate
 from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import Metrics, evaluate
 
 HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\n|---|---|---|---|---|---|---|---|"
 

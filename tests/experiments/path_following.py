@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from omnid.core.evaluation import evaluate
 from omnid.formats.tum import Trajectory, read_tum
+from omnid.recordings.evaluation import evaluate
 from tests.benchmark.accuracy import omnid
 from tests.experiments import pictures
 from tests.experiments.views import Experiment

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omnid.formats.tum import read_tum
-from omnid.recorded_run import read_run
+from omnid.recordings.run_reader import read_run
 from tests.interop.conftest import Known
 from tests.interop.programs import program, run
 

@@ -14,9 +14,9 @@ from mcap.reader import make_reader
 from calib import se3
 from calib.rig_file import parse_rig, read_rig, write_rig
 from omnid.config import Config
-from omnid.core.evaluation import evaluate
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import evaluate
 from omnid.replay import Options, Replay
 from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from omnid.core.evaluation import Metrics, evaluate
 from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import Metrics, evaluate
 from tests.replay.command import Command
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from calib.rig_file import parse_rig, rig_toml
 from drivers.mcap_reader import LogReader
-from omnid.recorded_run import read_run
+from omnid.recordings.run_reader import read_run
 from tests.replay.command import Command
 from tests.replay.recorded import recorded_run
 

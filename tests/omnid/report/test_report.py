@@ -16,10 +16,10 @@ from calib.rig import Rig
 from calib.rig_file import rig_toml
 from drivers.mcap_reader import LogReader
 from omnid.cli import main
-from omnid.core.evaluation import evaluate
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.log_rig import attached_rig
+from omnid.recordings.evaluation import evaluate
 from omnid.report.against_truth import compare
 from omnid.report.recording import Recording, read_recording
 from omnid.report.report import report_html

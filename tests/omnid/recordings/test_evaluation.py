@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.evaluation import evaluate, format_metrics
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
+from omnid.recordings.evaluation import evaluate, format_metrics
 
 STEP_NS = 100_000_000
 

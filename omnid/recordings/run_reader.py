@@ -20,8 +20,8 @@ from drivers.mcap_index import read_attachments, read_summary
 from drivers.mcap_messages import DataSection, Message
 from drivers.mcap_records import LogFile, RecordError
 from drivers.mcap_survey import State, Survey, survey
-from omnid.core.run_differences import Series
 from omnid.errors import OmnidError
+from omnid.recordings.series_differences import Series
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, TWIST_SCHEMA, odometry_from_cdr, twist_from_cdr
 from omnid.transport.decode import report_from
 

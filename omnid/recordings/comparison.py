@@ -10,7 +10,9 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.strict import toml_table
-from omnid.core.run_differences import (
+from omnid.errors import OmnidError
+from omnid.recordings.run_reader import STATES, Run
+from omnid.recordings.series_differences import (
     Gaps,
     Series,
     aligned,
@@ -22,9 +24,7 @@ from omnid.core.run_differences import (
     in_both,
     pose_excess,
 )
-from omnid.core.table_differences import table_differences
-from omnid.errors import OmnidError
-from omnid.recorded_run import STATES, Run
+from omnid.recordings.settings_differences import table_differences
 
 MOST_KEYS: Final = 40  # lines about settings
 ATTACHED: Final = (("settings", "omnid.toml"), ("rig", "rig.toml"))

@@ -12,11 +12,11 @@ import pytest
 
 from calib import se3
 from drivers.mcap_writer import LogWriter
-from omnid import recorded_run
 from omnid.cli import main
-from omnid.core.run_differences import Series, gaps, pose_excess
-from omnid.core.table_differences import table_differences
-from omnid.recorded_run import read_run
+from omnid.recordings import run_reader as recorded_run
+from omnid.recordings.run_reader import read_run
+from omnid.recordings.series_differences import Series, gaps, pose_excess
+from omnid.recordings.settings_differences import table_differences
 from omnid.transport import codec
 from tests.drivers.mcap_logs import START_NS
 

@@ -1,0 +1,1 @@
+"""Recorded runs: read, compared with each other, evaluated against the truth."""
