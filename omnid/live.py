@@ -15,6 +15,9 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Camera, Frame, FrameSource
 from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
+from omnid.controller.controller import HelmSettings
+from omnid.controller.link import HelmLink
+from omnid.controller.messages import Orders
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.logging_setup import WARNING
@@ -27,9 +30,6 @@ from omnid.outputs.bus import BusSink, PanoramaSink
 from omnid.outputs.encoded import Encoder, clouds_of, status_report
 from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.outputs.heard_commands import keeper_of_commands
-from omnid.outputs.helm import HelmSettings
-from omnid.outputs.helm_link import HelmLink
-from omnid.outputs.helm_messages import Orders
 from omnid.outputs.latency import Latency
 from omnid.outputs.rig_watch import RigWatch
 from omnid.outputs.status import StatusReport, StatusTick, Watched

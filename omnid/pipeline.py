@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.controller.link import HelmLink
+from omnid.controller.motor import MotorTick
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, Odometry, Panoramas
 from omnid.outputs.encoded import Outgoing
-from omnid.outputs.helm_link import HelmLink
-from omnid.outputs.motor import MotorTick
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.guidance import Guidance

@@ -18,6 +18,7 @@ from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
+from omnid.controller.motor import MotorTick, open_motor
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import Pace
 from omnid.engine.signals import ended_by_signals
@@ -27,7 +28,6 @@ from omnid.log_rig import attached_rig
 from omnid.outputs.bus import BusSink
 from omnid.outputs.encoded import Encoder, Outgoing, clouds_of
 from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
-from omnid.outputs.motor import MotorTick, open_motor
 from omnid.outputs.progress import Progress
 from omnid.outputs.recorder import Recorder
 from omnid.outputs.status import stage_status

@@ -13,10 +13,10 @@ from typing import Final
 
 from calib.errors import CalibError
 from calib.rig_file import read_rig
+from omnid.controller.motor import SIMULATED
 from omnid.doctor.devices import access, holders, is_ours
 from omnid.doctor.finding import Finding
 from omnid.errors import OmnidError
-from omnid.outputs.motor import SIMULATED
 from omnid.transport.bus_config import BusConfig, checked
 
 _TIMEOUT_S: Final = 2.0

@@ -16,13 +16,13 @@ from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.v4l2_ledger import CameraState
 from omnid.config import PairConfig
+from omnid.controller.controller import Arrived, Helm, HelmSettings
+from omnid.controller.link import heading_of
+from omnid.controller.statistics import Logbook
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import Odometry
-from omnid.outputs.helm import Arrived, Helm, HelmSettings
-from omnid.outputs.helm_link import heading_of
 from omnid.outputs.latency import Latency
-from omnid.outputs.logbook import Logbook
 from omnid.outputs.status import SILENT_S, StatusReport, StatusTick, Watched
 from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair

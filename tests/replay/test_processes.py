@@ -20,9 +20,9 @@ from mcap.reader import make_reader
 from drivers.motor import VelocityCommand, is_stop
 from drivers.serial_motor import SerialMotor
 from drivers.simulated_motor import SimulatedMotor
+from omnid.controller.motor import MotorTick
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
-from omnid.outputs.motor import MotorTick
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
 from tests.replay.command import Command, rows

@@ -1,11 +1,11 @@
-"""What the daemon and the process that steers say to each other; beside these, each tick (omnid.outputs.logbook)."""
+"""What the daemon and the process that steers say to each other; beside these, each tick (omnid.controller.statistics)."""
 
 from __future__ import annotations
 
 from typing import Final, NamedTuple
 
 from omnid.config import MotorConfig, RealtimeConfig
-from omnid.outputs.helm import Arrived, Heading, HelmSettings
+from omnid.controller.controller import Arrived, Heading, HelmSettings
 
 LONGEST_RAMP_S: Final = 3.0  # at the end: whatever has not stood still by then is stopped at once
 

@@ -15,13 +15,13 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.serial_motor import Late, SerialMotor
 from drivers.simulated_motor import SimulatedMotor
+from omnid.controller.controller import Arrived, Heading, Helm, HelmSettings
+from omnid.controller.statistics import Logbook
 from omnid.core.control import safety_rules as fail_safe
 from omnid.core.control.heading_controller import LONGEST_TICK_S, HeadingLimits, Setpoint
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.velocity_limits import CommandLimits
 from omnid.engine.telemetry import StageStats
-from omnid.outputs.helm import Arrived, Heading, Helm, HelmSettings
-from omnid.outputs.logbook import Logbook
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000

@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motor_protocols import PROTOCOLS
 from omnid.config import Config, MotorConfig
-from omnid.outputs.motor import open_motor
+from omnid.controller.motor import open_motor
 from omnid.settings import parse
 
 SLOW_HZ = 1.0  # so that a machine under load has a second to answer

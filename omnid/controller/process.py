@@ -15,12 +15,12 @@ from typing import Final
 
 from drivers.errors import DriverError
 from omnid.config import RealtimeConfig
+from omnid.controller.controller import NS, Arrived, Heading, Helm
+from omnid.controller.ipc import NOTHING, Line
+from omnid.controller.messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
+from omnid.controller.motor import open_motor
 from omnid.engine.realtime import ThreadStart, prepare
 from omnid.engine.signals import STOPPING
-from omnid.outputs.helm import NS, Arrived, Heading, Helm
-from omnid.outputs.helm_messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
-from omnid.outputs.line import NOTHING, Line
-from omnid.outputs.motor import open_motor
 
 MOST_LATE: Final = 500  # packets heard when a tick is due already: more than may wait on the line
 ORDERS_S: Final = 10.0

@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
+from omnid.controller.controller import NS, Arrived, Heading
+from omnid.controller.ipc import NOTHING, Line, pair
+from omnid.controller.messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
+from omnid.controller.statistics import Logbook, Tick
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.odometry.odometry import LOST
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.helm import NS, Arrived, Heading
-from omnid.outputs.helm_messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
-from omnid.outputs.line import NOTHING, Line, pair
-from omnid.outputs.logbook import Logbook, Tick
 from omnid.stages.odometry import of_base
 
 START_S: Final = 30.0  # some boards start anew when their port is opened
 END_S: Final = LONGEST_RAMP_S + 2.0
 LOOK_S: Final = 0.5
-PROCESS: Final = "omnid.outputs.helm_process"
+PROCESS: Final = "omnid.controller.process"
 
 
 class HelmLink:

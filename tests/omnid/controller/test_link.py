@@ -22,6 +22,9 @@ from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.config import MotorConfig, RealtimeConfig
+from omnid.controller.controller import HelmSettings
+from omnid.controller.link import HelmLink, heading_of
+from omnid.controller.messages import Orders
 from omnid.core.control import safety_rules as fail_safe
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
@@ -29,9 +32,6 @@ from omnid.core.control.velocity_limits import CommandLimits
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.helm import HelmSettings
-from omnid.outputs.helm_link import HelmLink, heading_of
-from omnid.outputs.helm_messages import Orders
 from tests.replay.live import ROOT, Base, wait_until
 
 DEADLINES = Deadlines(pose_s=5.0, command_s=5.0, tick_s=5.0)  # a busy machine is late with everything
@@ -175,7 +175,7 @@ def _says_pose(robot: Robot) -> bool:
 
 OWNER = """
 import sys, time
-from tests.omnid.test_helm_link import AHEAD, HelmLink, StageStats, np, odometry, orders
+from tests.omnid.controller.test_link import AHEAD, HelmLink, StageStats, np, odometry, orders
 link = HelmLink(orders(sys.argv[1]), np.eye(4), StageStats("motor"), print)
 while True:
     link.process(odometry())
@@ -208,7 +208,7 @@ def _has_open(base: Base) -> bool:
 
 
 def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("omnid.outputs.helm_link.END_S", 0.5)
+    monkeypatch.setattr("omnid.controller.link.END_S", 0.5)
     os.kill(robot.pid, signal.SIGSTOP)
     robot.link.end()
     robot.joined()

@@ -11,12 +11,12 @@ from typing import NamedTuple
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.serial_motor import Late
+from omnid.controller.statistics import Account, Tick
 from omnid.core.control.heading_controller import Drive, HeadingHold, HeadingLimits, Setpoint
 from omnid.core.control.heading_goal import HeadingGoal
 from omnid.core.control.safety_rules import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
 from omnid.core.control.velocity_limits import STOP, CommandLimits
 from omnid.engine.flow import nothing
-from omnid.outputs.logbook import Account, Tick
 
 SURE = ("", IDLE, COMMAND_STALE)  # reasons for which the pose has been found good
 NS = 1e-9
