@@ -26,10 +26,6 @@ from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.bus import BusSink, PanoramaSink
-from omnid.outputs.encoded import Encoder, clouds_of, status_report
-from omnid.outputs.frame_recorder import FrameRecorder
-from omnid.outputs.heard_commands import keeper_of_commands
 from omnid.outputs.latency import Latency
 from omnid.outputs.rig_watch import RigWatch
 from omnid.outputs.status import StatusReport, StatusTick, Watched
@@ -39,6 +35,10 @@ from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end
 from omnid.service import Status as StatusLine
 from omnid.settings import dump
+from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.command_log import keeper_of_commands
+from omnid.sinks.encoder import Encoder, clouds_of, status_report
+from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pair import LivePair
 from omnid.transport.bus import Bus

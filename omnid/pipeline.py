@@ -12,7 +12,7 @@ from omnid.controller.link import HelmLink
 from omnid.controller.motor import MotorTick
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, Odometry, Panoramas
-from omnid.outputs.encoded import Outgoing
+from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.guidance import Guidance

@@ -12,9 +12,9 @@ from drivers.rotating_log import NOTICE, WARNING, Report, RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.signals import ended_by_signals
-from omnid.outputs.encoded import Encoder
-from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.settings import dump
+from omnid.sinks.encoder import Encoder
+from omnid.sinks.frame_recorder import FrameRecorder
 
 PERIOD_S = 15.0  # between two lines about how it goes
 

@@ -25,17 +25,17 @@ from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.log_rig import attached_rig
-from omnid.outputs.bus import BusSink
-from omnid.outputs.encoded import Encoder, Outgoing, clouds_of
-from omnid.outputs.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.outputs.progress import Progress
-from omnid.outputs.recorder import Recorder
 from omnid.outputs.status import stage_status
 from omnid.outputs.summary import QUIET_BOXES, counters, summary
 from omnid.outputs.tally import Tally
 from omnid.outputs.verdict import doubts, found_nothing
 from omnid.pipeline import Ends, Watched, wire
 from omnid.settings import dump
+from omnid.sinks.bus_sink import BusSink
+from omnid.sinks.encoder import Encoder, Outgoing, clouds_of
+from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
+from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.pair import PairSync
 from omnid.transport.bus import Bus

@@ -18,7 +18,7 @@ from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 from omnid.commands import calibrate_camera, calibrate_check, calibrate_rig
 from omnid.errors import OmnidError
-from omnid.outputs.files import check_outputs
+from omnid.sinks.files import check_outputs
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -22,7 +22,7 @@ from omnid.calibration.boards import find_boards, spread
 from omnid.calibration.pictures import Pictures, read_pictures
 from omnid.calibration.report import report_html
 from omnid.errors import OmnidError
-from omnid.outputs.files import check_outputs
+from omnid.sinks.files import check_outputs
 
 # A log shows the same board over and over: so many views, far apart, say as much as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40

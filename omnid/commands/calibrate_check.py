@@ -18,7 +18,7 @@ from omnid.core.rig.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.errors import OmnidError
 from omnid.log_rig import attached_rig
 from omnid.messages import FramePair
-from omnid.outputs.files import check_outputs
+from omnid.sinks.files import check_outputs
 
 REFINEMENTS = 3
 # A mirror does not move so far aside; a camera's centre that is some pixels off looks as if it had.

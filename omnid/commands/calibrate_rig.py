@@ -28,7 +28,7 @@ from omnid.calibration.pictures import Pictures
 from omnid.calibration.rig_report import rig_report_html
 from omnid.commands.calibrate_camera import corners
 from omnid.errors import OmnidError
-from omnid.outputs.files import check_outputs
+from omnid.sinks.files import check_outputs
 
 MAX_LOG_VIEWS = 40
 # The square's side scales everything: of a rig that can stand on a robot the baseline tells a wrong one.

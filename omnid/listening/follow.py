@@ -13,7 +13,7 @@ from omnid.client import Report, Robot
 from omnid.listening.heard import Heard, Mailbox
 from omnid.listening.keepers import LogKeeper, TumKeeper
 from omnid.listening.screen import Screen
-from omnid.outputs.files import check_outputs
+from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import Unreachable
 

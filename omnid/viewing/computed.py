@@ -10,7 +10,7 @@ import numpy as np
 from calib import se3
 from omnid.engine.telemetry import Telemetry
 from omnid.messages import MapUpdate, Odometry
-from omnid.outputs.encoded import Outgoing
+from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
 from omnid.transport.decode import Cloud, Pose

@@ -23,8 +23,8 @@ from calib import se3
 from omnid.client import Report, Robot, Subscription
 from omnid.engine.telemetry import Histogram
 from omnid.messages import Odometry
-from omnid.outputs.bus import BusSink
-from omnid.outputs.encoded import Clouds, Encoder
+from omnid.sinks.bus_sink import BusSink
+from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
 from tests.omnid.buses import ROUTER, free_endpoint, script, wait_until

@@ -15,10 +15,10 @@ from calib.rig_file import parse_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import Config
 from omnid.engine.graph import Graph
-from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.summary import counters, summary
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
+from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.pair import PairSync
 from tests.replay.test_memory import to_and_fro

@@ -17,9 +17,9 @@ from drivers.mcap_reader import LogReader
 from omnid.config import Config
 from omnid.engine.graph import Graph
 from omnid.messages import Odometry
-from omnid.outputs.files import MapFile, TrajectoryFile
 from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
+from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.pair import PairSync
 

@@ -8,8 +8,8 @@ from typing import TypeAlias
 
 from drivers.mcap_writer import LogWriter
 from omnid.messages import Odometry
-from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports, status_report
 from omnid.outputs.tally import Tally
+from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports, status_report
 from omnid.transport.codec import Status
 
 Report: TypeAlias = Callable[[Tally], list[Status]]

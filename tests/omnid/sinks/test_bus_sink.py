@@ -18,8 +18,8 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import Wrapped
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.bus import BusSink, PanoramaSink
-from omnid.outputs.encoded import Clouds, Encoder
+from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
 from omnid.transport.features_note import MOST, features_bytes, features_from_bytes

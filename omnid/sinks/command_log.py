@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.errors import OmnidError
-from omnid.outputs.encoded import Encoded
-from omnid.outputs.frame_recorder import FrameRecorder
+from omnid.sinks.encoder import Encoded
+from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import message_from_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD
 from omnid.transport.topics import EMPTY_SCHEMA, HEARD

@@ -11,7 +11,7 @@ from drivers.frame import Frame
 from drivers.rotating_log import RecordingState, RotatingLog
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.encoded import Encoded, Encoder, Outgoing, StateReports
+from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports
 from omnid.transport.codec import ERROR, OK, Status
 from omnid.transport.image_codec import image_cdr, image_topic
 

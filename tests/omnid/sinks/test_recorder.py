@@ -22,14 +22,14 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, Odometry
-from omnid.outputs.encoded import Clouds, Encoder, status_report
-from omnid.outputs.frame_recorder import FrameRecorder
 from omnid.recording import open_recorder, record
+from omnid.sinks.encoder import Clouds, Encoder, status_report
+from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import ERROR, OK, Status
 from omnid.transport.image_codec import image_cdr, image_topic
 from tests.drivers.mcap_logs import STORE, jpeg
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9
 OFFSET_NS = START_NS - 5 * 10**9  # the machine has been up for five seconds
 WIDTH, HEIGHT = 6, 4

@@ -8,7 +8,7 @@ import cv2
 
 from drivers.frame import Frame
 from omnid.messages import Odometry
-from omnid.outputs.encoded import Encoder, Outgoing, StateReports
+from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
 from omnid.transport.features_note import features_bytes
 from omnid.transport.image_codec import image_cdr

@@ -12,8 +12,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from omnid.config import Config
-from omnid.outputs.heard_commands import command_as_logged, keeper_of_commands
 from omnid.recording import open_recorder
+from omnid.sinks.command_log import command_as_logged, keeper_of_commands
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD
 
