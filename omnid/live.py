@@ -18,6 +18,10 @@ from omnid.config import Config
 from omnid.controller.controller import HelmSettings
 from omnid.controller.link import HelmLink
 from omnid.controller.messages import Orders
+from omnid.diagnostics.latency import Latency
+from omnid.diagnostics.rig_monitor import RigWatch
+from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.status import StatusReport, StatusTick, Watched
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.logging_setup import WARNING
@@ -26,10 +30,6 @@ from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.outputs.latency import Latency
-from omnid.outputs.rig_watch import RigWatch
-from omnid.outputs.status import StatusReport, StatusTick, Watched
-from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
 from omnid.recording import open_recorder
 from omnid.service import Service, show_stacks_at_the_end

@@ -19,17 +19,17 @@ from drivers.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.motor import MotorTick, open_motor
+from omnid.diagnostics.input_warnings import doubts, found_nothing
+from omnid.diagnostics.progress import Progress
+from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_summary import QUIET_BOXES, counters, summary
+from omnid.diagnostics.status import stage_status
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import Pace
 from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.log_rig import attached_rig
-from omnid.outputs.progress import Progress
-from omnid.outputs.status import stage_status
-from omnid.outputs.summary import QUIET_BOXES, counters, summary
-from omnid.outputs.tally import Tally
-from omnid.outputs.verdict import doubts, found_nothing
 from omnid.pipeline import Ends, Watched, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink

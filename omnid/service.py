@@ -15,9 +15,9 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Final
 
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.logging_setup import ERROR, NOTICE, say
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.outputs.tally import Tally
 
 STATUS_PERIOD_S: Final = 1.0
 _FEEDS_A_PERIOD: Final = 3

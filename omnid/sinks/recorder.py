@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from drivers.mcap_writer import LogWriter
+from omnid.diagnostics.run_statistics import Tally
 from omnid.messages import Odometry
-from omnid.outputs.tally import Tally
 from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports, status_report
 from omnid.transport.codec import Status
 

@@ -14,9 +14,9 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import Config
+from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_summary import counters, summary
 from omnid.engine.graph import Graph
-from omnid.outputs.summary import counters, summary
-from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims

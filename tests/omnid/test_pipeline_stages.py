@@ -17,11 +17,11 @@ from drivers.frame import Camera, Frame
 from drivers.mcap_reader import LogReader
 from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import Pace
 from omnid.formats.tum import read_tum
 from omnid.messages import Depth, FramePair, MapUpdate, Odometry, Panoramas
-from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry

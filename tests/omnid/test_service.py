@@ -16,9 +16,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.outputs.tally import Tally
 from omnid.service import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
 
 ROOT = Path(__file__).parents[2]

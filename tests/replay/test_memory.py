@@ -15,9 +15,9 @@ from calib.rig_file import parse_rig
 from drivers.frame import Frame
 from drivers.mcap_reader import LogReader
 from omnid.config import Config
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import Graph
 from omnid.messages import Odometry
-from omnid.outputs.tally import Tally
 from omnid.pipeline import Ends, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims

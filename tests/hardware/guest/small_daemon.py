@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 
 from omnid.config import RealtimeConfig
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.logging_setup import WARNING, say
 from omnid.engine.realtime import ThreadStart, prepare, priorities
-from omnid.outputs.tally import Tally
 from omnid.service import Service, Status, show_stacks_at_the_end
 from omnid.transport.bus import Bus, BusConfig
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from omnid.config import PairConfig
-from omnid.outputs.tally import Tally
+from omnid.diagnostics.run_statistics import Tally
 from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 

@@ -14,10 +14,10 @@ from calib.rig_file import read_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
+from omnid.diagnostics.rig_monitor import MIN_PLACES, PAIRS, RigWatch
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
-from omnid.outputs.rig_watch import MIN_PLACES, PAIRS, RigWatch
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
 from omnid.stages.pair import PairSync

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.telemetry import SummaryRow
-from omnid.outputs.tally import Tally
 
 QUIET_BOXES = ("progress", "tally")
 

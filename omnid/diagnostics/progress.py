@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TextIO
 
-from omnid.outputs.tally import Tally
+from omnid.diagnostics.run_statistics import Tally
 
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0

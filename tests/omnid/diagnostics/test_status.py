@@ -20,11 +20,11 @@ from omnid.controller.controller import Arrived, Helm, HelmSettings
 from omnid.controller.link import heading_of
 from omnid.controller.statistics import Logbook
 from omnid.core.control.heading_controller import Setpoint
+from omnid.diagnostics.latency import Latency
+from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.status import SILENT_S, StatusReport, StatusTick, Watched
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import Odometry
-from omnid.outputs.latency import Latency
-from omnid.outputs.status import SILENT_S, StatusReport, StatusTick, Watched
-from omnid.outputs.tally import Tally
 from omnid.stages.live_pair import LivePair
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
 from omnid.transport.commands import Commands

@@ -1,0 +1,1 @@
+"""The state of a run: status entries, statistics, warnings, progress."""
