@@ -16,8 +16,8 @@ from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
 from omnid.config import Config
 from omnid.core.rig.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.errors import OmnidError
-from omnid.log_rig import attached_rig
 from omnid.messages import FramePair
+from omnid.runs.log_rig import attached_rig
 from omnid.sinks.files import check_outputs
 
 REFINEMENTS = 3

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import Config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
-    from omnid.replay import Options, Replay
+    from omnid.runs.replay import Options, Replay
     from omnid.settings import load
 
     _make(args.output)

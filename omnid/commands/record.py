@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from drivers.frame import Camera
     from drivers.v4l2_camera import V4l2Camera
     from omnid.config import Config
-    from omnid.recording import record
+    from omnid.runs.record import record
     from omnid.settings import load
 
     named = {"record.folder": args.folder, "cameras.rig": args.rig}

@@ -46,7 +46,7 @@ def _add_manner(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replays the log."""
     from omnid.config import Config
-    from omnid.replay import Options, Replay
+    from omnid.runs.replay import Options, Replay
     from omnid.settings import load
 
     options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,

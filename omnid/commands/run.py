@@ -13,7 +13,7 @@ from omnid.commands.config import add_settings
 if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
     from calib.rig import Rig
     from omnid.config import Config
-    from omnid.live import Opener
+    from omnid.runs.live import Opener
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     share_heap()  # before anything else: the next line loads numpy, which starts threads
     from omnid.config import Config
     from omnid.engine.logging_setup import say
-    from omnid.live import Live
+    from omnid.runs.live import Live
     from omnid.settings import load
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
@@ -73,7 +73,7 @@ def _recorded(args: argparse.Namespace) -> Opener:
 
 def _rig_of(log: Path) -> Rig:
     from drivers.mcap_reader import LogReader
-    from omnid.log_rig import attached_rig
+    from omnid.runs.log_rig import attached_rig
 
     with closing(LogReader(log)) as reader:
         return attached_rig(reader, log)

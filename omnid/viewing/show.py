@@ -12,7 +12,7 @@ from typing import Final
 from drivers.mcap_survey import Survey, survey
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.replay import Options, Replay, Topics
+from omnid.runs.replay import Options, Replay, Topics
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.viewing.board import Board

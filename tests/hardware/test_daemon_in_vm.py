@@ -24,7 +24,7 @@ from drivers.log_camera import Pictures
 from drivers.mcap_reader import LogReader
 from drivers.simulated_line import SimulatedLine
 from drivers.simulated_motor import LONGEST_ABSENCE_S
-from omnid.log_rig import attached_rig
+from omnid.runs.log_rig import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.hardware.guest_report import names_in, passed, run_tests
 from tests.hardware.image import ROOT

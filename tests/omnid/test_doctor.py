@@ -289,7 +289,7 @@ def test_room_for_recordings() -> None:
 def test_a_folder_that_the_service_may_not_write_to(tmp_path: Path) -> None:
     *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
     assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.mend
-    unit = (ROOT / "systemd" / "omnid.service").read_text()
+    unit = (ROOT / "systemd" / "omnid.runs.systemd").read_text()
     assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
 
 

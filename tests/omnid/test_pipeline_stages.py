@@ -22,7 +22,7 @@ from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import Pace
 from omnid.formats.tum import read_tum
 from omnid.messages import Depth, FramePair, MapUpdate, Odometry, Panoramas
-from omnid.pipeline import Ends, wire
+from omnid.runs.pipeline import Ends, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.guidance import Guidance

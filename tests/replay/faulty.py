@@ -23,7 +23,7 @@ from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame, gray
 from drivers.log_camera import LogCamera, Pictures
 from omnid.config import Config
-from omnid.live import Live
+from omnid.runs.live import Live
 from omnid.settings import load
 
 TIME, TIME_NS = time.time, time.time_ns

@@ -27,7 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 from drivers.log_camera import LogCamera, Pictures
 from omnid.config import Config
-from omnid.recording import record
+from omnid.runs.record import record
 
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()

@@ -18,7 +18,7 @@ from omnid.config import Config
 from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import Graph
 from omnid.messages import Odometry
-from omnid.pipeline import Ends, wire
+from omnid.runs.pipeline import Ends, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.pair import PairSync

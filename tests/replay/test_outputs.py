@@ -17,7 +17,7 @@ from omnid.config import Config
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.replay import Options, Replay
+from omnid.runs.replay import Options, Replay
 from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import map_from, report_from

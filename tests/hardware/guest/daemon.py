@@ -121,7 +121,7 @@ def unit() -> Iterator[None]:
         path.write_text(text)
     Path("/opt/omnid/bin/omnid").chmod(0o755)
     shutil.copy("/mnt/job/rig.toml", "/etc/omnid")
-    shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
+    shutil.copy(SYSTEMD / "omnid.runs.systemd", DROP_INS.parent)
     run("udevadm", "control", "--reload")
     run("udevadm", "trigger", "--settle", "--subsystem-match=video4linux", "--subsystem-match=tty")
     run("systemctl", "daemon-reload")

@@ -49,7 +49,7 @@ def unit() -> Iterator[None]:
     run("chmod", "-R", "a+rX", "/opt/omnid")
     Path("/etc/omnid").mkdir()
     run("chmod", "a+rwX", *OPEN)
-    shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
+    shutil.copy(SYSTEMD / "omnid.runs.systemd", DROP_INS.parent)
     DROP_INS.mkdir()
     (DROP_INS / "daemon.conf").write_text(DAEMON)
     run("systemctl", "daemon-reload")
@@ -99,7 +99,7 @@ def test_a_hung_stage_is_told_of_and_the_daemon_restarted() -> None:
     lines = said()
     assert any(priority == 3 and text.startswith("stage 'picture' is hung") for priority, text in lines)
     assert any("in where_it_hangs" in text for _, text in lines)
-    assert any(text == "omnid.service: Failed with result 'watchdog'." for _, text in lines)
+    assert any(text == "omnid.runs.systemd: Failed with result 'watchdog'." for _, text in lines)
 
 
 def test_a_daemon_that_is_killed_comes_back() -> None:

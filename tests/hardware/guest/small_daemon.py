@@ -22,7 +22,7 @@ from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.logging_setup import WARNING, say
 from omnid.engine.realtime import ThreadStart, prepare, priorities
-from omnid.service import Service, Status, show_stacks_at_the_end
+from omnid.runs.systemd import Service, Status, show_stacks_at_the_end
 from omnid.transport.bus import Bus, BusConfig
 
 HANG = Path("/run/omnid/hang")

@@ -18,11 +18,11 @@ from drivers.mcap_reader import LogReader
 from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
-from omnid.log_rig import attached_rig
 from omnid.recordings.evaluation import evaluate
 from omnid.report.against_truth import compare
 from omnid.report.recording import Recording, read_recording
 from omnid.report.report import report_html
+from omnid.runs.log_rig import attached_rig
 from omnid.transport.codec import Status
 from tests.omnid.report.recordings import (
     T_odom_base,

@@ -12,7 +12,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from omnid.config import Config
-from omnid.recording import open_recorder
+from omnid.runs.record import open_recorder
 from omnid.sinks.command_log import command_as_logged, keeper_of_commands
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD

@@ -22,7 +22,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, Odometry
-from omnid.recording import open_recorder, record
+from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Clouds, Encoder, status_report
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import ERROR, OK, Status

@@ -9,7 +9,7 @@ import pytest
 
 from omnid.config import Config
 from omnid.messages import Odometry
-from omnid.replay import Options, Replay
+from omnid.runs.replay import Options, Replay
 from tests.conftest import PAIRS
 
 

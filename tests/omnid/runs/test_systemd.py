@@ -19,9 +19,9 @@ import pytest
 from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.service import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
+from omnid.runs.systemd import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 LONG_S = 20.0  # a wait that only a broken service exhausts
 
 
@@ -271,7 +271,7 @@ def test_where_stderr_is_no_file_there_is_nothing_to_show(capsys: pytest.Capture
 
 @pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGXCPU], ids=lambda number: number.name)
 def test_who_is_killed_for_being_stuck_shows_where_it_was(number: signal.Signals) -> None:
-    stuck = ("import os, signal, time; from omnid.service import show_stacks_at_the_end\n"
+    stuck = ("import os, signal, time; from omnid.runs.systemd import show_stacks_at_the_end\n"
              f"def where_it_hangs():\n  os.kill(os.getpid(), {number.value}); time.sleep(20)\n"
              "show_stacks_at_the_end()\nwhere_it_hangs()")
     done = subprocess.run([sys.executable, "-c", stuck], cwd=ROOT, capture_output=True, text=True)

@@ -29,8 +29,8 @@ from omnid.engine.playback_clock import Pace
 from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.log_rig import attached_rig
-from omnid.pipeline import Ends, Watched, wire
+from omnid.runs.log_rig import attached_rig
+from omnid.runs.pipeline import Ends, Watched, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Encoder, Outgoing, clouds_of

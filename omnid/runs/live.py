@@ -30,10 +30,10 @@ from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
-from omnid.pipeline import Ends, wire
-from omnid.recording import open_recorder
-from omnid.service import Service, show_stacks_at_the_end
-from omnid.service import Status as StatusLine
+from omnid.runs.pipeline import Ends, wire
+from omnid.runs.record import open_recorder
+from omnid.runs.systemd import Service, show_stacks_at_the_end
+from omnid.runs.systemd import Status as StatusLine
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import keeper_of_commands

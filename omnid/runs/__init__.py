@@ -1,0 +1,1 @@
+"""Runs from the opening of their inputs to their result: live, replay, record."""
