@@ -21,7 +21,7 @@ from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
-from omnid.stages.pair import Decoder
+from omnid.stages.log_pairing import Decoder
 
 PAIRS = 24
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from omnid.config import PairConfig
 from omnid.diagnostics.run_statistics import Tally
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 from omnid.stages.stereo import Stereo
 
 

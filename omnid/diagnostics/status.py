@@ -13,7 +13,7 @@ from omnid.controller.statistics import Logbook
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
 from omnid.diagnostics.run_statistics import Tally
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
-from omnid.stages.live_pair import LivePair
+from omnid.stages.live_pairing import LivePair
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status
 from omnid.transport.commands import Commands
 

@@ -40,7 +40,7 @@ from omnid.sinks.command_log import keeper_of_commands
 from omnid.sinks.encoder import Encoder, clouds_of, status_report
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
-from omnid.stages.live_pair import LivePair
+from omnid.stages.live_pairing import LivePair
 from omnid.transport.bus import Bus
 from omnid.transport.codec import Status, compile_serialisers
 from omnid.transport.commands import Commands

@@ -37,7 +37,7 @@ from omnid.sinks.encoder import Encoder, Outgoing, clouds_of
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 from omnid.transport.bus import Bus
 from omnid.transport.codec import OK, Status
 

@@ -17,7 +17,7 @@ from calib.rim import find_rim
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.stages.pair import Decoder
+from omnid.stages.log_pairing import Decoder
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from omnid.engine.graph import Graph
 from omnid.runs.pipeline import Ends, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 from tests.replay.test_memory import to_and_fro
 
 TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"

@@ -17,7 +17,7 @@ from omnid.config import Config
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 from tests.experiments.scenes import RigOptions, build
 from tests.scenes.recipes import Run
 

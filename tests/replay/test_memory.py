@@ -21,7 +21,7 @@ from omnid.messages import Odometry
 from omnid.runs.pipeline import Ends, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 
 PAIRS = 2000
 PERIOD_NS = 100_000_000

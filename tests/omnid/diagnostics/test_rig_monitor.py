@@ -20,7 +20,7 @@ from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
-from omnid.stages.pair import PairSync
+from omnid.stages.log_pairing import PairSync
 from tests.scenes import build, write_log
 from tests.scenes.logs import PERIOD_NS
 from tests.scenes.rigs import misturned

@@ -25,7 +25,7 @@ from omnid.diagnostics.run_statistics import Tally
 from omnid.diagnostics.status import SILENT_S, StatusReport, StatusTick, Watched
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import Odometry
-from omnid.stages.live_pair import LivePair
+from omnid.stages.live_pairing import LivePair
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
 from omnid.transport.commands import Commands
 from tests.scenes import build

@@ -26,10 +26,10 @@ from omnid.runs.pipeline import Ends, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.guidance import Guidance
+from omnid.stages.log_pairing import PairSync
 from omnid.stages.mapping import Mapping
 from omnid.stages.mapping import Path as Way
 from omnid.stages.odometry import in_axes, of_base
-from omnid.stages.pair import PairSync
 from omnid.stages.stereo import Stereo
 from tests.conftest import PAIRS
 from tests.omnid.allocations import taken

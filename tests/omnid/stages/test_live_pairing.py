@@ -14,7 +14,7 @@ from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from omnid.config import PairConfig
 from omnid.messages import FramePair
-from omnid.stages.live_pair import WAITING, LivePair
+from omnid.stages.live_pairing import WAITING, LivePair
 from tests.scenes import build
 
 MS = 1_000_000

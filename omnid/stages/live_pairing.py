@@ -9,7 +9,7 @@ from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from omnid.config import PairConfig
 from omnid.messages import FramePair
-from omnid.stages.pair import Decoder, Image
+from omnid.stages.log_pairing import Decoder, Image
 
 WAITING = 4  # frames of a camera that may wait for their partner
 FORGETS = 0.02  # share of a new skew in the slow mean: some fifty pairs
