@@ -26,7 +26,7 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.decode import Cloud, Map, Pose, Report, cloud_from, map_from, pose_from, report_from
-from omnid.transport.note import Note
+from omnid.transport.pose_attachment import Note
 from omnid.transport.session import Unreachable, open_session
 
 __all__ = ["HERE", "Cloud", "Driver", "Map", "Note", "Pose", "Report", "Robot", "Subscription", "Unreachable",

@@ -10,9 +10,9 @@ from drivers.frame import Frame
 from omnid.messages import Odometry
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
-from omnid.transport.features_note import features_bytes
+from omnid.transport.features_attachment import features_bytes
 from omnid.transport.image_codec import image_cdr
-from omnid.transport.note import Note, note_bytes
+from omnid.transport.pose_attachment import Note, note_bytes
 
 
 class BusSink:

@@ -16,7 +16,7 @@ from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import NS_PER_S, Status
-from omnid.transport.note import Note, note_from_bytes
+from omnid.transport.pose_attachment import Note, note_from_bytes
 
 ALIGNED = 0.999_999  # w of a quaternion that hardly turns
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
 from omnid.transport.decode import Cloud, Pose
-from omnid.transport.note import Note
+from omnid.transport.pose_attachment import Note
 from omnid.viewing.board import Board
 from omnid.viewing.looks import depth_picture
 from omnid.viewing.pictures import jpeg

@@ -16,7 +16,7 @@ from omnid.errors import OmnidError
 from omnid.listening.heard import Letter, Mailbox
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import cloud_from, pose_from, report_from
-from omnid.transport.features_note import features_from_bytes
+from omnid.transport.features_attachment import features_from_bytes
 from omnid.viewing import reports
 from omnid.viewing.board import Board
 from omnid.viewing.places import Place

@@ -27,7 +27,7 @@ from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
-from tests.omnid.buses import ROUTER, free_endpoint, script, wait_until
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wait_until
 
 pytestmark = pytest.mark.benchmark
 RATE_HZ = 30.0

@@ -23,8 +23,8 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
 from omnid.transport.decode import cloud_from, map_from, pose_from, report_from
-from omnid.transport.note import Note, note_bytes, note_from_bytes
-from tests.omnid.buses import free_endpoint, odometry, script, wait_until
+from omnid.transport.pose_attachment import Note, note_bytes, note_from_bytes
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
 
 
 @contextlib.contextmanager

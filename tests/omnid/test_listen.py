@@ -23,8 +23,8 @@ from omnid.listening.screen import Screen, line, table
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
-from omnid.transport.note import Note, note_bytes
-from tests.omnid.buses import DEADLINE_S, free_endpoint
+from omnid.transport.pose_attachment import Note, note_bytes
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
 
 

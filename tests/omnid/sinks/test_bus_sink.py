@@ -22,8 +22,8 @@ from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import pose_from
-from omnid.transport.features_note import MOST, features_bytes, features_from_bytes
-from tests.omnid.buses import free_endpoint, wait_until
+from omnid.transport.features_attachment import MOST, features_bytes, features_from_bytes
+from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 
 OFFSET_NS = 10**18
 PICTURE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)

@@ -25,10 +25,10 @@ from drivers.frame import Frame
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
-from omnid.transport.features_note import features_bytes
+from omnid.transport.features_attachment import features_bytes
 from omnid.transport.image_codec import image_cdr
-from omnid.transport.note import Note, note_bytes
-from tests.omnid.buses import DEADLINE_S, free_endpoint
+from omnid.transport.pose_attachment import Note, note_bytes
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.omnid.viewing.rrd import need_rerun, positions, rows, verified
 from tests.omnid.viewing.test_view import START_NS, made
 

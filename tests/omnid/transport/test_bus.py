@@ -20,9 +20,9 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK, WARN
-from omnid.transport.note import Note, note_bytes
-from tests.omnid.buses import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
-from tests.omnid.buses import SUBSCRIBER as LISTENER
+from omnid.transport.pose_attachment import Note, note_bytes
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
+from tests.omnid.transport.bus_fixtures import SUBSCRIBER as LISTENER
 
 SUBSCRIBER = """
 import json, sys, zenoh

@@ -15,7 +15,7 @@ import zenoh
 
 from omnid.client import Robot, Unreachable
 from omnid.transport.bus import Bus, BusConfig
-from tests.omnid.buses import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 

@@ -20,7 +20,7 @@ from omnid.client import Pose, Robot
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
-from tests.omnid.buses import ROUTER, free_endpoint, odometry, script, wait_until
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
 ODOMETRY_KEY = ("0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
                 "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0")
