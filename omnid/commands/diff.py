@@ -31,7 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Prints what there is to say; 0 where the runs agree, 1 where they part."""
     from omnid.engine.logging_setup import WARNING, tell
-    from omnid.listening.heard import plain
+    from omnid.monitor.robot_state import plain
     from omnid.recordings.comparison import Comparison, Tolerance
     from omnid.recordings.run_reader import read_run
 

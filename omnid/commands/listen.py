@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
 
     from omnid.config import Config
     from omnid.errors import OmnidError
-    from omnid.listening.follow import listen
+    from omnid.monitor.follow import listen
     from omnid.settings import load
 
     if args.seconds is not None and not 0 < args.seconds < 1e9:

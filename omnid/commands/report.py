@@ -23,8 +23,8 @@ def run(args: argparse.Namespace) -> int:
     """Writes the page."""
     from calib.rig_file import write_file
     from omnid.formats.tum import read_tum
-    from omnid.report.recording import read_recording
     from omnid.report.report import report_html
+    from omnid.report.report_data import read_recording
     from omnid.sinks.files import check_outputs, on_stdout
 
     inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])

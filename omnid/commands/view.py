@@ -10,7 +10,7 @@ from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # whoever asks for another command loads none of this
     from omnid.config import Config
-    from omnid.viewing.places import Place
+    from omnid.viewer.targets import Place
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
     _refuse_contradictions(args)
     _require_rerun()
-    from omnid.viewing.show import check_file, place_for
+    from omnid.viewer.view import check_file, place_for
 
     config = load(Config, args.config, args.overrides)
     check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _log(args: argparse.Namespace, config: Config, place: Place) -> int:
-    from omnid.viewing.show import Log, show_log
+    from omnid.viewer.view import Log, show_log
 
     log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.quiet)
     return show_log(log, config, args.config, place)
@@ -72,7 +72,7 @@ def _log(args: argparse.Namespace, config: Config, place: Place) -> int:
 def _robot(args: argparse.Namespace, config: Config, place: Place) -> int:
     from dataclasses import replace
 
-    from omnid.viewing.show import show_robot
+    from omnid.viewer.view import show_robot
 
     bus = replace(config.bus, robot=args.robot or config.bus.robot, connect=tuple(args.connect or config.bus.connect))
     return show_robot(bus, args.seconds, place)

@@ -8,6 +8,7 @@ from html import escape
 from itertools import cycle, pairwise
 from typing import Final, NamedTuple, TypeAlias
 
+from omnid.report.downsampling import Thinned
 from omnid.report.svg import (
     STYLES,
     Axis,
@@ -22,7 +23,6 @@ from omnid.report.svg import (
     rectangles,
     text,
 )
-from omnid.report.thinned import Thinned
 
 WIDTH: Final = 520
 HEIGHT: Final = 190

@@ -8,7 +8,7 @@ from typing import Final
 
 from omnid.report.chart import Clock, Line, chart, line
 from omnid.report.page import facts, grid, note, table
-from omnid.report.recording import Recording
+from omnid.report.report_data import Recording
 from omnid.report.statuses import ODOMETRY, STAGE, SUMMARY, StatusCourse, short
 
 _FLOW: Final = ("pair", "dewarp", "stereo", "odometry", "mapping", "record")  # whose times are drawn

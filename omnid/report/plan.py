@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.report.chart import Clock
+from omnid.report.downsampling import Corner
 from omnid.report.svg import Point, key, label, mark_key, number, path_d, polyline, round_step, text
-from omnid.report.thinned import Corner
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
+from omnid.report.downsampling import Corner, PathTrace, Thinned
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
-from omnid.report.thinned import Corner, PathTrace, Thinned
 from omnid.transport.codec import OdometryRecord
 
 STATES: Final = ("tracking", "degraded", "lost")

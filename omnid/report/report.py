@@ -14,14 +14,14 @@ from omnid import __version__
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory
 from omnid.report import chart, health, plan, sections, setup, svg
-from omnid.report.against_truth import Comparison, compare
 from omnid.report.chart import Clock
+from omnid.report.downsampling import Corner
 from omnid.report.page import figure, note, page
-from omnid.report.pictures import Wanted, panoramas
+from omnid.report.panorama_images import Wanted, panoramas
 from omnid.report.poses import MOST_KEPT
-from omnid.report.recording import Recording
-from omnid.report.thinned import Corner
+from omnid.report.report_data import Recording
 from omnid.report.timeline import timeline
+from omnid.report.truth_comparison import Comparison, compare
 
 _MOST_CROSSES: Final = 40
 _BEFORE_S: Final = 30.0  # that are shown of the time before the first pose, where something happened

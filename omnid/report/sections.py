@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from html import escape
 from typing import Final
 
-from omnid.report.against_truth import Comparison
 from omnid.report.chart import Clock, Line, chart, line
+from omnid.report.downsampling import Thinned
 from omnid.report.events import Event, Events
 from omnid.report.health import number
 from omnid.report.page import facts, grid, note, table
 from omnid.report.poses import STATES
-from omnid.report.recording import Recording
+from omnid.report.report_data import Recording
 from omnid.report.statuses import ODOMETRY
 from omnid.report.svg import label
-from omnid.report.thinned import Thinned
+from omnid.report.truth_comparison import Comparison
 
 _LEVELS: Final = ("", "warning", "error")
 

@@ -14,7 +14,7 @@ from calib.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
 from omnid.report.page import facts, note, table
-from omnid.report.recording import Recording
+from omnid.report.report_data import Recording
 from omnid.settings import dump
 
 _LARGEST: Final = 1 << 18  # bytes of settings

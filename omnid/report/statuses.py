@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Final
 
+from omnid.report.downsampling import Thinned
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.report.poses import STATES, UNKNOWN
-from omnid.report.thinned import Thinned
 from omnid.transport.codec import Status
 from omnid.transport.decode import Report
 

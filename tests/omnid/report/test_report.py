@@ -19,12 +19,12 @@ from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import evaluate
-from omnid.report.against_truth import compare
-from omnid.report.recording import Recording, read_recording
 from omnid.report.report import report_html
+from omnid.report.report_data import Recording, read_recording
+from omnid.report.truth_comparison import compare
 from omnid.runs.log_rig import attached_rig
 from omnid.transport.codec import Status
-from tests.omnid.report.recordings import (
+from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
     cloud,

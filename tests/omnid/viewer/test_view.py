@@ -17,7 +17,7 @@ from omnid.transport import codec
 from omnid.transport.codec import Status
 from omnid.transport.image_codec import image_cdr
 from tests.conftest import PAIRS
-from tests.omnid.viewing.rrd import entities, need_rerun, positions, rows, verified
+from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified
 from tests.replay.command import Command
 
 START_NS = 10**18

@@ -13,13 +13,13 @@ from omnid.client import Cloud, Pose, Report, Robot
 from omnid.core.odometry.stereo_frame import Features
 from omnid.engine.signals import ended_by_signals
 from omnid.errors import OmnidError
-from omnid.listening.heard import Letter, Mailbox
+from omnid.monitor.robot_state import Letter, Mailbox
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import cloud_from, pose_from, report_from
 from omnid.transport.features_attachment import features_from_bytes
-from omnid.viewing import reports
-from omnid.viewing.board import Board
-from omnid.viewing.places import Place
+from omnid.viewer import status_plots as reports
+from omnid.viewer.rerun_scene import Board
+from omnid.viewer.targets import Place
 
 T = TypeVar("T")
 PATIENCE_S: Final = 2.0

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from omnid.report.thinned import BINS, Corner, PathTrace, Thinned
+from omnid.report.downsampling import BINS, Corner, PathTrace, Thinned
 
 
 def test_few_values_stay_as_they_are() -> None:

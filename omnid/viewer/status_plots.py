@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterator
 from typing import Final, Protocol
 
-from omnid.listening.heard import plain
+from omnid.monitor.robot_state import plain
 from omnid.transport.codec import Status
 from omnid.transport.decode import Report
-from omnid.viewing.looks import STATES
+from omnid.viewer.style import STATES
 
 STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")
 ODOMETRY: Final = "omnid: odometry"

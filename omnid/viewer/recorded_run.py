@@ -16,9 +16,9 @@ from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA
 from omnid.transport.decode import Pose, Report, cloud_from, pose_from, report_from
-from omnid.viewing import reports
-from omnid.viewing.board import Board
-from omnid.viewing.pictures import compressed
+from omnid.viewer import status_plots as reports
+from omnid.viewer.image_encoding import compressed
+from omnid.viewer.rerun_scene import Board
 
 PICTURES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # whichever comes first
 _LISTED: Final = 8

@@ -9,7 +9,7 @@ from typing import IO, Final
 
 import numpy as np
 
-from omnid.listening.heard import Heard, plain
+from omnid.monitor.robot_state import Heard, plain
 from omnid.transport.decode import Pose
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")

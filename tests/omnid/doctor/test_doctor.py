@@ -30,7 +30,7 @@ from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
 from omnid.doctor.wiring import bus, motor, rig
 from omnid.transport.bus_config import BusConfig
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 NOBODY = 65534
 FORMATS = (Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0,)),
            Mode("MJPG", Sizes(1280, 1280), Sizes(960, 960), (30.0, 15.0)))

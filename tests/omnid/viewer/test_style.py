@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.viewing import looks
-from omnid.viewing.thinning import Thinning
+from omnid.viewer import style as looks
+from omnid.viewer.thinning import Thinning
 
 
 def test_an_ellipsoid_has_the_axes_of_the_covariance() -> None:

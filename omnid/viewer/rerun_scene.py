@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.stereo_frame import Features
 from omnid.transport.decode import Cloud, Pose
-from omnid.viewing import looks
-from omnid.viewing.layout import CLOCK
-from omnid.viewing.looks import Look
-from omnid.viewing.places import Place
-from omnid.viewing.thinning import Thinning
+from omnid.viewer import style as looks
+from omnid.viewer.layout import CLOCK
+from omnid.viewer.style import Look
+from omnid.viewer.targets import Place
+from omnid.viewer.thinning import Thinning
 
 Array = NDArray[np.float64]
 

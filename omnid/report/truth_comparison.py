@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import Metrics, evaluate
+from omnid.report.downsampling import Corner, PathTrace, Point, Thinned
 from omnid.report.poses import PoseCourse
-from omnid.report.thinned import Corner, PathTrace, Point, Thinned
 
 Array = NDArray[np.float64]
 TOLERANCE_S: Final = 0.01

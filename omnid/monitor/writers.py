@@ -8,7 +8,7 @@ from typing import IO
 from drivers.mcap_writer import LogWriter
 from omnid.client import Robot
 from omnid.formats.tum import tum_row
-from omnid.listening.heard import Letter
+from omnid.monitor.robot_state import Letter
 from omnid.transport.bus import ros_name
 from omnid.transport.decode import Pose
 from omnid.transport.topics import SAID

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omnid.transport.codec import Status
 from omnid.transport.decode import Report
-from omnid.viewing import reports
+from omnid.viewer import status_plots as reports
 
 
 def report(*statuses: Status) -> Report:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from omnid.client import Report, Robot
-from omnid.listening.heard import Heard, Mailbox
-from omnid.listening.keepers import LogKeeper, TumKeeper
-from omnid.listening.screen import Screen
+from omnid.monitor.robot_state import Heard, Mailbox
+from omnid.monitor.screen import Screen
+from omnid.monitor.writers import LogKeeper, TumKeeper
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import Unreachable

@@ -23,10 +23,10 @@ from drivers.mcap_records import LogFile, RecordError
 from drivers.mcap_survey import Survey, survey
 from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
+from omnid.report.downsampling import Thinned
 from omnid.report.events import Events
 from omnid.report.poses import PoseCourse
 from omnid.report.statuses import StatusCourse
-from omnid.report.thinned import Thinned
 from omnid.transport.codec import (
     DIAGNOSTICS_SCHEMA,
     ODOMETRY_SCHEMA,

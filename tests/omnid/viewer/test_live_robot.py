@@ -29,8 +29,8 @@ from omnid.transport.features_attachment import features_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import Note, note_bytes
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
-from tests.omnid.viewing.rrd import need_rerun, positions, rows, verified
-from tests.omnid.viewing.test_view import START_NS, made
+from tests.omnid.viewer.rrd import need_rerun, positions, rows, verified
+from tests.omnid.viewer.test_view import START_NS, made
 
 
 @contextlib.contextmanager

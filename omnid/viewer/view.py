@@ -15,12 +15,12 @@ from omnid.errors import OmnidError
 from omnid.runs.replay import Options, Replay, Topics
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
-from omnid.viewing.board import Board
-from omnid.viewing.computed import MAP_EVERY_S, Computed
-from omnid.viewing.layout import layout
-from omnid.viewing.live import Live
-from omnid.viewing.places import ClosedError, Place, RrdFile, Viewer
-from omnid.viewing.recorded import Recorded, poses_topic
+from omnid.viewer.layout import layout
+from omnid.viewer.live_robot import Live
+from omnid.viewer.recorded_run import Recorded, poses_topic
+from omnid.viewer.replayed_run import MAP_EVERY_S, Computed
+from omnid.viewer.rerun_scene import Board
+from omnid.viewer.targets import ClosedError, Place, RrdFile, Viewer
 
 PANORAMA: Final = "Panorama"
 

@@ -15,10 +15,10 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
 from omnid.transport.decode import Cloud, Pose
 from omnid.transport.pose_attachment import Note
-from omnid.viewing.board import Board
-from omnid.viewing.looks import depth_picture
-from omnid.viewing.pictures import jpeg
-from omnid.viewing.reports import STAGES
+from omnid.viewer.image_encoding import jpeg
+from omnid.viewer.rerun_scene import Board
+from omnid.viewer.status_plots import STAGES
+from omnid.viewer.style import depth_picture
 
 MAP_EVERY_S: Final = 2.0
 

@@ -18,8 +18,8 @@ from rosbags.highlevel import AnyReader
 
 from calib import se3
 from omnid.formats.tum import read_tum
-from omnid.listening.heard import Heard, Letter, Mailbox
-from omnid.listening.screen import Screen, line, table
+from omnid.monitor.robot_state import Heard, Letter, Mailbox
+from omnid.monitor.screen import Screen, line, table
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import Status
