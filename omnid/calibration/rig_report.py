@@ -12,8 +12,8 @@ from calib.errors import CalibError
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from calib.rig_fit import MOTION_NAMES, RigCalibration
-from omnid.calibration.drawings import ARROW, Image, residual_picture
-from omnid.calibration.pairs import SIDES, PairedPictures
+from omnid.calibration.figures import ARROW, Image, residual_picture
+from omnid.calibration.image_pairs import SIDES, PairedPictures
 from omnid.report.page import figure, page, table
 
 MAX_SHOWN_VIEWS = 20

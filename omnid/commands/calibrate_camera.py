@@ -18,9 +18,9 @@ from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
 from calib.ocam import VIEWS
 from calib.rig_file import write_file
 from calib.stack_mask import find_mask
-from omnid.calibration.boards import find_boards, spread
-from omnid.calibration.pictures import Pictures, read_pictures
-from omnid.calibration.report import report_html
+from omnid.calibration.board_search import find_boards, spread
+from omnid.calibration.camera_report import report_html
+from omnid.calibration.images import Pictures, read_pictures
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 

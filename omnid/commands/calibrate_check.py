@@ -11,8 +11,8 @@ from calib.rig import Rig
 from calib.rig_drift import corrected
 from calib.rig_file import read_rig, write_rig
 from calib.rim_check import RimShift
-from omnid.calibration.pairs import SIDES
-from omnid.calibration.rig_log import Looked, look, open_log, read_pairs_of
+from omnid.calibration.image_pairs import SIDES
+from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_of
 from omnid.config import Config
 from omnid.core.rig.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.errors import OmnidError

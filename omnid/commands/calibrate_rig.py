@@ -22,9 +22,9 @@ from calib.rig_frame import rig_between
 from calib.rim import find_rim
 from calib.stack_mask import find_mask
 from calib.unified import UnifiedCamera
-from omnid.calibration.boards import find_boards, spread
-from omnid.calibration.pairs import SIDES, PairedPictures, read_pairs
-from omnid.calibration.pictures import Pictures
+from omnid.calibration.board_search import find_boards, spread
+from omnid.calibration.image_pairs import SIDES, PairedPictures, read_pairs
+from omnid.calibration.images import Pictures
 from omnid.calibration.rig_report import rig_report_html
 from omnid.commands.calibrate_camera import corners
 from omnid.errors import OmnidError

@@ -22,8 +22,8 @@ from calib.fit import calibrate, sharpened
 from calib.rig import MountedCamera, Rig
 from calib.rig_fit import PairView, RigCalibration, calibrate_rig, sharpened_rig
 from calib.unified import UnifiedCamera
-from omnid.calibration.boards import find_boards
-from omnid.calibration.pairs import PairedPictures, read_pairs
+from omnid.calibration.board_search import find_boards
+from omnid.calibration.image_pairs import PairedPictures, read_pairs
 from tests.scenes.boards import Studio, around_both
 from tests.scenes.sensor import Sensor
 

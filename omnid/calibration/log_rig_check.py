@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.rim_check import RimShift, rim_shift
 from drivers.errors import DriverError
 from drivers.mcap_reader import LogReader
-from omnid.calibration.pairs import SIDES, paired
+from omnid.calibration.image_pairs import SIDES, paired
 from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_check import RigCheck, RigFinding
 from omnid.errors import OmnidError

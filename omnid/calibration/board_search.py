@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.board import Board, BoardView
 from calib.board_find import find_board
-from omnid.calibration.pictures import Pictures
+from omnid.calibration.images import Pictures
 from omnid.errors import OmnidError
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from calib.camera import Mask
 from calib.fit import Calibration
 from calib.ocam import OcamCamera
-from omnid.calibration.drawings import (
+from omnid.calibration.figures import (
     ARROW,
     Image,
     coverage_picture,
