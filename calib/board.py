@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
 
 MIN_SIDE, MAX_SIDE = 3, 60
 

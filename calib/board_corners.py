@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Array
+from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
 RING = 32

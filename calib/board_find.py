@@ -20,7 +20,7 @@ from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spa
 from calib.board_order import as_grid, in_order, largest_board, place
 from calib.board_refine import refine
 from calib.board_shape import is_printed, is_whole, unevenness
-from calib.camera import Array
+from calib.models.camera import Array
 
 Image = NDArray[np.uint8]
 MIN_SIDE_PX = 32

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.board_corners import Corners, Grey, look_at
 from calib.board_links import NOBODY, link
-from calib.camera import Array
+from calib.models.camera import Array
 
 Cell = tuple[int, int]
 Grid = dict[Cell, Array]  # pixel (2,) of the corner at (column, row); column to row turns clockwise in the picture

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board_corners import Corners, Grey, sample
-from calib.camera import Array
+from calib.models.camera import Array
 
 # Of so many nearest candidates an arm's neighbour is chosen.
 NEAREST = 28

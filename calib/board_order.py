@@ -9,7 +9,7 @@ import numpy as np
 from calib.board import Board
 from calib.board_corners import Grey, sample
 from calib.board_grid import Grid
-from calib.camera import Array
+from calib.models.camera import Array
 
 # A board may lack this part of its corners, if every one of its four borders shows so many of its own.
 MIN_FILLED = 0.9

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.board import Board
-from calib.camera import Array, OmniCamera
+from calib.models.camera import Array, OmniCamera
 
 MIN_CORNERS = 6
 

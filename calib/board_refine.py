@@ -16,7 +16,7 @@ from calib import se3
 from calib.board import Board
 from calib.board_corners import Grey, sample
 from calib.board_shape import local_mapping, terms
-from calib.camera import Array, OmniCamera
+from calib.models.camera import Array, OmniCamera
 
 ToPicture = Callable[[Array], Array]  # (..., 2) squares from a corner, along the board, to pixels
 

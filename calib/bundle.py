@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
 
 MAX_STEPS = 60
 # Rounds with the kernel's width measured anew.

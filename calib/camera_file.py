@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.camera import Mask, OmniCamera
 from calib.camera_table import camera_text, intrinsics_text, mask_text, read_camera_table, string_text
+from calib.models.camera import Mask, OmniCamera
 from calib.strict import read_bytes, require_schema, toml_table
 
 SCHEMA = 1

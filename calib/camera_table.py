@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Mask, OmniCamera
 from calib.errors import CalibError
-from calib.ocam import VIEWS, OcamCamera, View
+from calib.models.camera import Mask, OmniCamera
+from calib.models.ocam import VIEWS, OcamCamera, View
+from calib.models.unified import UnifiedCamera
 from calib.strict import Table, read_bytes
-from calib.unified import UnifiedCamera
 
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from calib.board import Board, BoardView
 from calib.board_refine import refine_with
 from calib.bundle import Adjusted, Observed
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
-from calib.ocam import OcamCamera, View
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import OcamCamera, View
 from calib.ocam_fit import DEGREE, fit_ocam, ocam_maker, ocam_values, raise_degree
 from calib.ocam_linear import solve_linear
 from calib.unified_fit import TERMS, fit_unified, unified_maker, unified_values

@@ -16,12 +16,12 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from calib import se3
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_frame import rig_between
 from calib.strict import Table, decode, read_bytes
-from calib.unified import UnifiedCamera
 
 # How far T_cam_imu and T_cn_cnm1 may disagree: more than rounding, less than any real difference of two rigs.
 MAX_DISAGREEMENT_M = 1e-3

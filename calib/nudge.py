@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 
 OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 

@@ -8,9 +8,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
-from calib.ocam import OcamCamera, View
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_frame import rig_between
 from calib.strict import decode, read_bytes, shown

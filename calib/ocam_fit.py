@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from calib.bundle import Adjusted, Observed, adjust
-from calib.camera import Array
 from calib.errors import CalibError
-from calib.ocam import OcamCamera, View
+from calib.models.camera import Array
+from calib.models.ocam import OcamCamera, View
 from calib.ocam_linear import powers, solve_linear
 
 DEGREE = 4

@@ -12,8 +12,8 @@ import numpy as np
 
 from calib import se3
 from calib.bundle import Observed
-from calib.camera import Array
-from calib.ocam import View
+from calib.models.camera import Array
+from calib.models.ocam import View
 
 # The centre is looked for on a grid this wide, in parts of the picture, that shrinks with every round.
 SEARCH_PART = 0.16

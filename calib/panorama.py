@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.camera import Array, inside_image
 from calib.errors import CalibError
+from calib.models.camera import Array, inside_image
 from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]

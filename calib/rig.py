@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib import se3
-from calib.camera import Array, Mask, OmniCamera, inscribed_mask
 from calib.errors import CalibError
+from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
 
 MIN_BASELINE_M = 1e-3
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 from calib.rig import Rig
 
 MIN_POINTS = 30

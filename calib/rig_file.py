@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
 from calib.camera_table import camera_text, intrinsics_text, mask_text, number_text, png, read_camera_table
 from calib.errors import CalibError
+from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
 from calib.strict import Table, read_bytes, require_schema, toml_table
 

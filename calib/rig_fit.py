@@ -12,9 +12,9 @@ from calib import se3
 from calib.board import Board, BoardView
 from calib.board_refine import refine_with
 from calib.bundle import Adjusted, Observed, adjust
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
 from calib.fit import Rejected, bad_views
+from calib.models.camera import Array, OmniCamera
 from calib.nudge import Nudge, nudge
 from calib.rig_start import Agreed, Seen, agree
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
+from calib.models.camera import Array, OmniCamera
 from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
 
 # Half the span, in pixels, over which the image's axis is measured: well inside any mirror or lens.

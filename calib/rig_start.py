@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.board import Board, BoardView
 from calib.board_pose import board_pose, pose_error_rad, turns
-from calib.camera import Array, OmniCamera
 from calib.errors import CalibError
+from calib.models.camera import Array, OmniCamera
 
 # A camera that is given must see every board as one to this; else the corners, or the camera, are wrong.
 MAX_POSE_ERROR_RAD = np.deg2rad(1.0)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Array, Mask
+from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720
 MIN_SIDE_PX = 64

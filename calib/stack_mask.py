@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Mask
 from calib.errors import CalibError
+from calib.models.camera import Mask
 from calib.rim import find_rim
 
 Image = NDArray[np.uint8]

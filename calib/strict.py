@@ -11,8 +11,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
 
 # Larger than any calibration with two embedded masks; what is larger is not one.
 MAX_FILE_BYTES = 16_000_000

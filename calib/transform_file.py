@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
 from calib.errors import CalibError
 from calib.kalibr import load_yaml
+from calib.models.camera import Array
 from calib.rig import MIN_BASELINE_M
 from calib.strict import Table, decode, read_bytes, toml_table
 

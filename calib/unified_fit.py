@@ -8,9 +8,9 @@ import numpy as np
 
 from calib import se3
 from calib.bundle import Adjusted, Observed, adjust
-from calib.camera import Array
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Array
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 
 # How many of the distortion's numbers may be solved for: none, k1 and k2, all.
 TERMS = (0, 2, 4)

@@ -7,9 +7,9 @@ from html import escape
 
 import numpy as np
 
-from calib.camera import Mask
 from calib.fit import Calibration
-from calib.ocam import OcamCamera
+from calib.models.camera import Mask
+from calib.models.ocam import OcamCamera
 from omnid.calibration.figures import (
     ARROW,
     Image,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.bundle import Adjusted
-from calib.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 from calib.fit import Calibration
+from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 
 Image = NDArray[np.uint8]
 ARROW = 40.0  # residuals are drawn so many times as long as they are

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera import field_of_view
 from calib.kalibr import export_kalibr, import_kalibr
-from calib.ocam import VIEWS, OcamCamera
+from calib.models.camera import field_of_view
+from calib.models.ocam import VIEWS, OcamCamera
 from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig

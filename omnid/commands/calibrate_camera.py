@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board import Board, BoardView
-from calib.camera import Mask
 from calib.camera_file import CameraFile, Quality, camera_toml
 from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
-from calib.ocam import VIEWS
+from calib.models.camera import Mask
+from calib.models.ocam import VIEWS
 from calib.rig_file import write_file
 from calib.stack_mask import find_mask
 from omnid.calibration.board_search import find_boards, spread

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib import se3
-from calib.ocam import OcamCamera
+from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
 from omnid.report.page import facts, note, table

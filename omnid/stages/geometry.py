@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.camera import Mask
+from calib.models.camera import Mask
 from calib.panorama import Cylinder, fit_cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rim import find_rim

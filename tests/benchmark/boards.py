@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib.board import Board
 from calib.board_find import find_board
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.benchmark.boards_rendered import Hard, hard
 
 # A corner is right within this part of its square's narrower side, or a pixel: half a side off is the next edge.

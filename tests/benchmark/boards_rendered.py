@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.board import Board
-from calib.camera import Array, Mask, OmniCamera
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Array, Mask, OmniCamera
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from tests.scenes import textures
 from tests.scenes.boards import Studio, board_pose, in_view, six_walls
 from tests.scenes.sensor import Exposure, Sensor

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera import Array, OmniCamera
-from calib.ocam import OcamCamera
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from calib.unified import UnifiedCamera
 
 # A mirror camera that looks up: its z axis points down, and forward, left, up become -y, -x, -z of the camera.
 T_DOWN = se3.transform([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], [0, 0, 0])

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from calib.board import Board
 from calib.board_find import find_board
 from calib.board_shape import is_whole
-from calib.camera import Array, Mask
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Array, Mask
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from tests.scenes.boards import Studio, around
 from tests.scenes.sensor import Sensor
 

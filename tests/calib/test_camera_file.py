@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.camera import Mask, OmniCamera
 from calib.camera_file import CameraFile, Quality, camera_toml, parse_camera, read_camera
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Mask, OmniCamera
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 
 OMNI = UnifiedCamera(1.1, (-214.0, 206.0), (390.0, 379.0), (780, 768), (-0.01, 0.002, 1e-4, -2e-4))
 OCAM = OcamCamera((-131.64, 0.0, 1.88e-3, 9.4e-8, -6.1e-10), (382.4, 514.6), (0.99923, 2.2e-4, 2.2e-4), (1024, 768))

@@ -13,14 +13,14 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.camera import Array, Mask
 from calib.kalibr import import_kalibr
-from calib.ocam import OcamCamera
+from calib.models.camera import Array, Mask
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
 from calib.rig_frame import rig_between
 from calib.transform_file import straight_up
-from calib.unified import UnifiedCamera
 
 FOCAL_PX = 200.0
 CENTER = (384.0, 380.0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera import Array
 from calib.errors import CalibError
 from calib.kalibr import export_kalibr, import_kalibr, parse_kalibr
+from calib.models.camera import Array
+from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
-from calib.unified import UnifiedCamera
 
 CAMERA = """
   camera_model: omni

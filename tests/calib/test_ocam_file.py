@@ -10,7 +10,7 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
+from calib.models.ocam import OcamCamera
 from calib.ocam_file import export_ocam, import_ocam, inverse_polynomial, parse_ocam
 from calib.rig import Rig
 from calib.transform_file import read_transform, straight_up, transform_toml

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from calib.board import Board, BoardView
 from calib.board_find import find_board
-from calib.camera import Array
 from calib.fit import MODELS, Calibration, calibrate, sharpened
-from calib.ocam import OcamCamera
+from calib.models.camera import Array
+from calib.models.ocam import OcamCamera
 from calib.unified_fit import axes
 
 BOARD = Board(6, 7, 0.03)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera import Array, Mask
 from calib.errors import CalibError
+from calib.models.camera import Array, Mask
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 

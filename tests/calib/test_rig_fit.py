@@ -10,12 +10,12 @@ import pytest
 from calib import se3
 from calib.board import Board, BoardView
 from calib.board_pose import board_pose, turns
-from calib.camera import Array, Mask
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
+from calib.models.camera import Array, Mask
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_fit import PairView, RigCalibration, calibrate_rig
-from calib.unified import UnifiedCamera
 from tests.scenes.boards import around_both
 
 LOWER = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), (780, 768))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.camera import Mask
+from calib.models.camera import Mask
 from calib.rim import find_rim
 
 Image = NDArray[np.uint8]

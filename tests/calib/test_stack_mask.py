@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.camera import Mask
 from calib.errors import CalibError
+from calib.models.camera import Mask
 from calib.stack_mask import find_mask
 from tests.scenes.sensor import Exposure, Sensor
 from tests.scenes.textures import value_noise

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.camera import Array
-from calib.ocam import View
+from calib.models.camera import Array
+from calib.models.ocam import View
 from calib.ocam_file import export_ocam, parse_ocam
 
 KEYS = ("ocam_std", "ocam_subpix")

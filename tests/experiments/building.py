@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.scenes import textures
 from tests.scenes.builders import CEILING_M, Point, box, posters, wall
 from tests.scenes.paths import planar_poses

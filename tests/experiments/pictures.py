@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.scenes.recipes import Run
 from tests.scenes.surfaces import Rectangle
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.camera import Array, OmniCamera
+from calib.models.camera import Array, OmniCamera
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from calib.unified import UnifiedCamera
 from tests.scenes.sensor import Floats
 from tests.scenes.surfaces import Rectangle, Scene
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.camera import Array
+from calib.models.camera import Array
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.tracking import Image, Klt, track
 from omnid.core.odometry.yaw_search import correlation_peaks

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.scenes.surfaces import Rectangle, Scene
 
 Indices = NDArray[np.intp]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.camera import Array
+from calib.models.camera import Array
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.paper.paper_odometry import turned_track
 from omnid.core.odometry.stereo_frame import Sight

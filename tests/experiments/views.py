@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 from calib.rig_file import read_rig
 from drivers.mcap_reader import LogReader
 from omnid.config import Config

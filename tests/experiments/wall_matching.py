@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 from omnid.config import Config
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.messages import Panoramas

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import Trajectory, read_tum

@@ -15,9 +15,9 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from calib.kalibr import import_kalibr
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import rig_toml
-from calib.unified import UnifiedCamera
 from drivers.frame import Frame, gray
 from drivers.mcap_reader import LogReader
 from drivers.mcap_writer import LogWriter

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.board import Board
-from calib.camera import Array, Mask, OmniCamera
+from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
 from tests.scenes.caster import render_grey
 from tests.scenes.sensor import Exposure, Sensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.scenes import textures
 from tests.scenes.surfaces import Rectangle, Scene, Texture
 

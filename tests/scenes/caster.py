@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 from calib.rig import MountedCamera
 from tests.scenes.surfaces import Rectangle, Scene
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.camera import Array, OmniCamera
+from calib.models.camera import Array, OmniCamera
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
-from calib.unified import UnifiedCamera
 from tests.scenes.caster import render_grey
 from tests.scenes.sensor import Exposure, Floats, Sensor
 from tests.scenes.surfaces import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from calib.camera import Array
+from calib.models.camera import Array
 
 HEIGHT_M = 1.2
 

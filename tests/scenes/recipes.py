@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.camera import Array
+from calib.models.camera import Array
 from calib.rig import Rig
 from tests.scenes import paths
 from tests.scenes.builders import corridor, room

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from calib import se3
-from calib.camera import Array, Mask
+from calib.models.camera import Array, Mask
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from calib.unified import UnifiedCamera
 
 HORIZON = 207.5676 / 768  # radius of the horizon at scale 1, of the picture's width
 RIM = 373.0 / 768  # radius of the mirror's rim

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Mask
+from calib.models.camera import Mask
 
 Floats = NDArray[np.float32]
 FITTING_GREY = 18.0  # struts and hub

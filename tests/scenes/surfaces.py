@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Array
+from calib.models.camera import Array
 
 Texture = NDArray[np.uint8]
 POSTER_GAP_M = 0.002  # in front of its wall; well above the depth error of float32

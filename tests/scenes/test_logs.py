@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from calib import se3
+from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig
-from calib.unified import UnifiedCamera
 from tests.scenes import RECIPES, Exposure, Sensor, build, make_rig, write_log
 from tests.scenes.paths import back_again, spline_path, turns
 from tests.scenes.recipes import TURN_DEG

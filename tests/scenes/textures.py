@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera import Array
+from calib.models.camera import Array
 from tests.scenes.surfaces import Texture
 
 Random = np.random.Generator

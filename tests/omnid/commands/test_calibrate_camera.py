@@ -11,10 +11,10 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib.board import Board
-from calib.camera import Mask
 from calib.camera_file import read_camera
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Mask
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 from drivers.mcap_writer import LogWriter
 from omnid.cli import main
 from tests.scenes.boards import Studio, around

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera import Mask
+from calib.models.camera import Mask
+from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from calib.unified import UnifiedCamera
 from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_of
 from omnid.cli import main
 from omnid.config import PanoramaConfig

@@ -13,11 +13,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from calib.board import Board
-from calib.camera import Array, Mask
 from calib.camera_file import CameraFile, camera_toml
+from calib.models.camera import Array, Mask
+from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
-from calib.unified import UnifiedCamera
 from drivers.mcap_writer import LogWriter
 from omnid.cli import main
 from tests.scenes.boards import Studio, around_both

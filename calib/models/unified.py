@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
 
 # Newton steps that undo the lens distortion; a mild one converges in 3 to 5, what does not is given NaN.
 UNDISTORT_STEPS = 12

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 from calib.errors import CalibError
-from calib.ocam import OcamCamera
-from calib.unified import UnifiedCamera
+from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
+from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 
 BENT = (-0.02, 0.004, 1e-3, -5e-4)
 CAMERAS: dict[str, OmniCamera] = {

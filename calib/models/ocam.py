@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from calib.camera import Array
 from calib.errors import CalibError
+from calib.models.camera import Array
 
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")

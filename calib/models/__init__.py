@@ -1,0 +1,1 @@
+"""Camera models: pixels to rays and back."""
