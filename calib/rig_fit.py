@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.board import Board, BoardView
-from calib.board_refine import refine_with
+from calib.boards.board import Board, BoardView
+from calib.boards.corner_refinement import refine_with
 from calib.bundle import Adjusted, Observed, adjust
 from calib.errors import CalibError
 from calib.fit import Rejected, bad_views

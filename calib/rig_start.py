@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.board import Board, BoardView
-from calib.board_pose import board_pose, pose_error_rad, turns
+from calib.boards.board import Board, BoardView
+from calib.boards.board_pose import board_pose, pose_error_rad, turns
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 

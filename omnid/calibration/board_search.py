@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.board import Board, BoardView
-from calib.board_find import find_board
+from calib.boards.board import Board, BoardView
+from calib.boards.board_finder import find_board
 from omnid.calibration.images import Pictures
 from omnid.errors import OmnidError
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board, BoardView
+from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, Quality, camera_toml
 from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
 from calib.models.camera import Mask

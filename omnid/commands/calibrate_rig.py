@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.board import Board, BoardView
+from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, read_camera
 from calib.fit import MODELS, Model, Rejected, calibrate, sharpened
 from calib.models.camera import Mask

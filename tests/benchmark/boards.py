@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.board_find import find_board
+from calib.boards.board import Board
+from calib.boards.board_finder import find_board
 from calib.models.camera import Array
 from tests.benchmark.boards_rendered import Hard, hard
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from calib import se3
-from calib.board import Board
+from calib.boards.board import Board
 from calib.fit import calibrate, sharpened
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.board import Board
-from calib.board_find import find_board
+from calib.boards.board import Board
+from calib.boards.board_finder import find_board
 from tests.benchmark.boards import DETECTORS, count, enough, judged
 from tests.benchmark.boards_rendered import Hard, hard
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.board import Board, BoardView
+from calib.boards.board import Board, BoardView
 from calib.bundle import Observed
 from calib.errors import CalibError
 from calib.fit import Calibration, calibrate, sharpened
@@ -153,7 +153,7 @@ def test_views_on_one_side_give_a_warning() -> None:
 
 def rendered() -> tuple[Calibration, Calibration]:
     """The ocam and the omni camera out of rendered pictures."""
-    from calib.board_find import find_board
+    from calib.boards.board_finder import find_board
 
     studio = Studio.of(BOARD, OMNI, MASK)
     poses = around(OMNI, BOARD, MASK, 8, seed=3, distance_m=(0.12, 0.28))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.board import Board, BoardView
-from calib.board_find import find_board
+from calib.boards.board import Board, BoardView
+from calib.boards.board_finder import find_board
 from calib.fit import MODELS, Calibration, calibrate, sharpened
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.board import Board, BoardView
-from calib.board_pose import board_pose, turns
+from calib.boards.board import Board, BoardView
+from calib.boards.board_pose import board_pose, turns
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from calib.board import Board
+from calib.boards.board import Board
 from calib.camera_file import read_camera
 from calib.models.camera import Mask
 from calib.models.ocam import OcamCamera

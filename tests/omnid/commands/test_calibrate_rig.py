@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.board import Board
+from calib.boards.board import Board
 from calib.camera_file import CameraFile, camera_toml
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera

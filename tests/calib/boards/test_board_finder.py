@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.board_find import find_board
-from calib.board_shape import is_whole
+from calib.boards.board import Board
+from calib.boards.board_finder import find_board
+from calib.boards.board_shape import is_whole
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera

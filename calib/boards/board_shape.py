@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.board_corners import Grey, sample
+from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array
 
 # Neighbours in a square of this half side shape the mapping; it has six terms and a corner may lack some of them.

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.board import Board
-from calib.board_corners import Grey, sample
-from calib.board_grid import Grid
+from calib.boards.board import Board
+from calib.boards.corner_candidates import Grey, sample
+from calib.boards.corner_grid import Grid
 from calib.models.camera import Array
 
 # A board may lack this part of its corners, if every one of its four borders shows so many of its own.

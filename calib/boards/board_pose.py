@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.board import Board
+from calib.boards.board import Board
 from calib.models.camera import Array, OmniCamera
 
 MIN_CORNERS = 6

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.board import Board
-from calib.board_corners import Grey, sample
-from calib.board_shape import local_mapping, terms
+from calib.boards.board import Board
+from calib.boards.board_shape import local_mapping, terms
+from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array, OmniCamera
 
 ToPicture = Callable[[Array], Array]  # (..., 2) squares from a corner, along the board, to pixels

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board_corners import Corners, Grey, look_at
-from calib.board_links import NOBODY, link
+from calib.boards.corner_candidates import Corners, Grey, look_at
+from calib.boards.corner_links import NOBODY, link
 from calib.models.camera import Array
 
 Cell = tuple[int, int]

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board, BoardView
-from calib.board_corners import Grey, find_corners, look_at, smoothed
-from calib.board_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
-from calib.board_order import as_grid, in_order, largest_board, place
-from calib.board_refine import refine
-from calib.board_shape import is_printed, is_whole, unevenness
+from calib.boards.board import Board, BoardView
+from calib.boards.board_order import as_grid, in_order, largest_board, place
+from calib.boards.board_shape import is_printed, is_whole, unevenness
+from calib.boards.corner_candidates import Grey, find_corners, look_at, smoothed
+from calib.boards.corner_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow, spacing
+from calib.boards.corner_refinement import refine
 from calib.models.camera import Array
 
 Image = NDArray[np.uint8]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board_corners import Corners, Grey, sample
+from calib.boards.corner_candidates import Corners, Grey, sample
 from calib.models.camera import Array
 
 # Of so many nearest candidates an arm's neighbour is chosen.

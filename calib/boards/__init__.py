@@ -1,0 +1,1 @@
+"""Checkerboards, and finding them in mirror images."""
