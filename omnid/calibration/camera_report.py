@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from calib.fit import Calibration
+from calib.fit.camera_fit import Calibration
 from calib.models.camera import Mask
 from calib.models.ocam import OcamCamera
 from omnid.calibration.figures import (

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.bundle import Adjusted
-from calib.fit import Calibration
+from calib.fit.bundle import Adjusted
+from calib.fit.camera_fit import Calibration
 from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 
 Image = NDArray[np.uint8]

@@ -9,9 +9,9 @@ import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
+from calib.fit.rig_fit import MOTION_NAMES, RigCalibration
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
-from calib.rig_fit import MOTION_NAMES, RigCalibration
 from omnid.calibration.figures import ARROW, Image, residual_picture
 from omnid.calibration.image_pairs import SIDES, PairedPictures
 from omnid.report.page import figure, page, table

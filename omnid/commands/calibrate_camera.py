@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, Quality, camera_toml
-from calib.fit import MODELS, Calibration, Model, calibrate, sharpened
+from calib.fit.camera_fit import MODELS, Calibration, Model, calibrate, sharpened
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS
 from calib.rig_file import write_file

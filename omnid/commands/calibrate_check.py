@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.fit.rig_drift import corrected
 from calib.rig import Rig
-from calib.rig_drift import corrected
 from calib.rig_file import read_rig, write_rig
 from calib.rim_check import RimShift
 from omnid.calibration.image_pairs import SIDES

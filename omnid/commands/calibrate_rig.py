@@ -12,13 +12,13 @@ import numpy as np
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, read_camera
-from calib.fit import MODELS, Model, Rejected, calibrate, sharpened
+from calib.fit.camera_fit import MODELS, Model, Rejected, calibrate, sharpened
+from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, sharpened_rig
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
-from calib.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, sharpened_rig
 from calib.rig_frame import rig_between
 from calib.rim import find_rim
 from calib.stack_mask import find_mask

@@ -17,11 +17,11 @@ import numpy as np
 
 from calib import se3
 from calib.boards.board import Board
-from calib.fit import calibrate, sharpened
+from calib.fit.camera_fit import calibrate, sharpened
+from calib.fit.rig_fit import PairView, RigCalibration, calibrate_rig, sharpened_rig
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from calib.rig_fit import PairView, RigCalibration, calibrate_rig, sharpened_rig
 from omnid.calibration.board_search import find_boards
 from omnid.calibration.image_pairs import PairedPictures, read_pairs
 from tests.scenes.boards import Studio, around_both

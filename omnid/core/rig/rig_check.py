@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.fit.rig_drift import Drift, find_drift
 from calib.panorama import Cylinder
-from calib.rig_drift import Drift, find_drift
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.tracking import Klt, Wrapped, track
 

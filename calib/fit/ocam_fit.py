@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calib.bundle import Adjusted, Observed, adjust
 from calib.errors import CalibError
+from calib.fit.bundle import Adjusted, Observed, adjust
+from calib.fit.ocam_linear import powers, solve_linear
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
-from calib.ocam_linear import powers, solve_linear
 
 DEGREE = 4
 

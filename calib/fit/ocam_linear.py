@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib import se3
-from calib.bundle import Observed
+from calib.fit.bundle import Observed
 from calib.models.camera import Array
 from calib.models.ocam import View
 

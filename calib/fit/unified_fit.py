@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from calib import se3
-from calib.bundle import Adjusted, Observed, adjust
+from calib.fit.bundle import Adjusted, Observed, adjust
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera

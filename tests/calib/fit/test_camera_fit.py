@@ -9,14 +9,14 @@ import pytest
 
 from calib import se3
 from calib.boards.board import Board, BoardView
-from calib.bundle import Observed
 from calib.errors import CalibError
-from calib.fit import Calibration, calibrate, sharpened
+from calib.fit.bundle import Observed
+from calib.fit.camera_fit import Calibration, calibrate, sharpened
+from calib.fit.ocam_linear import solve_linear
+from calib.fit.unified_fit import axes
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
-from calib.ocam_linear import solve_linear
-from calib.unified_fit import axes
 from tests.scenes.boards import Studio, around
 from tests.scenes.sensor import Sensor
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import find_board
-from calib.fit import MODELS, Calibration, calibrate, sharpened
+from calib.fit.camera_fit import MODELS, Calibration, calibrate, sharpened
+from calib.fit.unified_fit import axes
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
-from calib.unified_fit import axes
 
 BOARD = Board(6, 7, 0.03)
 SIZE = (1024, 768)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.corner_refinement import refine_with
-from calib.bundle import Adjusted, Observed
 from calib.errors import CalibError
+from calib.fit.bundle import Adjusted, Observed
+from calib.fit.ocam_fit import DEGREE, fit_ocam, ocam_maker, ocam_values, raise_degree
+from calib.fit.ocam_linear import solve_linear
+from calib.fit.unified_fit import TERMS, fit_unified, unified_maker, unified_values
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import OcamCamera, View
-from calib.ocam_fit import DEGREE, fit_ocam, ocam_maker, ocam_values, raise_degree
-from calib.ocam_linear import solve_linear
-from calib.unified_fit import TERMS, fit_unified, unified_maker, unified_values
 
 Model = Literal["ocam", "omni"]
 MODELS: tuple[Model, Model] = ("ocam", "omni")

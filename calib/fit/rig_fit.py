@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.corner_refinement import refine_with
-from calib.bundle import Adjusted, Observed, adjust
 from calib.errors import CalibError
-from calib.fit import Rejected, bad_views
+from calib.fit.bundle import Adjusted, Observed, adjust
+from calib.fit.camera_fit import Rejected, bad_views
+from calib.fit.parameterisation import Nudge, nudge
+from calib.fit.rig_initialisation import Agreed, Seen, agree
 from calib.models.camera import Array, OmniCamera
-from calib.nudge import Nudge, nudge
-from calib.rig_start import Agreed, Seen, agree
 
 MIN_PAIRS = 4
 MAX_REJECTIONS = 10

@@ -11,11 +11,11 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.board_pose import board_pose, turns
 from calib.errors import CalibError
+from calib.fit.rig_fit import PairView, RigCalibration, calibrate_rig
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from calib.rig_fit import PairView, RigCalibration, calibrate_rig
 from tests.scenes.boards import around_both
 
 LOWER = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), (780, 768))

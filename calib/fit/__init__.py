@@ -1,0 +1,1 @@
+"""Calibration from board views: intrinsics, rig, bundle adjustment."""
