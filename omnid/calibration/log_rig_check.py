@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
-from calib.rim_check import RimShift, rim_shift
 from drivers.errors import DriverError
 from drivers.mcap_reader import LogReader
 from omnid.calibration.image_pairs import SIDES, paired

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, Quality, camera_toml
 from calib.fit.camera_fit import MODELS, Calibration, Model, calibrate, sharpened
+from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS
 from calib.rig_file import write_file
-from calib.stack_mask import find_mask
 from omnid.calibration.board_search import find_boards, spread
 from omnid.calibration.camera_report import report_html
 from omnid.calibration.images import Pictures, read_pictures

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.fit.rig_drift import corrected
+from calib.masks.rim_check import RimShift
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
-from calib.rim_check import RimShift
 from omnid.calibration.image_pairs import SIDES
 from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_of
 from omnid.config import Config

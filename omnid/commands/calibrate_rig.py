@@ -14,14 +14,14 @@ from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, read_camera
 from calib.fit.camera_fit import MODELS, Model, Rejected, calibrate, sharpened
 from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, sharpened_rig
+from calib.masks.rim import find_rim
+from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
-from calib.rim import find_rim
-from calib.stack_mask import find_mask
 from omnid.calibration.board_search import find_boards, spread
 from omnid.calibration.image_pairs import SIDES, PairedPictures, read_pairs
 from omnid.calibration.images import Pictures

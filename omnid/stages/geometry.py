@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 from calib.panorama import Cylinder, fit_cylinder
 from calib.rig import MountedCamera, Rig
-from calib.rim import find_rim
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
 from omnid.core.odometry.pose_estimation import StereoModel

@@ -9,9 +9,9 @@ import pytest
 
 from calib import se3
 from calib.fit.rig_drift import corrected, find_drift
+from calib.masks.rim_check import rim_shift
 from calib.models.camera import Array, Mask
 from calib.rig import Rig
-from calib.rim_check import rim_shift
 from tests.scenes.rigs import misturned
 
 

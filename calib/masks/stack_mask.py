@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
+from calib.masks.rim import find_rim
 from calib.models.camera import Mask
-from calib.rim import find_rim
 
 Image = NDArray[np.uint8]
 MIN_FRAMES = 5

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.masks.rim import find_rim
 from calib.models.camera import Mask
-from calib.rim import find_rim
 
 # A mask may reach so far beyond the rim that is found: a pixel or two is how well it can be, a bit more as masks are
 # drawn by hand as well.

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
+from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
-from calib.stack_mask import find_mask
 from tests.scenes.sensor import Exposure, Sensor
 from tests.scenes.textures import value_noise
 

@@ -1,0 +1,1 @@
+"""Which pixels show the world: the mirror's rim, hub and struts."""
