@@ -22,7 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the list; 1 if there is none."""
-    from drivers.v4l2_devices import RULES_FILE, capture_devices, described, udev_rules
+    from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, described, udev_rules
 
     devices = capture_devices(ROOT)
     if not devices:

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 def examine(config: Config) -> Iterator[Finding]:
     """All checks, the quick ones first."""
-    from drivers.v4l2_devices import capture_devices
+    from drivers.cameras.v4l2_devices import capture_devices
     from omnid.doctor import cameras, devices, machine, wiring
 
     eyes, wanted = config.cameras, config.realtime

@@ -25,8 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Records; 1 where nothing was recorded."""
+    from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
-    from drivers.v4l2_camera import V4l2Camera
     from omnid.config import Config
     from omnid.runs.record import record
     from omnid.settings import load

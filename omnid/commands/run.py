@@ -57,14 +57,14 @@ def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
 
 
 def _devices(config: Config) -> Opener:
-    from drivers.v4l2_camera import V4l2Camera
+    from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import say
 
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, report=say)
 
 
 def _recorded(args: argparse.Namespace) -> Opener:
-    from drivers.log_camera import LogCamera, Pictures
+    from drivers.cameras.log_camera import LogCamera, Pictures
 
     pictures = Pictures.of(args.log)
     epoch_ns = time.monotonic_ns()

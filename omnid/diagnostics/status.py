@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
+from drivers.cameras.v4l2_buffers import CameraState
 from drivers.frame import Camera
-from drivers.v4l2_ledger import CameraState
 from omnid.controller.statistics import Logbook
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
 from omnid.diagnostics.run_statistics import Tally

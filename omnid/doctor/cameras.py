@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from drivers.cameras.v4l2_devices import CaptureDevice
+from drivers.cameras.v4l2_modes import choose
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from drivers.v4l2_devices import CaptureDevice
-from drivers.v4l2_modes import choose
-from drivers.v4l2_settings import V4l2Settings
 from omnid.doctor.devices import access, holders, is_ours
 from omnid.doctor.finding import Finding
 

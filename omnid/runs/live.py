@@ -12,8 +12,8 @@ from typing import Protocol
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
+from drivers.cameras.v4l2_buffers import CameraState
 from drivers.frame import Camera, Frame, FrameSource
-from drivers.v4l2_ledger import CameraState
 from omnid.config import Config
 from omnid.controller.controller import HelmSettings
 from omnid.controller.link import HelmLink

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 
 from calib.rig_file import rig_toml
+from drivers.cameras.log_camera import Pictures
 from drivers.frame import Frame
-from drivers.log_camera import Pictures
 from drivers.mcap_reader import LogReader
 from drivers.simulated_line import SimulatedLine
 from drivers.simulated_motor import LONGEST_ABSENCE_S

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.v4l2_devices import CaptureDevice, udev_rules
+from drivers.cameras.v4l2_devices import CaptureDevice, udev_rules
 from omnid.config import RealtimeConfig
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"

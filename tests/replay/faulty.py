@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from calib.rig_file import read_rig
+from drivers.cameras.log_camera import LogCamera, Pictures
 from drivers.frame import Camera, Frame, gray
-from drivers.log_camera import LogCamera, Pictures
 from omnid.config import Config
 from omnid.runs.live import Live
 from omnid.settings import load

@@ -25,7 +25,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from drivers.log_camera import LogCamera, Pictures
+from drivers.cameras.log_camera import LogCamera, Pictures
 from omnid.config import Config
 from omnid.runs.record import record
 

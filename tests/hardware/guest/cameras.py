@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_camera import V4l2Camera
+from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, udev_rules
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
-from drivers.v4l2_camera import V4l2Camera
-from drivers.v4l2_devices import RULES_FILE, capture_devices, udev_rules
-from drivers.v4l2_settings import V4l2Settings
 from tests.hardware.guest.loopback import DEVICES, Loopback, load_loopback
 
 SIZE = 320, 180

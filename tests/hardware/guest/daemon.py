@@ -21,7 +21,7 @@ import serial  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.log_camera import Pictures
+from drivers.cameras.log_camera import Pictures
 from tests.hardware.guest.loopback import load_loopback
 from tests.hardware.guest.unit import DROP_INS, SYSTEMD, restarted, run, said, show, until
 from tests.hardware.guest.world import SAMPLE, Operator, World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
 
 DEVICES = "/dev/video10", "/dev/video11"
 OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT

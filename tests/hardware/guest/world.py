@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from drivers.cameras.log_camera import Pictures
 from drivers.frame import Camera
-from drivers.log_camera import Pictures
 from omnid.client import Pose, Report, Robot
 from omnid.transport.decode import pose_from, report_from
 from tests.hardware.guest.loopback import DEVICES, Loopback

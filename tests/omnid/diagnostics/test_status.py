@@ -12,9 +12,9 @@ import pytest
 
 from calib import se3
 from calib.rig import Rig
+from drivers.cameras.v4l2_buffers import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.v4l2_ledger import CameraState
 from omnid.config import PairConfig
 from omnid.controller.controller import Arrived, Helm, HelmSettings
 from omnid.controller.link import heading_of

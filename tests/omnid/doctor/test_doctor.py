@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from calib.rig_file import read_rig, write_rig
-from drivers.v4l2_devices import CaptureDevice
-from drivers.v4l2_modes import Mode, Sizes
-from drivers.v4l2_settings import V4l2Settings
+from drivers.cameras.v4l2_devices import CaptureDevice
+from drivers.cameras.v4l2_modes import Mode, Sizes
+from drivers.cameras.v4l2_settings import V4l2Settings
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.doctor import machine

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers import v4l2_ioctl as v4l2
-from drivers.v4l2_ledger import WARNING, CameraState, Ledger
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_buffers import WARNING, CameraState, Ledger
 
 PERIOD_NS = 33_333_000
 START_NS = 5_000 * 10**9

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.cameras.v4l2_modes import ENCODINGS
 from drivers.errors import DriverError
-from drivers.v4l2_modes import ENCODINGS
 
 SWITCH: Final = ("keep", "on", "off")  # "keep" leaves a control as the camera has it
 POWER_LINE: Final = ("keep", "off", "50", "60", "auto")

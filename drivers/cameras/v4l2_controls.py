@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from drivers.v4l2_settings import V4l2Settings
 
 _MAX_CONTROLS = 512
 _MAX_MENU = 64

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.errors import DriverError
 
 # what each format is called in a Frame; the order is the order of choice: no decoding first, then fewer bytes

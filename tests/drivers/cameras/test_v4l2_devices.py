@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from drivers.cameras.v4l2_camera import V4l2Camera
+from drivers.cameras.v4l2_devices import CaptureDevice, capture_devices, described, udev_rules
+from drivers.cameras.v4l2_modes import Mode, Sizes
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from drivers.v4l2_camera import V4l2Camera
-from drivers.v4l2_devices import CaptureDevice, capture_devices, described, udev_rules
-from drivers.v4l2_modes import Mode, Sizes
-from drivers.v4l2_settings import V4l2Settings
 from omnid.cli import main
 from omnid.commands import cameras
 

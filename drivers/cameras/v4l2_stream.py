@@ -9,11 +9,11 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Final
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_controls import apply, controls, planned
+from drivers.cameras.v4l2_modes import BYTES_PER_PIXEL, ENCODINGS, RATE_TOLERANCE, choose, modes
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from drivers.v4l2_controls import apply, controls, planned
-from drivers.v4l2_modes import BYTES_PER_PIXEL, ENCODINGS, RATE_TOLERANCE, choose, modes
-from drivers.v4l2_settings import V4l2Settings
 
 _ADVICE: Final = {
     errno.ENOENT: "is not there; check the cable and the name, `omnid cameras` lists what is",

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_modes import Mode, modes
+from drivers.cameras.v4l2_stream import capability, explained
 from drivers.errors import DriverError
-from drivers.v4l2_modes import Mode, modes
-from drivers.v4l2_stream import capability, explained
 
 RULES_FILE: Final = "/etc/udev/rules.d/70-omnid-cameras.rules"  # ID_PATH is there after 60-persistent-v4l.rules
 _MEMORY_TO_MEMORY = 0x8000 | 0x4000  # V4L2_CAP_VIDEO_M2M and its multi-planar kin: codecs

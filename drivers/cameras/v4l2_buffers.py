@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
 
 Report = Callable[[int, str], None]  # how grave it is and one line; the numbers of syslog and journald (RFC 5424)
 WARNING: Final = 4

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from drivers import v4l2_ioctl
+from drivers.cameras import v4l2_ioctl
 
 SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
     "Capability": (104, 104), "FormatDescription": (64, 64), "FrameSize": (44, 44), "FrameInterval": (52, 52),

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.v4l2_controls import (
+from drivers.cameras.v4l2_controls import (
     AUTO_EXPOSURE,
     AUTO_GAIN,
     EXPOSURE,
@@ -17,8 +16,9 @@ from drivers.v4l2_controls import (
     Control,
     planned,
 )
-from drivers.v4l2_modes import Mode, Sizes, choose
-from drivers.v4l2_settings import V4l2Settings
+from drivers.cameras.v4l2_modes import Mode, Sizes, choose
+from drivers.cameras.v4l2_settings import V4l2Settings
+from drivers.errors import DriverError
 
 WEBCAM = [
     Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0, 15.0)),

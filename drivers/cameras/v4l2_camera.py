@@ -11,12 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from drivers import v4l2_ioctl as v4l2
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_buffers import NOTICE, WARNING, CameraState, Ledger, Report
+from drivers.cameras.v4l2_settings import V4l2Settings
+from drivers.cameras.v4l2_stream import V4l2Stream, explained
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.v4l2_ledger import NOTICE, WARNING, CameraState, Ledger, Report
-from drivers.v4l2_settings import V4l2Settings
-from drivers.v4l2_stream import V4l2Stream, explained
 
 _FIRST_RETRY_S: Final = 0.1
 _SETTLED_FRAMES: Final = 30  # a device that comes and goes is waited for longer each time

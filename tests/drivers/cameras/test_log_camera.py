@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from drivers.cameras.log_camera import LATEST_NS, LogCamera, Pictures
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.log_camera import LATEST_NS, LogCamera, Pictures
 from drivers.mcap_reader import LogReader
 from tests.conftest import PAIRS
 from tests.replay.edited import Picture, pictures, save

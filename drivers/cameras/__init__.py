@@ -1,0 +1,1 @@
+"""Cameras: V4L2 devices, and a log in the place of one."""
