@@ -8,7 +8,7 @@ from typing import Any
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from drivers.differential_drive import DifferentialDrive
-from drivers.log_folder import Rotation
+from drivers.logs.log_folder import Rotation
 from drivers.motor_protocols import PROTOCOLS
 from omnid.core.control.heading_controller import HeadingLimits
 from omnid.core.control.safety_rules import Deadlines

@@ -11,7 +11,7 @@ from pathlib import Path
 from drivers.cameras.v4l2_buffers import CameraState
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 
 MOST_BYTES = 1 << 30
 SLOWEST, FASTEST = 0.001, 1000.0  # paces

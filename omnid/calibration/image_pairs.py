@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drivers.errors import BrokenFrame
 from drivers.frame import Frame, gray
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from omnid.calibration.images import SUFFIXES, Image, Pictures, one_size, read_pictures
 from omnid.config import Config
 from omnid.errors import OmnidError

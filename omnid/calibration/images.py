@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from drivers.errors import BrokenFrame, DriverError
 from drivers.frame import MAX_PIXELS, Frame, gray
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_messages import DataSection, Message, scan
-from drivers.mcap_records import LogFile
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_messages import DataSection, Message, scan
+from drivers.logs.mcap_records import LogFile
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]

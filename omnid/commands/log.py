@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.mcap_recover import Recovery
-    from drivers.mcap_survey import Survey
+    from drivers.logs.mcap_info import Survey
+    from drivers.logs.mcap_recover import Recovery
 
 WIDEST = 60  # characters of a topic or a type in a column
 
@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run_info(args: argparse.Namespace) -> int:
     """Prints what is in each log; 1 if one is broken, 2 if one is none."""
     from drivers.errors import DriverError
-    from drivers.mcap_survey import State, survey
+    from drivers.logs.mcap_info import State, survey
 
     code = 0
     for number, path in enumerate(args.logs):
@@ -49,7 +49,7 @@ def run_info(args: argparse.Namespace) -> int:
 
 def run_recover(args: argparse.Namespace) -> int:
     """Makes a log whole."""
-    from drivers.mcap_recover import recover
+    from drivers.logs.mcap_recover import recover
 
     out = args.output or _mended(args.log)
     print("\n".join(_reported(recover(args.log, out), args.log, out)))
@@ -57,7 +57,7 @@ def run_recover(args: argparse.Namespace) -> int:
 
 
 def _mended(path: Path) -> Path:
-    from drivers.log_folder import PART, without_part
+    from drivers.logs.log_folder import PART, without_part
 
     return without_part(path) if path.name.endswith(PART) else path.with_name(f"{path.stem}.recovered.mcap")
 
@@ -93,7 +93,7 @@ def _described(found: Survey) -> Iterator[str]:
 
 
 def _state(found: Survey) -> str:
-    from drivers.mcap_survey import State
+    from drivers.logs.mcap_info import State
 
     advice = f"`omnid log recover {found.path}`"
     if found.state is State.BROKEN:

@@ -72,7 +72,7 @@ def _recorded(args: argparse.Namespace) -> Opener:
 
 
 def _rig_of(log: Path) -> Rig:
-    from drivers.mcap_reader import LogReader
+    from drivers.logs.mcap_reader import LogReader
     from omnid.runs.log_rig import attached_rig
 
     with closing(LogReader(log)) as reader:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import IO
 
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
 from omnid.formats.tum import tum_row
 from omnid.monitor.robot_state import Letter

@@ -15,11 +15,11 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from calib import se3
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_index import read_attachments, read_summary
-from drivers.mcap_messages import DataSection, Message
-from drivers.mcap_records import LogFile, RecordError
-from drivers.mcap_survey import State, Survey, survey
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_index import read_attachments, read_summary
+from drivers.logs.mcap_info import State, Survey, survey
+from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_records import LogFile, RecordError
 from omnid.errors import OmnidError
 from omnid.recordings.series_differences import Series
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, TWIST_SCHEMA, odometry_from_cdr, twist_from_cdr

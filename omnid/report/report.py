@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.mcap_survey import State
+from drivers.logs.mcap_info import State
 from omnid import __version__
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory

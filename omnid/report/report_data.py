@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.mcap_catalog import Catalog, Topic
-from drivers.mcap_index import read_attachments, read_summary
-from drivers.mcap_messages import DataSection, Message
-from drivers.mcap_records import LogFile, RecordError
-from drivers.mcap_survey import Survey, survey
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.mcap_catalog import Catalog, Topic
+from drivers.logs.mcap_index import read_attachments, read_summary
+from drivers.logs.mcap_info import Survey, survey
+from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_records import LogFile, RecordError
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
 from omnid.report.downsampling import Thinned
 from omnid.report.events import Events

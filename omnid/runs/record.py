@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.frame import Camera, FrameSource
-from drivers.log_folder import LogFolder
-from drivers.rotating_log import NOTICE, WARNING, Report, RotatingLog
+from drivers.logs.log_folder import LogFolder
+from drivers.logs.rotating_log import NOTICE, WARNING, Report, RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.signals import ended_by_signals

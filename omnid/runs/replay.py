@@ -15,7 +15,7 @@ import cv2
 from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from drivers.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.motor import MotorTick, open_motor

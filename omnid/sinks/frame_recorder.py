@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final, TypeAlias
 
 from drivers.frame import Frame
-from drivers.rotating_log import RecordingState, RotatingLog
+from drivers.logs.rotating_log import RecordingState, RotatingLog
 from omnid.errors import OmnidError
 from omnid.messages import Odometry
 from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports

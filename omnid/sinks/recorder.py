@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeAlias
 
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.diagnostics.run_statistics import Tally
 from omnid.messages import Odometry
 from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports, status_report

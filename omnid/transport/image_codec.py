@@ -1,6 +1,6 @@
 """Frames as the picture messages of ROS 2, under names that its own tools and `omnid replay` know.
 
-Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as drivers.ros_image reads it:
+Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as drivers.logs.ros_image reads it:
 pictures are nearly all of a recording, and this copies each of them once.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import Frame
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
 from omnid.transport.codec import MAX_SECONDS, NS_PER_S
 

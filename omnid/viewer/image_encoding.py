@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import Frame, gray
-from drivers.ros_image import RosImage
+from drivers.logs.ros_image import RosImage
 
 COMPRESSED: Final = ("jpeg", "png")
 QUALITY: Final = 85

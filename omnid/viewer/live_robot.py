@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Final, TypeVar
 
 from drivers.errors import BrokenFrame
-from drivers.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
+from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Pose, Report, Robot
 from omnid.core.odometry.stereo_frame import Features
 from omnid.engine.signals import ended_by_signals

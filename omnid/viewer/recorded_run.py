@@ -8,11 +8,11 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from drivers.errors import BrokenFrame
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_messages import DataSection, Message
-from drivers.mcap_records import LogFile, RecordError
-from drivers.mcap_survey import Survey
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_info import Survey
+from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_records import LogFile, RecordError
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA
 from omnid.transport.decode import Pose, Report, cloud_from, pose_from, report_from

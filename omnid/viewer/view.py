@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.mcap_survey import Survey, survey
+from drivers.logs.mcap_info import Survey, survey
 from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.runs.replay import Options, Replay, Topics

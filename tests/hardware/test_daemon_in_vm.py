@@ -21,7 +21,7 @@ import pytest
 from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import Pictures
 from drivers.frame import Frame
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from drivers.simulated_line import SimulatedLine
 from drivers.simulated_motor import LONGEST_ABSENCE_S
 from omnid.runs.log_rig import attached_rig

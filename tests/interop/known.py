@@ -14,7 +14,7 @@ import numpy as np
 
 from calib import se3
 from drivers.frame import Frame
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
 from omnid.transport.image_codec import image_cdr, image_topic
 

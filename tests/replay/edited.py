@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivers.mcap_reader import LogReader
-from tests.drivers.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+from drivers.logs.mcap_reader import LogReader
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 
 PERIOD_NS = 100_000_000
 

@@ -19,8 +19,8 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import rig_toml
 from drivers.frame import Frame, gray
-from drivers.mcap_reader import LogReader
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.mcap_writer import LogWriter
 
 SIDE_PX = 512
 QUALITY = 70  # 198 pictures in less than 7.5 MB

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import PAIRS
-from tests.drivers.mcap_logs import Entry, text, write_log
+from tests.drivers.logs.mcap_logs import Entry, text, write_log
 from tests.replay.command import Command, rows
 from tests.replay.edited import pictures, save
 

@@ -11,7 +11,7 @@ import pytest
 from calib.rig_file import read_rig, write_rig
 from omnid.formats.tum import read_tum
 from tests.conftest import PAIRS
-from tests.drivers.mcap_logs import IMAGE, LOWER, UPPER, Entry, image, write_log
+from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image, write_log
 from tests.replay.command import Command
 from tests.replay.edited import dark, pictures, save
 

@@ -14,8 +14,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from drivers.mcap_writer import LogWriter
-from tests.drivers.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
+from drivers.logs.mcap_writer import LogWriter
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[2]

@@ -22,7 +22,7 @@ from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import map_from, report_from
 from tests.conftest import PAIRS
-from tests.drivers.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
 from tests.replay.edited import pictures
 

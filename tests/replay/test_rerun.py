@@ -11,7 +11,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib.rig_file import parse_rig, rig_toml
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from omnid.recordings.run_reader import read_run
 from tests.replay.command import Command
 from tests.replay.recorded import recorded_run

@@ -11,7 +11,7 @@ from calib import se3
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
-from tests.drivers.mcap_logs import STORE
+from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import dark, pictures, save
 

@@ -12,7 +12,7 @@ import pytest
 from drivers.cameras.log_camera import LATEST_NS, LogCamera, Pictures
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from tests.conftest import PAIRS
 from tests.replay.edited import Picture, pictures, save
 

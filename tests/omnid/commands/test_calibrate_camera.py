@@ -15,7 +15,7 @@ from calib.camera_file import read_camera
 from calib.models.camera import Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
 from tests.scenes.boards import Studio, around
 

@@ -18,7 +18,7 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
 from tests.scenes.boards import Studio, around_both
 from tests.scenes.sensor import Sensor

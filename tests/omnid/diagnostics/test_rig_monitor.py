@@ -11,7 +11,7 @@ import pytest
 
 from calib.rig import Rig
 from calib.rig_file import read_rig
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
 from omnid.diagnostics.rig_monitor import MIN_PLACES, PAIRS, RigWatch

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from calib import se3
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
 from omnid.recordings import run_reader as recorded_run
 from omnid.recordings.run_reader import read_run
 from omnid.recordings.series_differences import Series, gaps, pose_excess
 from omnid.recordings.settings_differences import table_differences
 from omnid.transport import codec
-from tests.drivers.mcap_logs import START_NS
+from tests.drivers.logs.mcap_logs import START_NS
 
 PERIOD_NS = 10**8
 COUNT = 20

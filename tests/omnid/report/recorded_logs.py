@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
 from omnid.transport.codec import Status
 

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from drivers.frame import Camera, Frame, gray
-from drivers.mcap_reader import LogReader
+from drivers.logs.mcap_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.voxel_map import MapPoints
@@ -27,7 +27,7 @@ from omnid.sinks.encoder import Clouds, Encoder, status_report
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import ERROR, OK, Status
 from omnid.transport.image_codec import image_cdr, image_topic
-from tests.drivers.mcap_logs import STORE, jpeg
+from tests.drivers.logs.mcap_logs import STORE, jpeg
 
 ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9

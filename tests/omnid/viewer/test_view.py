@@ -11,7 +11,7 @@ import pytest
 
 from calib import se3
 from drivers.frame import Frame
-from drivers.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.formats.tum import read_tum
 from omnid.transport import codec
 from omnid.transport.codec import Status

@@ -15,10 +15,10 @@ from mcap.records import ChunkIndex, Header
 from mcap.writer import CompressionType, Writer
 
 from drivers.errors import DriverError
-from drivers.file_lock import hold, is_held
-from drivers.mcap_copy import Copy
-from drivers.mcap_index import has_footer, read_summary, summary_section
-from drivers.mcap_records import (
+from drivers.logs.file_lock import hold, is_held
+from drivers.logs.mcap_copy import Copy
+from drivers.logs.mcap_index import has_footer, read_summary, summary_section
+from drivers.logs.mcap_records import (
     MAGIC,
     PARSE_ERRORS,
     LogFile,

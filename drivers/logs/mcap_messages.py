@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_records import MAGIC, LogFile, Record, RecordError, Source, content, records, unpack_chunk
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_records import MAGIC, LogFile, Record, RecordError, Source, content, records, unpack_chunk
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 

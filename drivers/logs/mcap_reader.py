@@ -9,13 +9,13 @@ from dataclasses import replace
 
 from drivers.errors import BrokenFrame, DriverError
 from drivers.frame import Camera, Frame
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_index import has_footer, read_attachments, read_summary
-from drivers.mcap_messages import DataSection, Message, scan
-from drivers.mcap_records import LogFile, RecordError
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, RosImage, parse_image
-from drivers.stamp_order import StampOrder
-from drivers.topic_choice import choose_topics
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
+from drivers.logs.mcap_messages import DataSection, Message, scan
+from drivers.logs.mcap_records import LogFile, RecordError
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, RosImage, parse_image
+from drivers.logs.stamp_order import StampOrder
+from drivers.logs.topic_choice import choose_topics
 
 _SCAN_BYTES = 64 * 2**20
 _SCAN_MESSAGES = 2000

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
-from tests.drivers.mcap_logs import STORE, TYPES, header
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
+from tests.drivers.logs.mcap_logs import STORE, TYPES, header
 
 
 @pytest.mark.parametrize("little_endian", [True, False])

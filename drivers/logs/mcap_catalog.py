@@ -8,7 +8,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from drivers.mcap_records import PARSE_ERRORS, RecordError, parsing
+from drivers.logs.mcap_records import PARSE_ERRORS, RecordError, parsing
 
 _MAX_CHANNELS = 4096
 _MAX_DEFINITION_BYTES = 2**20

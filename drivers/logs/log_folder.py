@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
-from drivers.file_lock import is_held
+from drivers.logs.file_lock import is_held
 
 PART: Final = ".part"
 _MAX_NUMBER: Final = 999_999

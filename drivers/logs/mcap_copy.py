@@ -11,8 +11,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import Writer
 
-from drivers.mcap_index import summary_section
-from drivers.mcap_records import (
+from drivers.logs.mcap_index import summary_section
+from drivers.logs.mcap_records import (
     PARSE_ERRORS,
     LogFile,
     Record,

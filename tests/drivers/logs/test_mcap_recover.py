@@ -18,12 +18,12 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError
-from drivers.mcap_reader import LogReader
-from drivers.mcap_records import MAGIC
-from drivers.mcap_recover import Recovery, recover
-from drivers.mcap_writer import LogWriter
-from tests.drivers.mcap_logs import BARE, START_NS, Entry, pairs, text, write_log
-from tests.drivers.test_mcap_damage import HOSTILE, LAYOUTS
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.mcap_records import MAGIC
+from drivers.logs.mcap_recover import Recovery, recover
+from drivers.logs.mcap_writer import LogWriter
+from tests.drivers.logs.mcap_logs import BARE, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.test_mcap_damage import HOSTILE, LAYOUTS
 
 RIG = [("rig.toml", b"version = 1"), ("big", bytes(3 * 2**20))]
 

@@ -15,10 +15,10 @@ from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
-from drivers.mcap_reader import LogReader
-from drivers.ros_image import RosImage
-from drivers.stamp_order import StampOrder
-from tests.drivers.mcap_logs import (
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.ros_image import RosImage
+from drivers.logs.stamp_order import StampOrder
+from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
     IMAGE,
@@ -36,7 +36,7 @@ from tests.drivers.mcap_logs import (
     write_log,
 )
 
-REAL_LOGS = Path(__file__).parents[3] / "shared" / "data"
+REAL_LOGS = Path(__file__).parents[4] / "shared" / "data"
 
 
 def read(path: Path, **options: Any) -> tuple[list[Frame], LogReader]:

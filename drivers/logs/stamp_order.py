@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from drivers.frame import Camera, Frame
-from drivers.ros_image import RosImage
+from drivers.logs.ros_image import RosImage
 
 MAX_HELD_BYTES = 256 * 2**20
 

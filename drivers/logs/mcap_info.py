@@ -12,11 +12,11 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Statistics
 
-from drivers.file_lock import is_held
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_index import has_footer, read_attachments, read_summary, summary_section
-from drivers.mcap_messages import DataSection
-from drivers.mcap_records import MAGIC, PARSE_ERRORS, LogFile, RecordError, content, parsing, records
+from drivers.logs.file_lock import is_held
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_index import has_footer, read_attachments, read_summary, summary_section
+from drivers.logs.mcap_messages import DataSection
+from drivers.logs.mcap_records import MAGIC, PARSE_ERRORS, LogFile, RecordError, content, parsing, records
 
 
 class State(Enum):

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Statistics
 
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_records import (
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_records import (
     HEAD,
     MAGIC,
     PARSE_ERRORS,

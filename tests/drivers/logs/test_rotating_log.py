@@ -17,16 +17,16 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.errors import DriverError
-from drivers.file_lock import is_held
-from drivers.log_folder import LogFolder, Rotation
-from drivers.mcap_catalog import Catalog
-from drivers.mcap_messages import DataSection
-from drivers.mcap_records import LogFile
-from drivers.mcap_writer import LogWriter
-from drivers.rotating_log import NOTICE, WARNING, RotatingLog
-from tests.drivers.mcap_logs import COMPRESSED, LOWER, START_NS, picture
+from drivers.logs.file_lock import is_held
+from drivers.logs.log_folder import LogFolder, Rotation
+from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_messages import DataSection
+from drivers.logs.mcap_records import LogFile
+from drivers.logs.mcap_writer import LogWriter
+from drivers.logs.rotating_log import NOTICE, WARNING, RotatingLog
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, picture
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 RIG = {"rig.toml": b"version = 1"}
 ROOMY = Rotation(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0, retry_s=0.5)
 TICK_NS = 33_333_333
@@ -235,7 +235,7 @@ from pathlib import Path
 from dataclasses import replace
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
-from tests.drivers.test_rotating_log import Bench, ROOMY
+from tests.drivers.logs.test_rotating_log import Bench, ROOMY
 recording = Bench(Path(sys.argv[1]), ROOMY)
 recording.write(200, size=10_000)
 state = recording.state

@@ -17,10 +17,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from drivers.errors import BrokenFrame, DriverError
-from drivers.mcap_reader import LogReader
-from drivers.mcap_records import MAGIC
-from drivers.ros_image import parse_image
-from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, Entry, image, pairs, picture, write_log
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.mcap_records import MAGIC
+from drivers.logs.ros_image import parse_image
+from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, Entry, image, pairs, picture, write_log
 
 LAYOUTS: list[dict[str, Any]] = [
     {"compression": CompressionType.LZ4, "chunk_size": 700},

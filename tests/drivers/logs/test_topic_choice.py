@@ -7,9 +7,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
-from drivers.mcap_reader import LogReader
-from drivers.topic_choice import choose_topics
-from tests.drivers.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.topic_choice import choose_topics
+from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
 

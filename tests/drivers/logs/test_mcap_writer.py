@@ -14,9 +14,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError
-from drivers.mcap_reader import LogReader
-from drivers.mcap_writer import LogWriter, schema_text
-from tests.drivers.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, UPPER, Entry, pairs, text
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.mcap_writer import LogWriter, schema_text
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, UPPER, Entry, pairs, text
 
 RIG = {"rig.toml": b"version = 1", "omnid.toml": b""}
 
@@ -60,8 +60,8 @@ def test_the_file_is_what_ros_writes(tmp_path: Path) -> None:
 
 DIES = """
 import os, sys
-from drivers.mcap_writer import LogWriter
-from tests.drivers.mcap_logs import pairs
+from drivers.logs.mcap_writer import LogWriter
+from tests.drivers.logs.mcap_logs import pairs
 log = LogWriter(sys.argv[1], {"rig.toml": b"version = 1"}, int(sys.argv[2]))
 for entry in pairs(50):
     log.write(entry.topic, entry.type, entry.data, entry.log_time_ns)
@@ -73,7 +73,7 @@ os._exit(9)
 def test_a_crash_loses_no_more_than_the_last_chunk_or_second(tmp_path: Path, chunk_bytes: int) -> None:
     path = tmp_path / "log.mcap"
     command = [sys.executable, "-c", DIES, str(path), str(chunk_bytes)]
-    assert subprocess.run(command, cwd=Path(__file__).parents[2], check=False).returncode == 9
+    assert subprocess.run(command, cwd=Path(__file__).parents[3], check=False).returncode == 9
     reader = LogReader(path)
     count = len(list(reader.frames()))
     assert (95 if chunk_bytes == 2000 else 80) <= count < 100

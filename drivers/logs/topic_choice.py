@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
-from drivers.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 
 _WORDS: dict[str, Camera] = {
     "lower": "lower",

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.errors import DriverError
-from drivers.file_lock import hold
+from drivers.logs.file_lock import hold
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.errors import DriverError
-from drivers.log_folder import LogFolder, Rotation, delete, without_part
-from drivers.mcap_writer import LogWriter
+from drivers.logs.log_folder import LogFolder, Rotation, delete, without_part
+from drivers.logs.mcap_writer import LogWriter
 
 Report = Callable[[int, str], None]  # how grave it is and one line; the numbers of syslog and journald (RFC 5424)
 WARNING: Final = 4

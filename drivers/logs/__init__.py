@@ -1,0 +1,1 @@
+"""Logs: MCAP files read, written, repaired and rotated."""
