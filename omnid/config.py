@@ -7,9 +7,9 @@ from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
-from drivers.differential_drive import DifferentialDrive
 from drivers.logs.log_folder import Rotation
-from drivers.motor_protocols import PROTOCOLS
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.registry import PROTOCOLS
 from omnid.core.control.heading_controller import HeadingLimits
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.velocity_limits import CommandLimits

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
-from drivers.serial_motor import Late
+from drivers.motors.serial_motor import Late
 from omnid.controller.statistics import Account, Tick
 from omnid.core.control.heading_controller import Drive, HeadingHold, HeadingLimits, Setpoint
 from omnid.core.control.heading_goal import HeadingGoal

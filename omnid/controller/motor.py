@@ -7,10 +7,10 @@ from contextlib import ExitStack
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
-from drivers.motor_protocols import PROTOCOLS
-from drivers.serial_motor import SerialMotor, Silence
-from drivers.simulated_controllers import TWINS
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.serial_motor import SerialMotor, Silence
+from drivers.motors.simulated.controllers import TWINS
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import MotorConfig
 from omnid.engine.graph import Slot
 

@@ -16,7 +16,7 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.motor import MotorTick, open_motor
 from omnid.diagnostics.input_warnings import doubts, found_nothing

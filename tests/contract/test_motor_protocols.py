@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motor_protocol import Framer, MotorProtocol
-from drivers.motor_protocols import PROTOCOLS
-from drivers.simulated_controllers import TWINS
-from drivers.simulated_motor import SimulatedController
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Framer, MotorProtocol
+from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.simulated.controllers import TWINS
+from drivers.motors.simulated.simulated_motor import SimulatedController
 from tests.contract.twins import BASE, LONG_MS, NAMES, answer, controller_of
 
 WIRINGS = [

@@ -11,9 +11,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motor_protocols import PROTOCOLS
-from drivers.serial_motor import Late, SerialMotor, Silence
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.serial_motor import Late, SerialMotor, Silence
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from tests.contract.twins import (
     ANSWER_S,
     BASE,

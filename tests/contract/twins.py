@@ -6,15 +6,15 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.motor_protocol import Framer, Script, T
-from drivers.motor_protocols import PROTOCOLS
-from drivers.serial_motor import SerialMotor
-from drivers.simulated_base import TwinLimits
-from drivers.simulated_controllers import TWINS
-from drivers.simulated_line import SimulatedLine
-from drivers.simulated_motor import SimulatedController, SimulatedMotor
-from drivers.simulated_vesc import SimulatedVesc
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Framer, Script, T
+from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.serial_motor import SerialMotor
+from drivers.motors.simulated.controllers import TWINS
+from drivers.motors.simulated.simulated_base import TwinLimits
+from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_vesc import SimulatedVesc
 
 NAMES = sorted(PROTOCOLS)
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing is measured against it

@@ -22,8 +22,8 @@ from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import Pictures
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
-from drivers.simulated_line import SimulatedLine
-from drivers.simulated_motor import LONGEST_ABSENCE_S
+from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_motor import LONGEST_ABSENCE_S
 from omnid.runs.log_rig import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.hardware.guest_report import names_in, passed, run_tests

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from drivers.simulated_line import SimulatedLine
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec
 
 ROOT = Path(__file__).parents[2]

@@ -18,8 +18,8 @@ import zenoh
 from mcap.reader import make_reader
 
 from drivers.motor import VelocityCommand, is_stop
-from drivers.serial_motor import SerialMotor
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.serial_motor import SerialMotor
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.motor import MotorTick
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum

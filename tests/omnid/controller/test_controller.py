@@ -13,8 +13,8 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.serial_motor import Late, SerialMotor
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.serial_motor import Late, SerialMotor
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Arrived, Heading, Helm, HelmSettings
 from omnid.controller.statistics import Logbook
 from omnid.core.control import safety_rules as fail_safe

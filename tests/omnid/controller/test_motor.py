@@ -6,10 +6,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motor_protocols import PROTOCOLS
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.registry import PROTOCOLS
 from omnid.config import Config, MotorConfig
 from omnid.controller.motor import open_motor
 from omnid.settings import parse

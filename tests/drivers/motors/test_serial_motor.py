@@ -13,14 +13,22 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
-from drivers.line_protocol import LineProtocol, SetWatchdog, Status, Velocity, WatchdogSet, decode, encode
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motor_protocol import Script, T
-from drivers.serial_motor import SerialMotor
-from drivers.simulated_line import SimulatedLine
-from drivers.simulated_motor import SimulatedMotor
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, T
+from drivers.motors.protocols.line_protocol import (
+    LineProtocol,
+    SetWatchdog,
+    Status,
+    Velocity,
+    WatchdogSet,
+    decode,
+    encode,
+)
+from drivers.motors.serial_motor import SerialMotor
+from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing here is measured against it
 ANSWER_S = 2.0

@@ -8,9 +8,9 @@ import random
 
 import pytest
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
+from drivers.motors.differential_drive import DifferentialDrive
 
 
 def command(velocity_mps: float, yaw_rate_radps: float) -> VelocityCommand:

@@ -11,8 +11,8 @@ import tty
 from typing import Protocol
 
 from drivers.motor import VelocityCommand
-from drivers.simulated_base import STEP_S, Pose, SimulatedBase
-from drivers.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
+from drivers.motors.simulated.simulated_line import SimulatedLine
 
 READ_LIMIT_BYTES = 4096
 LONGEST_ABSENCE_S = 0.05  # a twin that got no processor for longer stands still with its clocks: nobody was silent

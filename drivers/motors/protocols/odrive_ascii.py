@@ -22,10 +22,10 @@ import operator
 import re
 from collections.abc import Sequence
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.motor_protocol import Script, TextFramer, require_watchdog
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, TextFramer, require_watchdog
 
 AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800

@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 import re
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motor_protocol import Script, TextFramer
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, TextFramer
 
 AUTO_STOP_MS = 2000
 FRAME_S = 0.033

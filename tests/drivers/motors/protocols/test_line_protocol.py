@@ -8,7 +8,8 @@ import random
 import pytest
 
 from drivers.errors import DriverError
-from drivers.line_protocol import (
+from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motors.protocols.line_protocol import (
     MAX_LINE,
     LineAssembler,
     Message,
@@ -21,7 +22,6 @@ from drivers.line_protocol import (
     decode,
     encode,
 )
-from drivers.motor import MotorStatus, VelocityCommand, stop_command
 
 STATUS = MotorStatus(0.25, -1.5, 0.125, watchdog_expired=True, fault=7, battery_v=12.6)
 MESSAGES: list[Message] = [

@@ -1,13 +1,13 @@
-"""The twin of two VESCs, one on the port and one behind it on CAN; the source is named in drivers/vesc.py."""
+"""The twin of two VESCs, one on the port and one behind it on CAN; the source is named in drivers/motors/protocols/vesc.py."""
 
 from __future__ import annotations
 
 import math
 import struct
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.simulated_base import LEFT, RIGHT, SimulatedBase, answered
-from drivers.vesc import PacketFramer
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.vesc import PacketFramer
+from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SimulatedBase, answered
 
 _LOCAL_ID = 77
 _SET_RPM, _GET_APPCONF, _ALIVE, _FORWARD_CAN, _GET_VALUES_SELECTIVE = 8, 17, 30, 34, 50

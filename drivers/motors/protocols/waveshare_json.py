@@ -18,9 +18,9 @@ from __future__ import annotations
 import json
 import math
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motor_protocol import Script, TextFramer, heard
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, TextFramer, heard
 
 SPEED, FEEDBACK, STREAM, HEARTBEAT, INTERVAL, ECHO, BASE_INFO = 1, 130, 131, 136, 142, 143, 1001
 MAX_WHEEL_MPS = 2.0

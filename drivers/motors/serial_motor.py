@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import serial  # type: ignore[import-untyped]
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
-from drivers.line_protocol import LineProtocol
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motor_protocol import MotorProtocol, Script, T
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import MotorProtocol, Script, T
+from drivers.motors.protocols.line_protocol import LineProtocol
 
 CONNECT_TRY_S = 0.2
 STOPS_AT_CLOSE = 3

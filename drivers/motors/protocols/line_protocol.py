@@ -37,10 +37,10 @@ import math
 import re
 from dataclasses import dataclass, replace
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motor_protocol import Script, heard, require_watchdog
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, heard, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64

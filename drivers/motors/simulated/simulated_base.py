@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motor_protocol import Framer
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Framer
 
 STEP_S = 0.005
 LONGEST_ADVANCE_S = 60.0

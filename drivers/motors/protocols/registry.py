@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.line_protocol import LineProtocol
-from drivers.motor_protocol import MotorProtocol
-from drivers.odrive_ascii import ODriveAscii
-from drivers.roboteq import MIXED, POWER, Roboteq
-from drivers.ros_arduino_bridge import RosArduinoBridge
-from drivers.vesc import Vesc
-from drivers.waveshare_json import WaveshareJson
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import MotorProtocol
+from drivers.motors.protocols.line_protocol import LineProtocol
+from drivers.motors.protocols.odrive_ascii import ODriveAscii
+from drivers.motors.protocols.roboteq import MIXED, POWER, Roboteq
+from drivers.motors.protocols.ros_arduino_bridge import RosArduinoBridge
+from drivers.motors.protocols.vesc import Vesc
+from drivers.motors.protocols.waveshare_json import WaveshareJson
 
 PROTOCOLS: Mapping[str, Callable[[DifferentialDrive], MotorProtocol]] = {
     "line": LineProtocol,

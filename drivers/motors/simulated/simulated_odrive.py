@@ -1,13 +1,13 @@
-"""The twin of an ODrive v3 with two axes; the source is named in drivers/odrive_ascii.py."""
+"""The twin of an ODrive v3 with two axes; the source is named in drivers/motors/protocols/odrive_ascii.py."""
 
 from __future__ import annotations
 
 import math
 import re
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.motor_protocol import TextFramer
-from drivers.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, answered
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, answered
 
 _FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"
 _WATCHDOG_EXPIRED, _CLOSED_LOOP, _IDLE = 0x800, 8, 1

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.line_protocol import (
+from drivers.motor import MotorStatus, VelocityCommand, is_stop
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
     LineAssembler,
     ProtocolError,
@@ -16,8 +17,7 @@ from drivers.line_protocol import (
     decode,
     encode,
 )
-from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.simulated_base import SimulatedBase, TwinLimits, answered
+from drivers.motors.simulated.simulated_base import SimulatedBase, TwinLimits, answered
 
 
 class SimulatedLine:

@@ -21,10 +21,10 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motor_protocol import Script, T
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, T
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status

@@ -1,4 +1,4 @@
-"""The twin of a Waveshare UGV board; the source is named in drivers/waveshare_json.py."""
+"""The twin of a Waveshare UGV board; the source is named in drivers/motors/protocols/waveshare_json.py."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 import math
 from typing import Any
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.motor_protocol import TextFramer
-from drivers.simulated_base import SimulatedBase, answered
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.simulated.simulated_base import SimulatedBase, answered
 
 _TOP_MPS = 2.0
 _SETTINGS = (131, 136, 142, 143)

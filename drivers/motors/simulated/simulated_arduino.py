@@ -1,13 +1,13 @@
-"""The twin of an Arduino with ROSArduinoBridge; the source is named in drivers/ros_arduino_bridge.py."""
+"""The twin of an Arduino with ROSArduinoBridge; the source is named in drivers/motors/protocols/ros_arduino_bridge.py."""
 
 from __future__ import annotations
 
 import math
 import re
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.motor_protocol import TextFramer
-from drivers.simulated_base import SimulatedBase, answered
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.simulated.simulated_base import SimulatedBase, answered
 
 _AUTO_STOP_MS, _LOOP_S = 2000, 0.033
 

@@ -1,14 +1,14 @@
-"""The twin of a Roboteq dual-channel controller; the manual is named in drivers/roboteq.py."""
+"""The twin of a Roboteq dual-channel controller; the manual is named in drivers/motors/protocols/roboteq.py."""
 
 from __future__ import annotations
 
 import math
 import re
 
-from drivers.differential_drive import DifferentialDrive
-from drivers.motor_protocol import TextFramer
-from drivers.roboteq import MIXED, RPM
-from drivers.simulated_base import SimulatedBase, answered
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.roboteq import MIXED, RPM
+from drivers.motors.simulated.simulated_base import SimulatedBase, answered
 
 _ORDER = re.compile(rb"!([SG]) ([12]) (-?[0-9]{1,5})")
 _TOP = {b"S": 65535, b"G": 1000}

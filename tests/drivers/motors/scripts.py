@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.motor_protocol import Script, T
+from drivers.motors.motor_protocol import Script, T
 
 
 class Unfinished(Exception):  # noqa: N818 - it is what was found

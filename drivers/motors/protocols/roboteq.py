@@ -19,10 +19,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from drivers.differential_drive import DifferentialDrive
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motor_protocol import Script, TextFramer, require_watchdog
+from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.motor_protocol import Script, TextFramer, require_watchdog
 
 RPM, POWER, MIXED = "rpm", "power", "mixed"
 FULL = 1000  # of "!G"

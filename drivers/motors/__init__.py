@@ -1,0 +1,1 @@
+"""Motor controllers behind a serial port."""

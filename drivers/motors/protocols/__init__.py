@@ -1,0 +1,1 @@
+"""Protocols of motor controllers: commands to bytes and back, no I/O."""

@@ -1,0 +1,1 @@
+"""Simulated motor controllers, byte for byte, for demonstrations and tests."""
