@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.scenes import build, write_log
+from tests.simulation import build, write_log
 
 PAIRS = 24
 

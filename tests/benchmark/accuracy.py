@@ -1,6 +1,6 @@
 """A table of errors against the truth: `python -m tests.benchmark.accuracy FOLDER ... [-- OPTION OF omnid replay ...]`.
 
-Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.scenes` writes them.
+Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.simulation` writes them.
 """
 
 from __future__ import annotations

@@ -14,9 +14,9 @@ from calib.boards.board import Board
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from tests.scenes import textures
-from tests.scenes.boards import Studio, board_pose, in_view, six_walls
-from tests.scenes.sensor import Exposure, Sensor
+from tests.simulation import textures
+from tests.simulation.boards import Studio, board_pose, in_view, six_walls
+from tests.simulation.sensor import Exposure, Sensor
 
 Random = np.random.Generator
 Image = NDArray[np.uint8]

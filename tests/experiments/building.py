@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.models.camera import Array
-from tests.scenes import textures
-from tests.scenes.builders import CEILING_M, Point, box, posters, wall
-from tests.scenes.paths import planar_poses
-from tests.scenes.surfaces import Rectangle, Scene
+from tests.simulation import textures
+from tests.simulation.builders import CEILING_M, Point, box, posters, wall
+from tests.simulation.paths import planar_poses
+from tests.simulation.surfaces import Rectangle, Scene
 
 PX_PER_M = 200.0  # of floor and ceiling
 DOOR_M = (0.95, 2.1)  # width, height

@@ -13,7 +13,7 @@ import numpy as np
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from tests.benchmark.accuracy import omnid
-from tests.experiments import pictures
+from tests.experiments import figures as pictures
 from tests.experiments.views import Experiment
 
 KLT = ("--method", "paper", "--tracker", "klt")

@@ -20,8 +20,8 @@ from calib import se3
 from calib.models.camera import Array, OmniCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from tests.scenes.sensor import Floats
-from tests.scenes.surfaces import Rectangle, Scene
+from tests.simulation.sensor import Floats
+from tests.simulation.surfaces import Rectangle, Scene
 
 MIRROR_M = 0.01  # the conic's semi-latus rectum: how wide the mirror is at the height of the viewpoint
 INSTALL = "apt-get install povray"

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from tests.experiments.povray import shoot, write_world
-from tests.scenes.logs import pack_log
-from tests.scenes.recipes import Run
-from tests.scenes.sensor import Floats
+from tests.simulation.logs import pack_log
+from tests.simulation.recipes import Run
+from tests.simulation.sensor import Floats
 
 CAMERAS = ("lower", "upper")
 

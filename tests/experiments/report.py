@@ -12,7 +12,8 @@ from pathlib import Path
 
 import cv2
 
-from tests.experiments import path_following, pictures, speed, tables, turn_tracking, wall_matching, whole_building
+from tests.experiments import figures as pictures
+from tests.experiments import path_following, speed, tables, turn_tracking, wall_matching, whole_building
 from tests.experiments.tables import Seeds, Values
 from tests.experiments.views import ORIGIN, Experiment
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from calib.rig import Rig
 from tests.experiments.building import building, round_trip
-from tests.scenes import paths
-from tests.scenes.builders import CEILING_M, corridor
-from tests.scenes.builders import wall as upright
-from tests.scenes.recipes import TURN_DEG, Run
-from tests.scenes.rigs import RIM, make_rig
-from tests.scenes.surfaces import Rectangle, Scene
-from tests.scenes.textures import PAINTERS
+from tests.simulation import paths
+from tests.simulation.builders import CEILING_M, corridor
+from tests.simulation.builders import wall as upright
+from tests.simulation.recipes import TURN_DEG, Run
+from tests.simulation.rigs import RIM, make_rig
+from tests.simulation.surfaces import Rectangle, Scene
+from tests.simulation.textures import PAINTERS
 
 WALL_M = 2.0  # section V.B: from the cameras to the wall
 WALL_SIZE_M = (9.0, CEILING_M)

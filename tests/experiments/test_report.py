@@ -17,7 +17,7 @@ from tests.experiments.scenes import build
 from tests.experiments.tables import percent, spread
 from tests.experiments.views import Experiment
 from tests.experiments.whole_building import map_errors
-from tests.scenes.recipes import Run
+from tests.simulation.recipes import Run
 
 # Rendered by POV-Ray: render brick --seed 1 --size 512 --pairs 1, turns --size 448 --pairs 5 --supersample 3.
 SMALL = Path(__file__).parent / "small"

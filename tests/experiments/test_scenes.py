@@ -18,8 +18,8 @@ from tests.experiments.rendering import render_log
 from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
 from tests.experiments.truth import cast, sees, surface_distance_m
 from tests.experiments.views import Experiment
-from tests.scenes.caster import render_grey
-from tests.scenes.rigs import make_rig
+from tests.simulation.ray_caster import render_grey
+from tests.simulation.rigs import make_rig
 
 needs_povray = pytest.mark.skipif(not available(), reason=f"POV-Ray is not installed: {INSTALL}")
 CROOKED = (1.0, -2.0, 20.0)

@@ -19,7 +19,7 @@ from omnid.core.odometry.yaw_search import correlation_peaks
 from tests.experiments.scenes import MOVED_TURNS_DEG, TURNS_DEG
 from tests.experiments.truth import Flags, cast, sees
 from tests.experiments.views import Experiment, Views, look
-from tests.scenes.recipes import Run
+from tests.simulation.recipes import Run
 
 FEATURES = 500
 RIGHT_PX = 3.0  # from where the truth has it

@@ -19,7 +19,7 @@ from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.log_pairing import PairSync
 from tests.experiments.scenes import RigOptions, build
-from tests.scenes.recipes import Run
+from tests.simulation.recipes import Run
 
 ORIGIN = "experiment.json"
 

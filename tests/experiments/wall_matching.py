@@ -14,11 +14,11 @@ from omnid.config import Config
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.messages import Panoramas
 from omnid.stages.stereo import Stereo
-from tests.experiments import pictures
+from tests.experiments import figures as pictures
 from tests.experiments.scenes import WALL_M
 from tests.experiments.truth import cast
 from tests.experiments.views import Experiment, Views, look
-from tests.scenes.recipes import Run
+from tests.simulation.recipes import Run
 
 METHODS = {"original SAD": "sad", "enhanced SAD": "enhanced", "semi-global (omnid)": "semiglobal"}
 WRONG_M = 0.05  # off the wall

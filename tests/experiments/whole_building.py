@@ -14,12 +14,12 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import Trajectory, read_tum
 from tests.benchmark.accuracy import omnid
-from tests.experiments import pictures
+from tests.experiments import figures as pictures
 from tests.experiments.path_following import PAPER, against_truth
 from tests.experiments.truth import sees, surface_distance_m
 from tests.experiments.views import Experiment
-from tests.scenes.recipes import Run
-from tests.scenes.surfaces import Rectangle
+from tests.simulation.recipes import Run
+from tests.simulation.surfaces import Rectangle
 
 METHODS: dict[str, tuple[str, ...]] = {"the paper": PAPER, "omnid": ()}
 NEAR_M = 4.0  # of the path: the map is judged there

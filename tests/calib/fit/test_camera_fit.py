@@ -17,8 +17,8 @@ from calib.fit.unified_fit import axes
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
-from tests.scenes.boards import Studio, around
-from tests.scenes.sensor import Sensor
+from tests.simulation.boards import Studio, around
+from tests.simulation.sensor import Sensor
 
 BOARD = Board(7, 6, 0.03)
 MASK = Mask((394.2, 380.9), 60.0, 372.0)

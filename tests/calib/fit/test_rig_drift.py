@@ -12,7 +12,7 @@ from calib.fit.rig_drift import corrected, find_drift
 from calib.masks.rim_check import rim_shift
 from calib.models.camera import Array, Mask
 from calib.rig import Rig
-from tests.scenes.rigs import misturned
+from tests.simulation.rigs import misturned
 
 
 def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:

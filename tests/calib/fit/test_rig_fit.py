@@ -16,7 +16,7 @@ from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from tests.scenes.boards import around_both
+from tests.simulation.boards import around_both
 
 LOWER = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), (780, 768))
 UPPER = UnifiedCamera(0.97, (-207.0, 206.2), (391.2, 382.9), (780, 768))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
-from tests.scenes.sensor import Exposure, Sensor
-from tests.scenes.textures import value_noise
+from tests.simulation.sensor import Exposure, Sensor
+from tests.simulation.textures import value_noise
 
 CENTER, RIM = (201.4, 197.2), 176.0
 SIZE = (400, 396)

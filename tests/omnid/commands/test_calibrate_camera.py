@@ -17,7 +17,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from tests.scenes.boards import Studio, around
+from tests.simulation.boards import Studio, around
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-110.0, 110.5), (178.3, 181.1), (360, 362))

@@ -16,7 +16,7 @@ from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_o
 from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
-from tests.scenes.rigs import misturned
+from tests.simulation.rigs import misturned
 
 Turn = tuple[float, float, float]
 

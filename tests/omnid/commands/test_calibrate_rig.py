@@ -20,8 +20,8 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from tests.scenes.boards import Studio, around_both
-from tests.scenes.sensor import Sensor
+from tests.simulation.boards import Studio, around_both
+from tests.simulation.sensor import Sensor
 
 BOARD = Board(7, 6, 0.03)
 T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.omnid.core.scenery import Eyes
-from tests.scenes import corridor, make_rig
+from tests.simulation import corridor, make_rig
 
 
 @pytest.fixture(scope="session")

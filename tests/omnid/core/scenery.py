@@ -15,7 +15,7 @@ from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.odometry.tracking import Wrapped
 from omnid.core.stereo.matcher import Matcher, Matching
-from tests.scenes import Exposure, Scene, Sensor, render_grey
+from tests.simulation import Exposure, Scene, Sensor, render_grey
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

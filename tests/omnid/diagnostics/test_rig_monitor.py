@@ -21,9 +21,9 @@ from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
 from omnid.stages.log_pairing import PairSync
-from tests.scenes import build, write_log
-from tests.scenes.logs import PERIOD_NS
-from tests.scenes.rigs import misturned
+from tests.simulation import build, write_log
+from tests.simulation.logs import PERIOD_NS
+from tests.simulation.rigs import misturned
 
 SECONDS = 10**9
 LOOK_S = 5.0

@@ -28,7 +28,7 @@ from omnid.messages import Odometry
 from omnid.stages.live_pairing import LivePair
 from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
 from omnid.transport.commands import Commands
-from tests.scenes import build
+from tests.simulation import build
 
 SIZE = 256
 JPEG = cv2.imencode(".jpg", np.full((SIZE, SIZE), 90, np.uint8))[1].tobytes()

@@ -15,7 +15,7 @@ from drivers.frame import Camera, Frame
 from omnid.config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.live_pairing import WAITING, LivePair
-from tests.scenes import build
+from tests.simulation import build
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333

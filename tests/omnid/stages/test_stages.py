@@ -34,7 +34,7 @@ from omnid.stages.stereo import Stereo
 from tests.conftest import PAIRS
 from tests.omnid.allocations import taken
 from tests.omnid.core.scenery import texture, wrapped
-from tests.scenes import build, make_rig, render_grey
+from tests.simulation import build, make_rig, render_grey
 
 CONFIG = Config()
 MS = 1_000_000

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.replay.faults import TRIALS
 from tests.replay.faults.trial import Outcome, Place
-from tests.scenes import build, write_log
+from tests.simulation import build, write_log
 
 
 def scene(folder: Path) -> Path:

@@ -13,8 +13,8 @@ from omnid.core.odometry.odometry import DEGRADED, LOST, TRACKING, Ego, EgoMotio
 from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.odometry.tracking import Klt
 from tests.omnid.core.scenery import Eyes, motion_errors
-from tests.scenes import corridor
-from tests.scenes.paths import planar_poses
+from tests.simulation import corridor
+from tests.simulation.paths import planar_poses
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.places.relocalisation import Relocaliser
 from tests.omnid.core.scenery import Eyes, motion_errors
-from tests.scenes import corridor
-from tests.scenes.paths import planar_poses
+from tests.simulation import corridor
+from tests.simulation.paths import planar_poses
 
 T_ODOM_KEYFRAME = se3.exp([3.0, 1.0, 0, 0, 0, 2.0])
 PLACES = planar_poses(np.array([[0.0, 0], [0.25, 0.17]]), np.array([0.0, 0.7]))

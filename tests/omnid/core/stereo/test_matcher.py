@@ -11,7 +11,7 @@ from calib import se3
 from omnid.core.stereo.edges import smooth
 from omnid.core.stereo.matcher import METHODS, Matcher, Matching
 from tests.omnid.core.scenery import PAD_PX, Eyes, texture, turned
-from tests.scenes import make_rig, room
+from tests.simulation import make_rig, room
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]

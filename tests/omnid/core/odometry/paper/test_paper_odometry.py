@@ -15,7 +15,7 @@ from omnid.core.odometry.stereo_frame import Sight
 from omnid.core.odometry.tracking import Klt
 from omnid.errors import OmnidError
 from tests.omnid.core.scenery import Eyes, motion_errors, texture, turned, wrapped
-from tests.scenes.paths import planar_poses
+from tests.simulation.paths import planar_poses
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calib.models.camera import Array
-from tests.scenes import textures
-from tests.scenes.surfaces import Rectangle, Scene, Texture
+from tests.simulation import textures
+from tests.simulation.surfaces import Rectangle, Scene, Texture
 
 PX_PER_M = 320.0  # finer than a 768 pixel camera resolves at 0.6 m
 CEILING_M = 2.6

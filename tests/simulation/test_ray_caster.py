@@ -8,9 +8,9 @@ import pytest
 
 from calib import se3
 from calib.rig import MountedCamera, Rig
-from tests.scenes import Rectangle, Scene, build, make_rig, render
-from tests.scenes.builders import wall
-from tests.scenes.paths import planar_poses
+from tests.simulation import Rectangle, Scene, build, make_rig, render
+from tests.simulation.builders import wall
+from tests.simulation.paths import planar_poses
 
 SIZE = 192
 SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1

@@ -1,4 +1,4 @@
-"""`python -m tests.scenes NAME --seed N --out DIR [--size 768] [--pairs N]` renders a log with its truth."""
+"""`python -m tests.simulation NAME --seed N --out DIR [--size 768] [--pairs N]` renders a log with its truth."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 import time
 from pathlib import Path
 
-from tests.scenes.logs import write_log
-from tests.scenes.recipes import RECIPES, build
+from tests.simulation.logs import write_log
+from tests.simulation.recipes import RECIPES, build
 
 
 def main() -> None:
     """Renders one recipe into a folder."""
-    parser = argparse.ArgumentParser(prog="python -m tests.scenes", description="Render a log with exact truth.")
+    parser = argparse.ArgumentParser(prog="python -m tests.simulation", description="Render a log with exact truth.")
     parser.add_argument("name", choices=sorted(RECIPES))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for log.mcap, camchain.yaml and truth.txt")

@@ -9,11 +9,11 @@ import numpy as np
 
 from calib.models.camera import Array
 from calib.rig import Rig
-from tests.scenes import paths
-from tests.scenes.builders import corridor, room
-from tests.scenes.rigs import make_rig
-from tests.scenes.sensor import Sensor
-from tests.scenes.surfaces import Scene
+from tests.simulation import paths
+from tests.simulation.builders import corridor, room
+from tests.simulation.rigs import make_rig
+from tests.simulation.sensor import Sensor
+from tests.simulation.surfaces import Scene
 
 TURN_DEG = 94.0
 

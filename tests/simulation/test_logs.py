@@ -13,9 +13,9 @@ from ruamel.yaml import YAML
 from calib import se3
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig
-from tests.scenes import RECIPES, Exposure, Sensor, build, make_rig, write_log
-from tests.scenes.paths import back_again, spline_path, turns
-from tests.scenes.recipes import TURN_DEG
+from tests.simulation import RECIPES, Exposure, Sensor, build, make_rig, write_log
+from tests.simulation.paths import back_again, spline_path, turns
+from tests.simulation.recipes import TURN_DEG
 
 SIZE = 96
 SCHEMA = "sensor_msgs/msg/CompressedImage"

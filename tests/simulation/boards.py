@@ -12,10 +12,10 @@ from calib import se3
 from calib.boards.board import Board
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
-from tests.scenes.caster import render_grey
-from tests.scenes.sensor import Exposure, Sensor
-from tests.scenes.surfaces import Rectangle, Scene
-from tests.scenes.textures import value_noise
+from tests.simulation.ray_caster import render_grey
+from tests.simulation.sensor import Exposure, Sensor
+from tests.simulation.surfaces import Rectangle, Scene
+from tests.simulation.textures import value_noise
 
 SQUARE_PX = 24  # of the board's texture
 MARGIN_SQUARES = 1.0  # white around the squares

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.models.camera import Array
-from tests.scenes.surfaces import Texture
+from tests.simulation.surfaces import Texture
 
 Random = np.random.Generator
 Size = tuple[int, int]  # (width, height) [px]

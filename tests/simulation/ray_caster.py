@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array
 from calib.rig import MountedCamera
-from tests.scenes.surfaces import Rectangle, Scene
+from tests.simulation.surfaces import Rectangle, Scene
 
 Floats = NDArray[np.float32]
 TILE_PX = 32

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.models.camera import Array
-from tests.scenes.recipes import Run
-from tests.scenes.surfaces import Rectangle
+from tests.simulation.recipes import Run
+from tests.simulation.surfaces import Rectangle
 
 DPI = 110
 STYLES = (("0.65", ":"), ("0.5", "--"), ("0.0", "-"))

@@ -16,9 +16,9 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
-from tests.scenes.caster import render_grey
-from tests.scenes.sensor import Exposure, Floats, Sensor
-from tests.scenes.surfaces import Scene
+from tests.simulation.ray_caster import render_grey
+from tests.simulation.sensor import Exposure, Floats, Sensor
+from tests.simulation.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
