@@ -32,12 +32,12 @@ class Quality:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """The camera in a `camera.toml`; its mask's picture is looked for beside it."""
+    """The camera in a `camera.toml`; its mask's image is looked for beside it."""
     return parse_camera(read_bytes(path), path.parent, str(path))
 
 
 def parse_camera(text: str | bytes, folder: Path | None = None, name: str = "camera.toml") -> CameraFile:
-    """The camera in the text of a `camera.toml`; folder holds its mask's picture."""
+    """The camera in the text of a `camera.toml`; folder holds its mask's image."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
     table.only(("schema", "camera", "quality"))
@@ -45,7 +45,7 @@ def parse_camera(text: str | bytes, folder: Path | None = None, name: str = "cam
 
 
 def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: str = "") -> str:
-    """The text of a `camera.toml`; mask_image names the mask's picture, "" embeds it."""
+    """The text of a `camera.toml`; mask_image names the mask's image, "" embeds it."""
     parts = [f"schema = {SCHEMA}\n", camera_text("camera", file.camera, ""),
              intrinsics_text("camera", file.camera)]
     if file.mask is not None:

@@ -24,7 +24,7 @@ OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
 
 def read_camera_table(table: Table, folder: Path | None, others: Collection[str] = ()
                       ) -> tuple[OmniCamera, Mask | None]:
-    """The camera and the mask of a table, which may have other keys; folder holds the mask's picture if it has one."""
+    """The camera and the mask of a table, which may have other keys; folder holds the mask's image if it has one."""
     model = table.choice("model", ("omni", "ocam"))
     table.only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
     camera = _omni(table) if model == "omni" else _ocam(table)
@@ -66,7 +66,7 @@ def _mask(table: Table, folder: Path | None) -> Mask:
     image = _mask_image(values, folder) if values.has("image") else None
     if image is not None and image.shape[::-1] != table.size("size"):
         raise CalibError(f"{table.file}: {values.path}.image: expected {table.size('size')} pixels (width, height) "
-                         f"like the camera's pictures, found {image.shape[::-1]}")
+                         f"like the camera's images, found {image.shape[::-1]}")
     return Mask((u, v), inner, outer, image)
 
 
@@ -77,7 +77,7 @@ def _mask_image(values: Table, folder: Path | None) -> NDArray[np.uint8]:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:
         image = None
-    return values.fail("image", "a picture") if image is None else image.astype(np.uint8, copy=False)
+    return values.fail("image", "a image") if image is None else image.astype(np.uint8, copy=False)
 
 
 def _embedded(values: Table, source: str) -> bytes:
@@ -89,12 +89,12 @@ def _embedded(values: Table, source: str) -> bytes:
 
 def _beside(values: Table, source: str, folder: Path | None) -> bytes:
     if folder is None or "\0" in source:
-        values.fail("image", "an embedded picture, as there is no folder to look for a file in")
+        values.fail("image", "an embedded image, as there is no folder to look for a file in")
     return read_bytes(folder / source)
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """A picture (H, W) uint8 as the bytes of a PNG."""
+    """A image (H, W) uint8 as the bytes of a PNG."""
     return cv2.imencode(".png", image)[1].tobytes()
 
 
@@ -124,7 +124,7 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
 
 
 def mask_text(name: str, mask: Mask, image: str) -> str:
-    """The table of the mask likewise; image names its picture, "" embeds it."""
+    """The table of the mask likewise; image names its image, "" embeds it."""
     lines = ["", f"[{name}.mask]", f"center = [{number_text(mask.center[0])}, {number_text(mask.center[1])}]",
              f"inner_px = {number_text(mask.inner_px)}"]
     if np.isfinite(mask.outer_px):

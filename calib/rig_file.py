@@ -26,12 +26,12 @@ TRANSLATION_DECIMALS = 12
 
 
 def read_rig(path: Path) -> Rig:
-    """The rig in a `rig.toml`; a mask's picture is looked for beside it."""
+    """The rig in a `rig.toml`; a mask's image is looked for beside it."""
     return parse_rig(read_bytes(path), path.parent, str(path))
 
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
-    """The rig in the text of a `rig.toml`; folder holds its mask pictures, None where only embedded ones can be had."""
+    """The rig in the text of a `rig.toml`; folder holds its mask images, None where only embedded ones can be had."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
     table.only(("schema", "T_base_rig", *SIDES))
@@ -48,7 +48,7 @@ def _mounted(table: Table, folder: Path | None, transform: str) -> MountedCamera
 
 
 def write_rig(path: Path, rig: Rig) -> None:
-    """Write `rig.toml`, and a mask's picture beside it as `<stem>.lower.png` or `<stem>.upper.png`."""
+    """Write `rig.toml`, and a mask's image beside it as `<stem>.lower.png` or `<stem>.upper.png`."""
     images: dict[str, str] = {}
     for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True):
         if mounted.mask is not None and mounted.mask.image is not None:
@@ -80,7 +80,7 @@ def _write_whole(target: Path, data: bytes) -> None:
 
 
 def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
-    """The text of `rig.toml`; images names mask pictures by side, one that is not named is embedded."""
+    """The text of `rig.toml`; images names mask images by side, one that is not named is embedded."""
     parts = [f"schema = {SCHEMA}\nT_base_rig = {_matrix(rig.T_base_rig)}\n"]
     for side, mounted, topic in zip(SIDES, (rig.lower, rig.upper), rig.topics, strict=True):
         parts.append(camera_text(side, mounted.camera, topic))

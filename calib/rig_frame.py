@@ -29,7 +29,7 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
 
 
 def image_axis(camera: OmniCamera, step_px: tuple[float, float]) -> Array:
-    """Unit vector (3,) in the camera frame along which the picture runs at its centre, for a step in pixels."""
+    """Unit vector (3,) in the camera frame along which the image runs at its centre, for a step in pixels."""
     ends = camera.lift(np.array([np.subtract(camera.center, step_px), np.add(camera.center, step_px)]))
     axis = ends[1] - ends[0]
     if not np.isfinite(axis).all():

@@ -6,4 +6,4 @@ class DriverError(Exception):
 
 
 class BrokenFrame(DriverError):  # noqa: N818 - it is told of a frame, not of the program
-    """One picture cannot be decoded; the stream that brought it goes on."""
+    """One image cannot be decoded; the stream that brought it goes on."""

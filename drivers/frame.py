@@ -1,4 +1,4 @@
-"""One picture of one camera as it came off the wire, and its grey pixels."""
+"""One image of one camera as it came off the wire, and its grey pixels."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TO_GRAY = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """An undecoded picture; width, height, step and bigendian describe the raw encodings only."""
+    """An undecoded image; width, height, step and bigendian describe the raw encodings only."""
 
     seq: int  # counts the frames of this camera from 0
     stamp_ns: int  # capture time
@@ -55,18 +55,18 @@ class FrameSource(Protocol):
 
 
 def gray(frame: Frame) -> NDArray[np.uint8]:
-    """The picture as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
+    """The image as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
 
     Colours are weighed as OpenCV does, mono16 keeps its upper byte, yuyv, uyvy and nv12 their luma as it is, and an
     EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises BrokenFrame for
     anything cut, malformed or unknown.
     """
     try:
-        picture = _decompress(frame) if frame.encoding in _OPENING else _unpack(frame)
+        image = _decompress(frame) if frame.encoding in _OPENING else _unpack(frame)
     except (cv2.error, ValueError, TypeError, BufferError, OverflowError, MemoryError) as error:
         raise _broken(frame, " ".join(str(error).split())[:120]) from error
-    picture.setflags(write=False)
-    return picture
+    image.setflags(write=False)
+    return image
 
 
 def _broken(frame: Frame, reason: str) -> BrokenFrame:
@@ -78,14 +78,14 @@ def _decompress(frame: Frame) -> NDArray[np.uint8]:
     head = data[: len(_OPENING[frame.encoding])].tobytes()
     if head != _OPENING[frame.encoding]:
         raise _broken(frame, f"it starts with {head.hex() or 'nothing'}")
-    # libjpeg fills the missing rest of a cut picture with grey and calls it a success, so the end is looked for first
+    # libjpeg fills the missing rest of a cut image with grey and calls it a success, so the end is looked for first
     if not _unpadded_tail(data).endswith(_CLOSING[frame.encoding]):
         raise _broken(frame, f"its end is missing after {data.size} bytes")
     _refuse_size(frame, *(_png_size(data) if frame.encoding == "png" else _jpeg_size(data)))
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None or picture.ndim != 2 or picture.dtype != np.uint8:
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise _broken(frame, "its content is corrupt")
-    return np.ascontiguousarray(picture, np.uint8)
+    return np.ascontiguousarray(image, np.uint8)
 
 
 def _unpadded_tail(data: NDArray[np.uint8]) -> bytes:

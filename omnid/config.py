@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import Field, dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from drivers.logs.log_folder import Rotation
@@ -12,11 +10,11 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.registry import PROTOCOLS
 from omnid.core.control.heading_controller import HeadingLimits
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import CommandLimits
-from omnid.core.odometry.odometry import Limits
-from omnid.core.odometry.tracking import Klt
-from omnid.core.stereo.matcher import METHODS, Matching
-from omnid.settings import Knob, knob
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.odometry.odometry import OdometryLimits
+from omnid.core.odometry.tracking import KltSettings
+from omnid.core.stereo.matcher import MatchingSettings
+from omnid.settings import knob
 from omnid.transport.bus_config import BusConfig
 
 
@@ -24,7 +22,7 @@ from omnid.transport.bus_config import BusConfig
 class LogConfig:
     """How a log is read."""
 
-    reorder_frames: int = knob(32, "pictures that may wait for one that was written late", low=1, high=1000)
+    reorder_frames: int = knob(32, "images that may wait for one that was written late", low=1, high=1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +32,10 @@ class CamerasConfig:
     rig: str = knob("/etc/omnid/rig.toml", "the calibration of the cameras, see `omnid calibrate`")
     lower: str = knob("/dev/omnid/lower", "device of the lower camera, by a name that stays, see `omnid cameras`")
     upper: str = knob("/dev/omnid/upper", "device of the upper camera")
-    width_px: int = knob(1280, "width of the pictures, px", low=16, high=16384)
-    height_px: int = knob(960, "height of the pictures, px", low=16, high=16384)
-    rate_hz: float = knob(30.0, "pictures per second; 0: what the camera does by itself", low=0, high=1000)
-    pixel_format: str = knob("auto", "how pictures come over the wire", choices=PIXEL_FORMATS)
+    width_px: int = knob(1280, "width of the images, px", low=16, high=16384)
+    height_px: int = knob(960, "height of the images, px", low=16, high=16384)
+    rate_hz: float = knob(30.0, "images per second; 0: what the camera does by itself", low=0, high=1000)
+    pixel_format: str = knob("auto", "how images come over the wire", choices=PIXEL_FORMATS)
     auto_exposure: str = knob("keep", "automatic exposure", choices=SWITCH)
     exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
     auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
@@ -48,8 +46,8 @@ class CamerasConfig:
     focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
     power_line: str = knob("keep", "against the flicker of lamps, Hz", choices=POWER_LINE)
     controls: tuple[str, ...] = knob((), "other controls, as v4l2-ctl --list-ctrls names them: 'sharpness=2'")
-    buffers: int = knob(4, "pictures the kernel holds", low=2, high=32)
-    timeout_s: float = knob(2.0, "a camera without a picture for so long is opened anew, s", low=0.05, high=60)
+    buffers: int = knob(4, "images the kernel holds", low=2, high=32)
+    timeout_s: float = knob(2.0, "a camera without a image for so long is opened anew, s", low=0.05, high=60)
     retry_s: float = knob(2.0, "longest wait between two tries to open a lost camera, s", low=0.05, high=60)
 
     def settings(self, camera: str) -> V4l2Settings:
@@ -59,11 +57,11 @@ class CamerasConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class HelmConfig:
+class ControllerConfig:
     """When the wheels of a live robot must stand, and what they may be told at most."""
 
     deadlines: Deadlines = field(default_factory=Deadlines)
-    limits: CommandLimits = field(default_factory=CommandLimits)
+    limits: VelocityLimits = field(default_factory=VelocityLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +87,10 @@ class PairConfig:
 class PanoramaConfig:
     """What is shown on the cylinder."""
 
-    width_px: int = knob(0, "columns of a full turn, px; 0: the pictures' own resolution", low=0, high=4096)
+    width_px: int = knob(0, "columns of a full turn, px; 0: the images' own resolution", low=0, high=4096)
     elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
     pad_px: int = knob(48, "columns repeated on either side, so that windows run across the seam", low=16, high=256)
-    rim_margin_px: float = knob(4.0, "what is left out along rim and hub in the pictures, px", low=0, high=100)
+    rim_margin_px: float = knob(4.0, "what is left out along rim and hub in the images, px", low=0, high=100)
     margin_px: int = knob(7, "what is left out along the border of what both cameras show, px", low=0, high=100)
 
 
@@ -102,7 +100,7 @@ class StereoConfig:
 
     min_range_m: float = knob(0.65, "the nearest points wanted, m from the rig's axis", low=0.01, high=100)
     noise_px: float = knob(0.5, "deviation of a disparity, px: how far the map trusts a point", low=0.01, high=10)
-    matching: Matching = field(default_factory=Matching)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +111,8 @@ class OdometryConfig:
     tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
     reference: str = knob("previous", "what the paper's method measures against", choices=("previous", "keyframe"))
     noise_px: float = knob(0.1, "deviation of a tracked corner, px", low=0.01, high=10)
-    klt: Klt = field(default_factory=Klt)
-    limits: Limits = field(default_factory=Limits)
+    klt: KltSettings = field(default_factory=KltSettings)
+    limits: OdometryLimits = field(default_factory=OdometryLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +140,35 @@ class GuidanceConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DriveConfig:
+    """Geometry and wiring of a base with two driven sides."""
+
+    track_m: float = knob(
+        0.3,
+        "between the left and the right wheels, m; where they skid, what makes measured turns right",
+        low=0.01,
+        high=10,
+    )
+    wheel_radius_m: float = knob(0.05, "radius of the wheels, m", low=0.001, high=5)
+    max_wheel_mps: float = knob(
+        1.0, "no wheel is told to roll faster, m/s; for roboteq_power and _mixed: at full power", low=0.001, high=20
+    )
+    gear: float = knob(1.0, "turns of the motor for one of the wheel", low=0.001, high=10_000)
+    ticks_per_turn: float = knob(
+        1000.0, "ros_arduino_bridge: ticks of the encoder for a turn of the motor", low=1, high=1_000_000
+    )
+    pole_pairs: int = knob(7, "vesc: pole pairs of the motor", low=1, high=100)
+    reverse_left: bool = knob(False, "the left motor turns the other way round")
+    reverse_right: bool = knob(False, "the right motor turns the other way round")
+    swapped: bool = knob(False, "the controller's first motor is the right one")
+    can_id: int = knob(1, "vesc: id of the second motor's controller", low=0, high=253)
+
+    def geometry(self) -> DifferentialDrive:
+        """Return the same numbers for the protocols; DriverError for a size that is not finite and above 0."""
+        return DifferentialDrive(**asdict(self))
+
+
+@dataclass(frozen=True, slots=True)
 class MotorConfig:
     """The controller of the wheels."""
 
@@ -152,7 +179,7 @@ class MotorConfig:
     stale_s: float = knob(0.5, "the wheels are stopped when the newest command is older, s", low=0.05, high=10)
     watchdog_ms: int = knob(500, "the controller stops the wheels by itself after so long without a command, ms",
                             low=50, high=10_000)
-    drive: DifferentialDrive = field(default_factory=DifferentialDrive)
+    drive: DriveConfig = field(default_factory=DriveConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +233,7 @@ class RealtimeConfig:
                                      low=0, high=100)
     motor_priority: int = knob(20, "SCHED_FIFO priority of the motor's tick, needs LimitRTPRIO; 0: none", low=0,
                                high=99)
-    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take pictures; 0: none", low=0, high=99)
+    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take images; 0: none", low=0, high=99)
     longest_run_ms: int = knob(500, "a SCHED_FIFO thread that runs for longer without a wait ends the daemon, ms; "
                                "0: never", low=0, high=10_000)
 
@@ -224,94 +251,10 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     motor: MotorConfig = field(default_factory=MotorConfig)
-    helm: HelmConfig = field(default_factory=HelmConfig)
+    helm: ControllerConfig = field(default_factory=ControllerConfig)
     live: LiveConfig = field(default_factory=LiveConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     service: ServiceConfig = field(default_factory=ServiceConfig)
-
-
-def _knob(doc: str, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Knob:
-    return Knob(doc, low, high, choices, finite=True)
-
-
-MATCHING: Mapping[str, Knob] = {
-    "method": _knob("how one of several candidates is chosen", choices=METHODS),
-    "window_px": _knob("side of the matching window, px; odd", 3, 15),
-    "disparities": _knob("largest disparity searched, px, however near the points wanted", 8, 512),
-    "max_difference": _knob("mean difference of grey levels in the window that is still a match", 0, 255),
-    "rival": _knob("enhanced: a candidate's SAD is at most this times the best one's,", 1, 10),
-    "rival_difference": _knob("plus so many grey levels; what has one candidate only is an anchor", 0, 255),
-    "edge_threshold": _knob("Sobel response that makes an edge, 8 per grey level and pixel", 0, 1020),
-    "max_points": _knob("edge pixels matched in a pair", 100, 1_000_000),
-    "sigma_px": _knob("deviation of the Gaussian before the edges, px", 0, 10),
-    "max_candidates": _knob("candidates compared for one pixel", 2, 64),
-}
-KLT: Mapping[str, Knob] = {
-    "window_px": _knob("side of the tracking window, px", 5, 61),
-    "levels": _knob("pyramid levels above the picture", 0, 6),
-    "max_error_px": _knob("largest error of the way back, px", 0.01, 10),
-    "iterations": _knob("steps on each level", 1, 200),
-}
-LIMITS: Mapping[str, Knob] = {
-    "features": _knob("landmarks wanted in a keyframe", 20, 10_000),
-    "refresh": _knob("a keyframe is added when this share of the last one's landmarks is left", 0, 1),
-    "sparse_every": _knob("sights after which a keyframe is added where the features wanted are not reached", 1, 1000),
-    "keyframes": _knob("keyframes in the local map; 1: frame to frame", 1, 50),
-    "min_inliers": _knob("landmarks that must agree with a pose", 4, 10_000),
-    "min_share": _knob("share of the found landmarks that must agree", 0, 1),
-    "sure_inliers": _knob("below so many the pose is degraded", 4, 10_000),
-    "sure_share": _knob("below this share other turns are tried", 0, 1),
-    "max_speed_mps": _knob("faster the robot cannot be, m/s", 0.1, 100),
-    "lost_after": _knob("refused poses running that make the state lost", 1, 1000),
-    "restart_after": _knob("sights with enough corners that fit nowhere, before the map starts anew", 1, 10_000),
-    "max_gap_s": _knob("a pose after a longer silence is degraded, s", 0.01, 60),
-}
-HEADING: Mapping[str, Knob] = {
-    "velocity_mps": _knob("highest speed, m/s", 0.001, 10),
-    "acceleration_mps2": _knob("highest acceleration, m/s^2", 0.001, 100),
-    "yaw_rate_radps": _knob("highest yaw rate, rad/s", 0.001, 20),
-    "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
-    "gain_hz": _knob("yaw rate per heading error, 1/s", 0.001, 50),
-}
-DRIVE: Mapping[str, Knob] = {
-    "track_m": _knob("between the left and the right wheels, m; where they skid, what makes measured turns right",
-                     0.01, 10),
-    "wheel_radius_m": _knob("radius of the wheels, m", 0.001, 5),
-    "max_wheel_mps": _knob("no wheel is told to roll faster, m/s; for roboteq_power and _mixed: at full power",
-                           0.001, 20),
-    "gear": _knob("turns of the motor for one of the wheel", 0.001, 10_000),
-    "ticks_per_turn": _knob("ros_arduino_bridge: ticks of the encoder for a turn of the motor", 1, 1_000_000),
-    "pole_pairs": _knob("vesc: pole pairs of the motor", 1, 100),
-    "reverse_left": _knob("the left motor turns the other way round"),
-    "reverse_right": _knob("the right motor turns the other way round"),
-    "swapped": _knob("the controller's first motor is the right one"),
-    "can_id": _knob("vesc: id of the second motor's controller", 0, 253),
-}
-DEADLINES: Mapping[str, Knob] = {
-    "pose_s": _knob("the wheels stop when the newest pose's pictures are older, s", 0.05, 10),
-    "command_s": _knob("the wheels stop when the newest command came longer ago, s", 0.05, 10),
-    "tick_s": _knob("the wheels stop when the host lets a tick come so much too late, s", 0.01, 10),
-}
-COMMAND: Mapping[str, Knob] = {
-    "velocity_mps": _knob("highest speed, m/s", 0.001, 10),
-    "acceleration_mps2": _knob("highest acceleration, m/s^2", 0.001, 100),
-    "deceleration_mps2": _knob("highest deceleration, at stops as well, m/s^2", 0.001, 100),
-    "yaw_rate_radps": _knob("highest yaw rate, rad/s", 0.001, 20),
-    "yaw_acceleration_radps2": _knob("highest yaw acceleration, rad/s^2", 0.001, 200),
-}
-
-
-def _describe(kind: type[Any], knobs: Mapping[str, Knob]) -> None:
-    """Gives the fields of a dataclass of the numerics, which knows nothing of settings, their words and ranges."""
-    every: tuple[Field[Any], ...] = fields(kind)
-    for entry in every:
-        described = knobs.get(entry.name) or _knob(entry.name.replace("_", " "))
-        entry.metadata = {"knob": described}  # type: ignore[assignment]  # any mapping will do
-
-
-for _kind, _knobs in ((Matching, MATCHING), (Klt, KLT), (Limits, LIMITS), (HeadingLimits, HEADING),
-                      (DifferentialDrive, DRIVE), (Deadlines, DEADLINES), (CommandLimits, COMMAND)):
-    _describe(_kind, _knobs)

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.odometry.tracking import Wrapped
+from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramePair:
-    """Pictures of both cameras at one instant; the stamp is the lower camera's."""
+    """Images of both cameras at one instant; the stamp is the lower camera's."""
 
     seq: int
     stamp_ns: int
@@ -26,17 +27,17 @@ class FramePair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panoramas:
-    """Both pictures on the cylinder about the line through the viewpoints: epipolar lines are columns."""
+    """Both images on the cylinder about the line through the viewpoints: epipolar lines are columns."""
 
     seq: int
     stamp_ns: int
-    lower: Wrapped
-    upper: Wrapped
+    lower: PaddedPanorama
+    upper: PaddedPanorama
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here, and in a tracking window around
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Depth:
+class StereoDepth:
     """Disparities of the lower panorama, and the points they stand for."""
 
     seq: int
@@ -49,7 +50,7 @@ class Depth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
+class OdometryUpdate:
     """The rig's pose, its uncertainty and motion, and the depth it came from."""
 
     seq: int
@@ -58,11 +59,11 @@ class Odometry:
     covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
     velocity: Array  # (6,) m/s, rad/s in the rig frame
     velocity_covariance: Array  # (6, 6)
-    state: str  # tracking | degraded | lost
+    state: TrackingState
     reset_counter: int  # how often odom had to start anew with an unknown gap
     inliers: int  # landmarks that agree with the pose
     tracks: int  # landmarks that were found
-    depth: Depth
+    depth: StereoDepth
     features: Features = field(default_factory=Features)  # for whoever looks on; the paper's method gives none
 
 

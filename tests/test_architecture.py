@@ -24,10 +24,10 @@ class Rule:
 RULES = (
     Rule("calib", ("omnid", "drivers", "threading", "_thread", "time", "socket")),
     Rule("drivers", ("omnid", "calib")),
-    Rule("omnid", ("threading", "_thread"), excepted=("omnid/graph.py",)),
+    Rule("omnid", ("threading", "_thread"), excepted=("omnid/engine/graph.py",)),
     Rule(
         "omnid/core",
-        ("threading", "time", "logging", "omnid.stages", "omnid.transport", "omnid.graph", "omnid.cli"),
+        ("threading", "time", "logging", "omnid.stages", "omnid.transport", "omnid.engine", "omnid.cli"),
     ),
     Rule("omnid/stages", ("threading", "time")),
 )
@@ -79,7 +79,7 @@ def test_imports_point_one_way(rule: Rule) -> None:
         ("omnid/a.py", "from threading import Lock"),
         ("omnid/stages/graph.py", "import os, threading"),
         ("omnid/stages/a.py", "import time"),
-        ("omnid/core/a.py", "from omnid import graph"),
+        ("omnid/core/a.py", "from omnid import engine"),
         ("omnid/core/a.py", "from ..stages.pair import PairSync"),
         ("omnid/core/a.py", "from .. import cli"),
         ("omnid/core/a.py", "import logging.handlers"),
@@ -96,7 +96,7 @@ def test_a_breach_is_found(tmp_path: Path, name: str, text: str) -> None:
     [
         ("calib/a.py", "from . import se3\nimport timeit, numpy as np"),
         ("drivers/a.py", "import threading, time\nimport omnidirectional, calibration"),
-        ("omnid/graph.py", "import threading"),
+        ("omnid/engine/graph.py", "import threading"),
         ("omnid/core/a.py", "from .tracks import Tracks\nfrom omnid.messages import Odometry\nfrom calib import se3"),
         ("omnid/a.py", "import time\nfrom drivers.frame import Frame"),
     ],

@@ -1,4 +1,4 @@
-"""A checkerboard and how one picture shows it."""
+"""A checkerboard and how one image shows it."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The corners of a board in one picture: pixels (N, 2) in the order of Board.points.
+    """The corners of a board in one image: pixels (N, 2) in the order of Board.points.
 
-    confidence 0 to 1: how much the worst corners look like ones. x, y of the board turn clockwise in the picture, and
+    confidence 0 to 1: how much the worst corners look like ones. x, y of the board turn clockwise in the image, and
     the first square is dark where the board's sides (one even, one odd) can tell.
     """
 

@@ -1,6 +1,6 @@
-"""Finds a checkerboard in a mirror's picture: by linked corners first, then by OpenCV's detectors.
+"""Finds a checkerboard in a mirror's image: by linked corners first, then by OpenCV's detectors.
 
-Linked corners are looked for in the picture as it is, with its local contrast raised, enlarged, and unrolled about its
+Linked corners are looked for in the image as it is, with its local contrast raised, enlarged, and unrolled about its
 middle: on a log-polar strip, which keeps small squares square, boards near the hub grow and lose their fan shape.
 """
 
@@ -25,12 +25,12 @@ from calib.models.camera import Array
 Image = NDArray[np.uint8]
 MIN_SIDE_PX = 32
 BLUR_PX = 0.7
-# Of a picture's grids so many are grown and tried: those of nearly as many corners as the board has, and the largest.
+# Of a image's grids so many are grown and tried: those of nearly as many corners as the board has, and the largest.
 TRIED_GRIDS = 5
 # What a corner may lie off its neighbours, in parts of a square; so many must be good, or the whole is no board.
 MAX_UNEVEN = 0.2
 MIN_GOOD = 0.75
-# Pictures larger than this are not enlarged.
+# Images larger than this are not enlarged.
 MAX_ENLARGED_PIXELS = 1_600_000
 MAX_STRIP_PX = 2400
 # A grid smaller than this hints at no board.
@@ -39,8 +39,8 @@ MIN_HINT_SIDE = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
-    """What came of a picture: the board, or what grid (columns, rows) was seen in its stead, (0, 0) for none."""
+class BoardSearch:
+    """What came of a image: the board, or what grid (columns, rows) was seen in its stead, (0, 0) for none."""
 
     view: BoardView | None
     seen: tuple[int, int] = (0, 0)
@@ -48,34 +48,34 @@ class Search:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """A picture made from another, and where (N, 2) in that one its pixels (N, 2) come from."""
+    """A image made from another, and where (N, 2) in that one its pixels (N, 2) come from."""
 
     image: Image
     origin: Callable[[Array], Array]
 
 
-def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> Search:
-    """The board in a picture (H, W) uint8, its corners to a fraction of a pixel.
+def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> BoardSearch:
+    """The board in a image (H, W) uint8, its corners to a fraction of a pixel.
 
     Not thorough: one look, some 0.1 s for a megapixel, for frames of which there are plenty.
     """
     seen = (0, 0)
     if min(image.shape) < MIN_SIDE_PX:
-        return Search(None)
+        return BoardSearch(None)
     blurred = smoothed(image, BLUR_PX)
     for look in _looks(image) if thorough else islice(_looks(image), 1):
         for looked_at in _grids(look, board):
             grid = grow(blurred, looked_at)
             view = _view(image, grid, board, name)
             if view is not None:
-                return Search(view)
+                return BoardSearch(view)
             seen = max(seen, largest_board(grid), key=lambda sides: sides[0] * sides[1])
     for grid in _by_opencv(image, board) if thorough else ():
         view = _view(image, grow(blurred, grid), board, name)
         if view is not None:
-            return Search(view)
+            return BoardSearch(view)
     hint = min(seen) >= MIN_HINT_SIDE and seen[0] * seen[1] >= MIN_HINT_CORNERS
-    return Search(None, seen if hint else (0, 0))
+    return BoardSearch(None, seen if hint else (0, 0))
 
 
 def _looks(image: Image) -> Iterator[_Look]:
@@ -93,7 +93,7 @@ def _contrasted(image: Image) -> Image:
 
 
 def _unrolled(image: Image, start_rad: float) -> _Look:
-    """The picture about its middle: azimuth from left to right, the logarithm of the radius upwards."""
+    """The image about its middle: azimuth from left to right, the logarithm of the radius upwards."""
     height, width = image.shape
     middle, inner, outer = np.array([(width - 1) / 2, (height - 1) / 2]), min(image.shape) / 16, max(image.shape) / 2
     scale = min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)  # pixels per radian
@@ -110,7 +110,7 @@ def _unrolled(image: Image, start_rad: float) -> _Look:
 
 
 def _grids(look: _Look, board: Board) -> Iterator[Grid]:
-    """Grids of linked corners, in the pixels of the first picture."""
+    """Grids of linked corners, in the pixels of the first image."""
     blurred = smoothed(look.image, BLUR_PX)
     for grid in _likeliest(find_grids(blurred, find_corners(look.image)), board):
         yield _back(grow(blurred, grid), look)
@@ -135,7 +135,7 @@ def _by_opencv(image: Image, board: Board) -> Iterator[Grid]:
 
 
 def _back(grid: Grid, look: _Look) -> Grid:
-    """The grid in the first picture."""
+    """The grid in the first image."""
     pixels = look.origin(np.array(list(grid.values())))
     return _upright(dict(zip(grid, pixels, strict=True)))
 

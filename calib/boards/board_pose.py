@@ -1,4 +1,4 @@
-"""Where a board is before a camera that is known, and how a board may be turned that its picture does not tell."""
+"""Where a board is before a camera that is known, and how a board may be turned that its image does not tell."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board:
 
 
 def turns(board: Board) -> list[NDArray[np.intp]]:
-    """The orders (N,) of its corners that one picture of a board cannot tell apart; the first is the one it has.
+    """The orders (N,) of its corners that one image of a board cannot tell apart; the first is the one it has.
 
     One side odd and one even: the colours tell. Else half a turn looks the same; an even square so does at any quarter.
     """

@@ -1,4 +1,4 @@
-"""How the corners of a board lie among their neighbours: the local mapping from board to picture."""
+"""How the corners of a board lie among their neighbours: the local mapping from board to image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_BEYOND, BEYOND_STEP = 0.65, 0.4
 
 
 def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Array | None:
-    """Coefficients (6, 2) of the picture's place by 1, x, y, x^2, xy, y^2 of the board's [squares] about a corner.
+    """Coefficients (6, 2) of the image's place by 1, x, y, x^2, xy, y^2 of the board's [squares] about a corner.
 
     corners (rows, columns, 2), NaN where unknown; without: from its neighbours alone. None: too few of them.
     """

@@ -1,4 +1,4 @@
-"""Points of a picture where four squares of a checkerboard may meet: saddles of brightness with two crossing edges."""
+"""Points of a image where four squares of a checkerboard may meet: saddles of brightness with two crossing edges."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ MAX_ODD = 0.6
 MIN_CROSSING_RAD = np.deg2rad(18)
 MAX_PER_LEVEL = 4000
 SAME_PX = 2.0
-REMAP_COLUMNS = 1024  # cv2.remap takes pictures, not lists
+REMAP_COLUMNS = 1024  # cv2.remap takes images, not lists
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """How large a corner is looked for: the picture shrunk by scale, blurred, a ring of that radius [shrunk px]."""
+    """How large a corner is looked for: the image shrunk by scale, blurred, a ring of that radius [shrunk px]."""
 
     scale: float
     blur_px: float
@@ -37,7 +37,7 @@ LEVELS = (Level(1.0, 0.8, 2.6), Level(1.0, 1.4, 4.6), Level(0.5, 1.2, 4.2), Leve
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Candidates: pixels (N, 2), edge angles (N, 2) [rad] rising in [0, pi), whether the picture is light between the
+    """Candidates: pixels (N, 2), edge angles (N, 2) [rad] rising in [0, pi), whether the image is light between the
     first and the second (N,), ring contrast (N,) in grey levels, quality (N,) 0 to 1, ring radius (N,) [px].
     """
 
@@ -58,7 +58,7 @@ class Corners:
 
 
 def find_corners(image: NDArray[np.uint8]) -> Corners:
-    """All candidates of a picture (H, W), from fine to coarse; of several at one place the best is kept."""
+    """All candidates of a image (H, W), from fine to coarse; of several at one place the best is kept."""
     levels = [level for level in LEVELS if min(image.shape) * level.scale >= 100 or level.scale == 1.0]
     return _merged([_at_level(image, level) for level in levels])
 
@@ -82,7 +82,7 @@ def sample(image: Grey, pixels: Array) -> Array:
 
 
 def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
-    """The picture (H, W) as float32, blurred."""
+    """The image (H, W) as float32, blurred."""
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), np.float32)
 
 

@@ -14,7 +14,7 @@ from calib.boards.corner_links import NOBODY, link
 from calib.models.camera import Array
 
 Cell = tuple[int, int]
-Grid = dict[Cell, Array]  # pixel (2,) of the corner at (column, row); column to row turns clockwise in the picture
+Grid = dict[Cell, Array]  # pixel (2,) of the corner at (column, row); column to row turns clockwise in the image
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
 MAX_CELLS = 61 * 61
 MAX_ROUNDS = 64
@@ -28,7 +28,7 @@ MIN_CONTRAST_PART = 0.25
 
 
 def find_grids(image: Grey, corners: Corners) -> list[Grid]:
-    """Grids (four corners at least) of a picture's candidates, the largest first."""
+    """Grids (four corners at least) of a image's candidates, the largest first."""
     neighbour, back = link(image, corners)
     squares = _in_square(neighbour, back)
     neighbour = np.where(squares, neighbour, NOBODY)
@@ -75,7 +75,7 @@ def _spread(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]) ->
 
 
 def grow(image: Grey, grid: Grid) -> Grid:
-    """The grid with every corner added that its neighbours predict and the picture shows."""
+    """The grid with every corner added that its neighbours predict and the image shows."""
     grid, refused = dict(grid), set[Cell]()
     for _ in range(MAX_ROUNDS):
         guesses = {cell: guess for cell in _border(grid) - refused if (guess := predict(grid, cell)) is not None}

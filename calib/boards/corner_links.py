@@ -1,6 +1,6 @@
 """Which corner candidates are neighbours on a checkerboard: joined by one straight enough edge between light and dark.
 
-Every corner has four arms, numbered 0 to 3 by rising angle in the picture: both edges, each in both directions.
+Every corner has four arms, numbered 0 to 3 by rising angle in the image: both edges, each in both directions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Bundle adjustment of one camera and the poses of a board, by Levenberg and Marquardt with a Huber kernel.
 
-Every picture has its own pose, so the normal equations are an arrow: the poses are eliminated (Schur complement) and
+Every image has its own pose, so the normal equations are an arrow: the poses are eliminated (Schur complement) and
 only a matrix of the intrinsics' size is solved (Triggs et al. 2000, section 6).
 """
 
@@ -26,7 +26,7 @@ MIN_SIGMA_PX = 0.02
 LOST_PX = 300.0
 # Done when a step that was hardly damped, so that it reached along the flattest valley, saves less than this part.
 STILL, UNDAMPED = 1e-9, 1e-7
-# Numeric derivatives: parameters are scaled so that one unit moves the picture by about a pixel; points by their depth.
+# Numeric derivatives: parameters are scaled so that one unit moves the image by about a pixel; points by their depth.
 STEP = 1e-4
 
 
@@ -42,13 +42,13 @@ Make = Callable[[Array], Projection]
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """Corners seen: pixels (K, N, 2) of K pictures, NaN where a corner is not known, of board points (N, 3) [m]."""
+    """Corners seen: pixels (K, N, 2) of K images, NaN where a corner is not known, of board points (N, 3) [m]."""
 
     pixels: Array
     points: Array
 
     def only(self, chosen: Array) -> Observed:
-        """The pictures of that index or selection."""
+        """The images of that index or selection."""
         return replace(self, pixels=self.pixels[chosen])
 
 

@@ -1,4 +1,4 @@
-"""From the boards in a camera's pictures to the camera: which views are good, which model terms earn their place."""
+"""From the boards in a camera's images to the camera: which views are good, which model terms earn their place."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _observed(views: Sequence[BoardView], board: Board) -> Observed:
 def _require(count: int, what: str, rejected: Sequence[Rejected] = ()) -> None:
     if count < MIN_VIEWS:
         left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
-        raise CalibError(f"calibrate: needs {MIN_VIEWS} {what} at least, found {count}{left_out}; take more pictures, "
+        raise CalibError(f"calibrate: needs {MIN_VIEWS} {what} at least, found {count}{left_out}; take more images, "
                          "with the board all around the camera, near, and tilted")
 
 
@@ -183,7 +183,7 @@ def _warnings(solved: _Solved, observed: Observed) -> tuple[str, ...]:
     if sectors < MIN_SECTORS:
         said.append(f"corners were seen in {sectors} of {SECTORS} directions only: hold the board on all sides")
     if solved.fit.mean_px > MAX_MEAN_PX:
-        said.append(f"the error of {solved.fit.mean_px:.2f} px is large: is the board flat, is the picture sharp, is "
+        said.append(f"the error of {solved.fit.mean_px:.2f} px is large: is the board flat, is the image sharp, is "
                     "--view right?")
     deviation = {name: (value, sigma) for name, value, sigma in solved.parameters}
     scale, sigma = deviation["a0" if "a0" in deviation else "fu"]

@@ -18,8 +18,8 @@ DEGREE = 4
 def fit_ocam(observed: Observed, size: tuple[int, int], view: View = "mirror") -> Adjusted:
     """The adjusted camera of degree DEGREE, read by ocam_maker and ocam_values; size (width, height) [px].
 
-    Parameters, all in pixels at the scale of half the picture: a0, a2 ... ; centre row, column; c - 1, and d = e, as a
-    turn of the picture about its centre cannot be told from one of the camera. CalibError where nothing fits.
+    Parameters, all in pixels at the scale of half the image: a0, a2 ... ; centre row, column; c - 1, and d = e, as a
+    turn of the image about its centre cannot be told from one of the camera. CalibError where nothing fits.
     """
     linear = solve_linear(observed, size, DEGREE, view)
     if linear.coefficients[0] >= 0:

@@ -15,12 +15,12 @@ from calib.fit.bundle import Observed
 from calib.models.camera import Array
 from calib.models.ocam import View
 
-# The centre is looked for on a grid this wide, in parts of the picture, that shrinks with every round.
+# The centre is looked for on a grid this wide, in parts of the image, that shrinks with every round.
 SEARCH_PART = 0.16
 SEARCH_SIDE = 5
 SEARCH_SHRINK = 0.55
 SEARCH_END_PX = 0.5
-# A corner off by more than this counts no further: one bad picture must not steer the centre.
+# A corner off by more than this counts no further: one bad image must not steer the centre.
 CAP_RAD = 0.05
 
 
@@ -119,7 +119,7 @@ def _third_row(R: Array) -> Array:
 
 
 def _signs(rho: Array, across: Array, height: Array, scale_px: float) -> Array:
-    """Which sign (K,) of (r31, r32) gives each picture a parabola f with a0 < 0: negating all of f fits as well."""
+    """Which sign (K,) of (r31, r32) gives each image a parabola f with a0 < 0: negating all of f fits as well."""
     A, b, _ = _without_shifts(rho, across, height, (rho[..., None] / scale_px) ** powers(2))
     parabolas = np.linalg.pinv(A) @ b[..., None]
     return np.where(parabolas[:, 0, 0] > 0, -1.0, 1.0)
@@ -138,7 +138,7 @@ def _without_shifts(rho: Array, across: Array, height: Array, basis: Array
                     ) -> tuple[Array, Array, Callable[[Array], Array]]:
     """Equations (K, N, D) and right sides (K, N) for the coefficients alone, and the t3 (K,) that go with these.
 
-    Every t3 stands in its own picture's equations only: these are projected to where it does not count.
+    Every t3 stands in its own image's equations only: these are projected to where it does not count.
     """
     known, weight = np.isfinite(rho), 1 / np.maximum(across, 1e-9)
     A = np.where(known[..., None], basis * (across * weight)[..., None], 0.0)

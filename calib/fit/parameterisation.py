@@ -15,7 +15,7 @@ OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 
 
 @dataclass(frozen=True, slots=True)
-class Nudge:
+class CameraParameters:
     """Steps (P,) about a camera: at() gives the camera, values its parameters there as its file has them."""
 
     base: OmniCamera
@@ -34,20 +34,22 @@ class Nudge:
         return [(name, float(value), float(sigma)) for name, value, sigma in found]
 
 
-def nudge(camera: OmniCamera) -> Nudge:
+def nudge(camera: OmniCamera) -> CameraParameters:
     """The steps about a camera: all its parameters, but of the distortion and polynomial only the terms it has."""
     scale = min(camera.size) / 2
     if isinstance(camera, UnifiedCamera):
         values = np.array([camera.xi, *camera.focal, *camera.center, *camera.distortion])
         kept = np.array([True] * 5 + [value != 0 for value in camera.distortion])
         units = np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
-        return Nudge(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
+        return CameraParameters(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
     if not isinstance(camera, OcamCamera):
         raise CalibError(f"calibrate: expected an omni or ocam camera, found {type(camera).__name__}")
     powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
     start = np.array([*(camera.polynomial[power] for power in powers), *camera.center_row_column, *camera.affine[:2]])
     units = np.array([*(scale ** -float(power) for power in powers), 1.0, 1.0, 1 / scale, 1 / scale])
-    return Nudge(camera, (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d"), start, units)
+    return CameraParameters(
+        camera, (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d"), start, units
+    )
 
 
 def _omni(base: UnifiedCamera, values: dict[str, float]) -> UnifiedCamera:
@@ -57,7 +59,7 @@ def _omni(base: UnifiedCamera, values: dict[str, float]) -> UnifiedCamera:
 
 
 def _ocam(base: OmniCamera, values: dict[str, float]) -> OcamCamera:
-    """d and e move together: the rest of them is a turn of the picture, which a turn of the camera is as well."""
+    """d and e move together: the rest of them is a turn of the image, which a turn of the camera is as well."""
     assert isinstance(base, OcamCamera)
     polynomial = tuple(values.get(f"a{power}", 0.0) for power in range(len(base.polynomial)))
     affine = (values["c"], values["d"], base.affine[2] + values["d"] - base.affine[1])

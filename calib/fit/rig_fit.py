@@ -14,7 +14,7 @@ from calib.boards.corner_refinement import refine_with
 from calib.errors import CalibError
 from calib.fit.bundle import Adjusted, Observed, adjust
 from calib.fit.camera_fit import Rejected, bad_views
-from calib.fit.parameterisation import Nudge, nudge
+from calib.fit.parameterisation import CameraParameters, nudge
 from calib.fit.rig_initialisation import Agreed, Seen, agree
 from calib.models.camera import Array, OmniCamera
 
@@ -88,7 +88,7 @@ class _PairCamera:
 class _Unknowns:
     """What is solved for: steps of both cameras, where they are not taken as they are, and of the motion between."""
 
-    nudges: tuple[Nudge, Nudge]
+    nudges: tuple[CameraParameters, CameraParameters]
     refined: bool
     T_upper_lower: Array
     units: Array  # (6,) of a motion's steps

@@ -1,4 +1,4 @@
-"""The mirror's rim in a picture, the circle beyond which it is dark, and a dark hub in its middle if there is one."""
+"""The mirror's rim in a image, the circle beyond which it is dark, and a dark hub in its middle if there is one."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ MIN_STEP = 12.0
 EDGE_FRACTION = 0.25
 # Pixels on either side over which the edge is judged, and how far beyond it the dark has to last.
 EDGE_PX = 4
-# Azimuths agree when their edge is this near the circle; this part of those the circle has in the picture must.
+# Azimuths agree when their edge is this near the circle; this part of those the circle has in the image must.
 AGREE_PX = 2.0
 MIN_SUPPORT = 0.6
-# Part of the circle that has to lie in the picture: less leaves the centre loose.
+# Part of the circle that has to lie in the image: less leaves the centre loose.
 MIN_ARC = 0.4
 FIT_ROUNDS = 200
 # What is cut off inside the rim and outside the hub: blur and the last reflections at the edge.
@@ -33,10 +33,10 @@ HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2
 
 
 def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
-    """The ring that shows the world in a picture (H, W) uint8, or None where no rim can be told for sure.
+    """The ring that shows the world in a image (H, W) uint8, or None where no rim can be told for sure.
 
-    center_guess (u, v) [px] may be off by a tenth of the radius. A picture that is bright all around (or the maximum of
-    several) gives the best rim. None: dark or full-frame pictures, noise, soft vignettes.
+    center_guess (u, v) [px] may be off by a tenth of the radius. A image that is bright all around (or the maximum of
+    several) gives the best rim. None: dark or full-frame images, noise, soft vignettes.
     """
     levels = _levels(image) if min(image.shape) >= MIN_SIDE_PX else None
     if levels is None:
@@ -61,7 +61,7 @@ def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
 
 
 def _polar(image: NDArray[np.uint8], center: tuple[float, float], radius_px: int) -> Array:
-    """The picture as (AZIMUTHS, radius) about a centre, 1 px apart; NaN outside of it."""
+    """The image as (AZIMUTHS, radius) about a centre, 1 px apart; NaN outside of it."""
     azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)[:, None]
     radii = np.arange(radius_px)
     u, v = center[0] + radii * np.cos(azimuth), center[1] + radii * np.sin(azimuth)
@@ -103,10 +103,10 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
     circles = [_circle(edges[generator.choice(len(edges), 3, replace=False)]) for _ in range(FIT_ROUNDS)]
     best = max(circles, key=lambda circle: int((_distance(edges, circle) < AGREE_PX).sum()))
     for _ in range(3):
-        agreeing = edges[_distance(edges, best) < AGREE_PX]
-        if len(agreeing) < 3:
+        inliers = edges[_distance(edges, best) < AGREE_PX]
+        if len(inliers) < 3:
             return None
-        best = _circle(agreeing)
+        best = _circle(inliers)
     near = np.hypot(best[0] - center[0], best[1] - center[1]) < 0.25 * best[2]
     return best if near else None
 
@@ -125,13 +125,13 @@ def _distance(points: Array, circle: Array) -> Array:
 
 
 def _supported(circle: Array, edges: Array, shape: tuple[int, ...]) -> bool:
-    """Whether enough of the circle lies in the picture, and enough of that part was seen as an edge."""
+    """Whether enough of the circle lies in the image, and enough of that part was seen as an edge."""
     azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
     reach = circle[2] + 2 * EDGE_PX
     u, v = circle[0] + reach * np.cos(azimuth), circle[1] + reach * np.sin(azimuth)
     possible = int(((u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)).sum())
-    agreeing = int((_distance(edges, circle) < AGREE_PX).sum())
-    return possible >= MIN_ARC * AZIMUTHS and agreeing >= MIN_SUPPORT * possible
+    inliers = int((_distance(edges, circle) < AGREE_PX).sum())
+    return possible >= MIN_ARC * AZIMUTHS and inliers >= MIN_SUPPORT * possible
 
 
 def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, threshold: float) -> float:

@@ -35,7 +35,7 @@ class RimShift:
 
 
 def rim_shift(brightest: NDArray[np.uint8], mask: Mask | None) -> RimShift | None:
-    """The rim in the maximum of several pictures (H, W), against a mask; None where either is not known."""
+    """The rim in the maximum of several images (H, W), against a mask; None where either is not known."""
     if mask is None or not np.isfinite(mask.outer_px):
         return None
     rim = find_rim(brightest, mask.center)

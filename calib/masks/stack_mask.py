@@ -1,4 +1,4 @@
-"""What of a camera's picture never shows the world, from a stack of frames: beyond the rim, the hub, the struts."""
+"""What of a camera's image never shows the world, from a stack of frames: beyond the rim, the hub, the struts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EDGE_PX = 2
 
 
 def find_mask(frames: Sequence[Image], center: tuple[float, float]) -> Mask:
-    """The mask of frames (H, W) uint8 that show different views; its picture is 255 where the world is seen.
+    """The mask of frames (H, W) uint8 that show different views; its image is 255 where the world is seen.
 
     center (u, v) [px]: of the camera, or a fair guess. Raises CalibError where frames are few or show no rim.
     """

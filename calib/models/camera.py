@@ -1,4 +1,4 @@
-"""The one face of every mirror camera: project, lift, and what part of the picture counts."""
+"""The one face of every mirror camera: project, lift, and what part of the image counts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OmniCamera(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """The part of an image that shows the world: a ring about a centre, minus what a picture blanks out.
+    """The part of an image that shows the world: a ring about a centre, minus what a image blanks out.
 
     center (u, v) [px]; inner_px and outer_px bound the radius; image (H, W) uint8, 0 = not the world.
     """

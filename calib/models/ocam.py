@@ -1,7 +1,7 @@
 """The polynomial model of OCamCalib (Scaramuzza et al. 2006): any central mirror or fisheye by f(rho).
 
 x = row - row centre and y = column - column centre, after the inverse of the affine [c d; e 1]; rho = |(x, y)|.
-Seen directly the ray is (x, y, f(rho)) with x down, y right, z towards the viewer. Seen in a mirror the picture is
+Seen directly the ray is (x, y, f(rho)) with x down, y right, z towards the viewer. Seen in a mirror the image is
 reflected and the right-handed ray is (x, y, -f(rho)). A flat board cannot tell the two apart, so `view` says it.
 """
 

@@ -1,4 +1,4 @@
-"""A recorded log in the place of a live camera: real pictures, at their pace or another, stamped as they are given."""
+"""A recorded log in the place of a live camera: real images, at their pace or another, stamped as they are given."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ Timed = tuple[tuple[int, Frame], ...]  # in order, each with its time since the 
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class LogImages:
     """The frames of both cameras, held in memory."""
 
     lower: Timed
     upper: Timed
 
     @staticmethod
-    def of(path: Path, lower: str | None = None, upper: str | None = None) -> Pictures:
-        """The pictures of a log, two or more of each camera; DriverError else, and beyond MOST_BYTES."""
+    def of(path: Path, lower: str | None = None, upper: str | None = None) -> LogImages:
+        """The images of a log, two or more of each camera; DriverError else, and beyond MOST_BYTES."""
         reader = LogReader(path, lower, upper)
         try:
             frames = list(_bounded(reader.frames(), path))
         finally:
             reader.close()
         timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
-        pictures = Pictures(*(tuple(t for t in timed if t[1].camera == name) for name in ("lower", "upper")))
-        if min(len(pictures.lower), len(pictures.upper)) < 2:
-            raise DriverError(f"{path}: {len(pictures.lower)} pictures of the lower and {len(pictures.upper)} of the "
+        images = LogImages(*(tuple(t for t in timed if t[1].camera == name) for name in ("lower", "upper")))
+        if min(len(images.lower), len(images.upper)) < 2:
+            raise DriverError(f"{path}: {len(images.lower)} images of the lower and {len(images.upper)} of the "
                               "upper camera: give a log with two or more of each")
-        return pictures
+        return images
 
     @property
     def last_ns(self) -> int:
-        """When the log's last picture was taken."""
+        """When the log's last image was taken."""
         return max(self.lower[-1][0], self.upper[-1][0])
 
     @property
@@ -58,7 +58,7 @@ def _bounded(frames: Iterator[Frame], path: Path) -> Iterator[Frame]:
     for frame in frames:
         held += len(frame.data)  # bytes, as LogReader gives them
         if held > MOST_BYTES:
-            raise DriverError(f"{path}: more than {MOST_BYTES >> 20} MiB of pictures: cut the log into shorter ones")
+            raise DriverError(f"{path}: more than {MOST_BYTES >> 20} MiB of images: cut the log into shorter ones")
         yield frame
 
 
@@ -66,16 +66,16 @@ class LogCamera:
     """One camera of a log, played forwards and backwards for as long as it is read.
 
     epoch_ns: when the log begins, CLOCK_MONOTONIC; both cameras of a log share it. pace: how many times as fast. once:
-    ends with the log. A stamp is the moment at which the picture was due; what was due before this camera was made is
+    ends with the log. A stamp is the moment at which the image was due; what was due before this camera was made is
     not shown.
     """
 
-    def __init__(self, pictures: Pictures, camera: Camera, epoch_ns: int, *, pace: float = 1.0, once: bool = False
+    def __init__(self, images: LogImages, camera: Camera, epoch_ns: int, *, pace: float = 1.0, once: bool = False
                  ) -> None:
         if not SLOWEST <= pace <= FASTEST:
             raise DriverError(f"the pace of a log is {pace:g}; give a number from {SLOWEST:g} to {FASTEST:g}; above 1 "
                               "is faster than it was recorded")
-        self._pictures, self._frames = pictures, pictures.lower if camera == "lower" else pictures.upper
+        self._images, self._frames = images, images.lower if camera == "lower" else images.upper
         self._epoch_ns, self._pace, self._once = epoch_ns, pace, once
         self._made_ns = time.monotonic_ns()
         self._closed = False
@@ -102,7 +102,7 @@ class LogCamera:
 
     def _schedule(self) -> Iterator[tuple[int, Frame]]:
         """Every frame with its time since the epoch at pace 1 [ns]; every second pass runs backwards."""
-        last_ns, pass_ns = self._pictures.last_ns, self._pictures.pass_ns
+        last_ns, pass_ns = self._images.last_ns, self._images.pass_ns
         for start_ns in count(0, 2 * pass_ns):
             yield from ((start_ns + at_ns, frame) for at_ns, frame in self._frames)
             if self._once:

@@ -31,7 +31,7 @@ class CameraState:
     reopens: int = 0
 
 
-class Ledger:
+class BufferAccounting:
     """Judges buffers one by one; no clock and no device in it."""
 
     def __init__(self, name: str, state: CameraState, report: Report) -> None:
@@ -44,10 +44,10 @@ class Ledger:
         """A stream starts anew, and so does its sequence."""
         self._last_sequence = None
 
-    def admit(self, buffer: v4l2.Buffer, arrival_ns: int, least_bytes: int) -> int | None:
-        """When the buffer's picture was taken, ns of CLOCK_MONOTONIC, rising strictly; None where it has no picture.
+    def admit(self, buffer: v4l2.V4l2Buffer, arrival_ns: int, least_bytes: int) -> int | None:
+        """When the buffer's image was taken, ns of CLOCK_MONOTONIC, rising strictly; None where it has no image.
 
-        arrival_ns: when it was taken from the driver, same clock. least_bytes: what a whole picture has at least.
+        arrival_ns: when it was taken from the driver, same clock. least_bytes: what a whole image has at least.
         """
         self._follow(buffer.sequence)
         if buffer.flags & v4l2.BUFFER_ERROR or buffer.bytesused < least_bytes:
@@ -74,7 +74,7 @@ class Ledger:
             return stamp_ns
         self._state.restamped += 1
         self._say_once("stamp", f"a stamp lies {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not after "
-                       "the one before; such pictures are stamped with their arrival and counted")
+                       "the one before; such images are stamped with their arrival and counted")
         return max(arrival_ns, self._last_stamp_ns + 1)
 
     def _say_once(self, kind: str, text: str) -> None:

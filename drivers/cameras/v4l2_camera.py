@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.v4l2_buffers import NOTICE, WARNING, CameraState, Ledger, Report
+from drivers.cameras.v4l2_buffers import NOTICE, WARNING, BufferAccounting, CameraState, Report
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.cameras.v4l2_stream import V4l2Stream, explained
 from drivers.errors import DriverError
@@ -36,16 +36,16 @@ class V4l2Camera:
 
     def __init__(self, settings: V4l2Settings, camera: Camera, *, report: Report = unheard) -> None:
         self._streams = deque([V4l2Stream(settings)])  # the open one, if any: to pop it is to own it
-        self.state = CameraState(mode=str(self._streams[0].picture))
+        self.state = CameraState(mode=str(self._streams[0].image))
         self._settings, self._camera, self._report = settings, camera, report
         self._name = f"{camera} camera"
-        self._ledger = Ledger(self._name, self.state, report)
+        self._ledger = BufferAccounting(self._name, self.state, report)
         self._wake = _Wake()
         self._closing = self._reading = False
         self._bus_info = "" if Path(settings.device).is_symlink() else self._streams[0].bus_info
 
     def frames(self) -> Iterator[Frame]:
-        """Gives the pictures as they come, until `close`; what was taken before the first call is not among them."""
+        """Gives the images as they come, until `close`; what was taken before the first call is not among them."""
         self._reading = True
         retry_s = _FIRST_RETRY_S
         try:
@@ -53,7 +53,7 @@ class V4l2Camera:
             while not self._closing:
                 given = self.state.frames
                 try:
-                    yield from self._pictures()
+                    yield from self._images()
                 except (OSError, DriverError) as error:
                     self._lose(error)
                     settled = self.state.frames - given > _SETTLED_FRAMES
@@ -70,21 +70,21 @@ class V4l2Camera:
         if not self._reading:
             self._end()
 
-    def _pictures(self) -> Iterator[Frame]:
-        """The pictures of one opening; OSError or DriverError at its end, unless closing."""
+    def _images(self) -> Iterator[Frame]:
+        """The images of one opening; OSError or DriverError at its end, unless closing."""
         stream = self._streams[0] if self._streams else self._reopened()
-        picture = stream.picture
+        image = stream.image
         self._ledger.begin()
         if self.state.status == "lost" and self._next(stream) is None:
-            return  # the first picture anew is left out: it may be an old one (v4l2loopback) or a dark one (webcams)
+            return  # the first image anew is left out: it may be an old one (v4l2loopback) or a dark one (webcams)
         while (filled := self._next(stream)) is not None:
             stamp_ns, data = filled
             seq = self._counted()
-            yield Frame(seq, stamp_ns, self._camera, picture.encoding, data, picture.width_px, picture.height_px,
-                        picture.step)
+            yield Frame(seq, stamp_ns, self._camera, image.encoding, data, image.width_px, image.height_px,
+                        image.step)
 
     def _next(self, stream: V4l2Stream) -> tuple[int, bytes] | None:
-        """Stamp and bytes of the next good picture, None when closing; DriverError when none came in time."""
+        """Stamp and bytes of the next good image, None when closing; DriverError when none came in time."""
         deadline_s = time.monotonic() + self._settings.timeout_s
         while not self._closing:
             if self._wake.wait_for(stream.fd, deadline_s - time.monotonic()):
@@ -94,15 +94,15 @@ class V4l2Camera:
                 elif (stamp_ns := self._admitted(filled[0], stream)) is not None:
                     return stamp_ns, filled[1]
             if time.monotonic() > deadline_s and not self._closing:
-                raise DriverError(f"camera {self._settings.device} sent no good picture for "
+                raise DriverError(f"camera {self._settings.device} sent no good image for "
                                   f"{self._settings.timeout_s:g} s; check its cable and power")
         return None
 
-    def _admitted(self, buffer: v4l2.Buffer, stream: V4l2Stream) -> int | None:
-        return self._ledger.admit(buffer, time.monotonic_ns(), stream.picture.least_bytes)
+    def _admitted(self, buffer: v4l2.V4l2Buffer, stream: V4l2Stream) -> int | None:
+        return self._ledger.admit(buffer, time.monotonic_ns(), stream.image.least_bytes)
 
     def _counted(self) -> int:
-        """The number of the picture that is about to be given; with the first one the camera is here, or back."""
+        """The number of the image that is about to be given; with the first one the camera is here, or back."""
         if self.state.status == "lost":
             self._report(NOTICE, f"{self._name}: back, {self.state.mode}")
         self.state.status, self.state.problem = "streaming", ""
@@ -127,7 +127,7 @@ class V4l2Camera:
         if self._bus_info and stream.bus_info != self._bus_info:
             raise DriverError(f"camera {self._settings.device} was at {self._bus_info}, there is now that at "
                               f"{stream.bus_info}; use a name that stays, see `omnid cameras`")
-        self.state.mode = str(stream.picture)
+        self.state.mode = str(stream.image)
         return stream
 
     def _discard(self) -> None:

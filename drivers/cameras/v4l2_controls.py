@@ -34,7 +34,7 @@ _NAMES: Final = {GAIN: "gain", AUTO_GAIN: "automatic gain", AUTO_WHITE_BALANCE: 
 
 
 @dataclass(frozen=True, slots=True)
-class Control:
+class CameraControl:
     """One control of a device, with its range."""
 
     id: int
@@ -59,17 +59,17 @@ class Control:
         return f"{self.low} to {self.high}" + (f" in steps of {self.step}" if self.step > 1 else "")
 
 
-def controls(fd: int) -> dict[int, Control]:
+def controls(fd: int) -> dict[int, CameraControl]:
     """All controls of an open device that can be set and hold a number, by id."""
     found = {}
     for entry in _queried(fd):
         if entry.type in _KINDS and not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
-            found[entry.id] = Control(entry.id, _plain(entry.name), entry.type, entry.minimum, entry.maximum,
+            found[entry.id] = CameraControl(entry.id, _plain(entry.name), entry.type, entry.minimum, entry.maximum,
                                       entry.step, _menu(fd, entry))
     return found
 
 
-def planned(settings: V4l2Settings, offered: Mapping[int, Control]) -> list[tuple[Control, int]]:
+def planned(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> list[tuple[CameraControl, int]]:
     """The controls to set with their values, automatics before what they govern.
 
     DriverError for a control that the device does not offer, or a value out of its range.
@@ -83,11 +83,11 @@ def planned(settings: V4l2Settings, offered: Mapping[int, Control]) -> list[tupl
     return plan
 
 
-def apply(fd: int, plan: list[tuple[Control, int]]) -> None:
+def apply(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
     """Sets the controls in their order, then reads them back; DriverError for what the device did not take."""
     for control, value in plan:
         try:
-            v4l2.call(fd, v4l2.S_CTRL, v4l2.Control(control.id, value))
+            v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control.id, value))
         except OSError as error:
             if error.errno in (errno.ENODEV, errno.EBUSY):
                 raise
@@ -102,12 +102,12 @@ def apply(fd: int, plan: list[tuple[Control, int]]) -> None:
 
 def value_of(fd: int, control_id: int) -> int:
     """The value in force."""
-    control = v4l2.Control(control_id)
+    control = v4l2.V4l2Control(control_id)
     v4l2.call(fd, v4l2.G_CTRL, control)
     return int(control.value)
 
 
-def _automatics(settings: V4l2Settings, offered: Mapping[int, Control]) -> Iterator[tuple[int, int]]:
+def _automatics(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
     """Fixing a value implies that its automatic is off, where there is one."""
     if settings.auto_exposure != "keep" or settings.exposure_us:
         yield AUTO_EXPOSURE, _automatic_exposure(offered) if settings.auto_exposure == "on" else _MANUAL
@@ -120,13 +120,13 @@ def _automatics(settings: V4l2Settings, offered: Mapping[int, Control]) -> Itera
             yield control_id, int(switch == "on")
 
 
-def _automatic_exposure(offered: Mapping[int, Control]) -> int:
+def _automatic_exposure(offered: Mapping[int, CameraControl]) -> int:
     """USB cameras call it aperture priority, others automatic."""
     control = offered.get(AUTO_EXPOSURE)
     return _APERTURE_PRIORITY if control and _AUTO not in control.menu else _AUTO
 
 
-def _values(settings: V4l2Settings, offered: Mapping[int, Control]) -> Iterator[tuple[int, int]]:
+def _values(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
     if settings.exposure_us:
         yield EXPOSURE, round(settings.exposure_us / 100)
     if settings.gain >= 0:
@@ -137,13 +137,13 @@ def _values(settings: V4l2Settings, offered: Mapping[int, Control]) -> Iterator[
         yield POWER_LINE_FREQUENCY, _POWER_LINE[settings.power_line]
 
 
-def _offered(control_id: int, offered: Mapping[int, Control]) -> Control:
+def _offered(control_id: int, offered: Mapping[int, CameraControl]) -> CameraControl:
     if control_id not in offered:
         raise DriverError(f"the device has no control of its {_NAMES[control_id]}; leave it as it is. {_all(offered)}")
     return offered[control_id]
 
 
-def _named(text: str, offered: Mapping[int, Control]) -> tuple[Control, int]:
+def _named(text: str, offered: Mapping[int, CameraControl]) -> tuple[CameraControl, int]:
     name, _, number = text.partition("=")
     for control in offered.values():
         if control.name == name.strip():
@@ -151,7 +151,7 @@ def _named(text: str, offered: Mapping[int, Control]) -> tuple[Control, int]:
     raise DriverError(f"the device has no control '{name.strip()}'. {_all(offered)}")
 
 
-def _all(offered: Mapping[int, Control]) -> str:
+def _all(offered: Mapping[int, CameraControl]) -> str:
     return f"It has: {', '.join(control.name for control in offered.values()) or 'none'}"
 
 

@@ -106,7 +106,7 @@ class _Place(ctypes.Union):
     _fields_ = (("offset", _u32), ("userptr", ctypes.c_long))
 
 
-class Buffer(ctypes.Structure):
+class V4l2Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
     _fields_ = (("index", _u32), ("type", _u32), ("bytesused", _u32), ("flags", _u32), ("field", _u32),
@@ -132,7 +132,7 @@ class QueryMenu(ctypes.Structure):
     _fields_ = (("id", _u32), ("index", _u32), ("name", ctypes.c_char * 32), ("reserved", _u32))
 
 
-class Control(ctypes.Structure):
+class V4l2Control(ctypes.Structure):
     """struct v4l2_control."""
 
     _fields_ = (("id", _u32), ("value", _i32))
@@ -151,15 +151,15 @@ ENUM_FMT: Final = _request(_READ | _WRITE, 2, FormatDescription)
 G_FMT: Final = _request(_READ | _WRITE, 4, Format)
 S_FMT: Final = _request(_READ | _WRITE, 5, Format)
 REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
-QUERYBUF: Final = _request(_READ | _WRITE, 9, Buffer)
-QBUF: Final = _request(_READ | _WRITE, 15, Buffer)
-DQBUF: Final = _request(_READ | _WRITE, 17, Buffer)
+QUERYBUF: Final = _request(_READ | _WRITE, 9, V4l2Buffer)
+QBUF: Final = _request(_READ | _WRITE, 15, V4l2Buffer)
+DQBUF: Final = _request(_READ | _WRITE, 17, V4l2Buffer)
 STREAMON: Final = _request(_WRITE, 18, Number)
 STREAMOFF: Final = _request(_WRITE, 19, Number)
 G_PARM: Final = _request(_READ | _WRITE, 21, StreamParameters)
 S_PARM: Final = _request(_READ | _WRITE, 22, StreamParameters)
-G_CTRL: Final = _request(_READ | _WRITE, 27, Control)
-S_CTRL: Final = _request(_READ | _WRITE, 28, Control)
+G_CTRL: Final = _request(_READ | _WRITE, 27, V4l2Control)
+S_CTRL: Final = _request(_READ | _WRITE, 28, V4l2Control)
 QUERYCTRL: Final = _request(_READ | _WRITE, 36, QueryControl)
 QUERYMENU: Final = _request(_READ | _WRITE, 37, QueryMenu)
 ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FrameSize)

@@ -1,4 +1,4 @@
-"""What a capture device offers to send, and which of it is taken for a picture of a size and a rate."""
+"""What a capture device offers to send, and which of it is taken for a image of a size and a rate."""
 
 from __future__ import annotations
 

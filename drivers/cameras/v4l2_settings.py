@@ -16,7 +16,7 @@ PIXEL_FORMATS: Final = ("auto", *ENCODINGS)
 
 @dataclass(frozen=True, slots=True)
 class V4l2Settings:
-    """Device, picture and controls; DriverError for a value that no camera takes."""
+    """Device, image and controls; DriverError for a value that no camera takes."""
 
     device: str  # a path that stays when the camera is plugged in again: /dev/omnid/lower, /dev/v4l/by-path/...
     width_px: int = 1280
@@ -33,7 +33,7 @@ class V4l2Settings:
     power_line: str = "keep"  # keep, off, 50, 60 (Hz) or auto: against flicker of lamps
     controls: tuple[str, ...] = ()  # any other, as `v4l2-ctl --list-ctrls` names it: "sharpness=2"
     buffers: int = 4  # v4l2loopback wants this number
-    timeout_s: float = 2.0  # without a picture for so long, the device is opened anew
+    timeout_s: float = 2.0  # without a image for so long, the device is opened anew
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
 
     def __post_init__(self) -> None:

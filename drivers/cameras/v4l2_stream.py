@@ -23,13 +23,13 @@ _ADVICE: Final = {
     errno.ENODEV: "is gone; check the cable",
     errno.ENXIO: "is gone; check the cable",
     errno.ENOTTY: "is not a video device; `omnid cameras` lists those that are",
-    errno.ENOSPC: "finds no bandwidth on its USB bus; choose MJPG, a smaller picture, a lower rate or another port",
+    errno.ENOSPC: "finds no bandwidth on its USB bus; choose MJPG, a smaller image, a lower rate or another port",
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """The layout of the pictures of a stream."""
+class CapturedImage:
+    """The layout of the images of a stream."""
 
     pixel_format: str
     width_px: int
@@ -44,7 +44,7 @@ class Picture:
 
     @property
     def least_bytes(self) -> int:
-        """What a whole picture has at least; of NV12 the luma."""
+        """What a whole image has at least; of NV12 the luma."""
         return max(1, self.step * self.height_px)
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class V4l2Stream:
             self.fd = os.open(settings.device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             self._resources.callback(os.close, self.fd)
             self.bus_info = _require_capture(self.fd)
-            self.picture = _set_picture(self.fd, settings)
+            self.image = _set_image(self.fd, settings)
             self._maps = [self._mapped(index) for index in range(_claim(self.fd, settings.buffers))]
             apply(self.fd, planned(settings, controls(self.fd)))
             self._start()
@@ -81,15 +81,15 @@ class V4l2Stream:
             self._resources.close()
             raise
 
-    def take(self) -> tuple[v4l2.Buffer, bytes] | None:
+    def take(self) -> tuple[v4l2.V4l2Buffer, bytes] | None:
         """The oldest buffer that is full and a copy of its bytes; None if there is none. OSError for a lost device."""
-        buffer = v4l2.Buffer(type=v4l2.CAPTURE, memory=v4l2.MMAP)
+        buffer = v4l2.V4l2Buffer(type=v4l2.CAPTURE, memory=v4l2.MMAP)
         try:
             v4l2.call(self.fd, v4l2.DQBUF, buffer)
         except BlockingIOError:
             return None
         data = self._maps[buffer.index][: buffer.bytesused]
-        taken = v4l2.Buffer.from_buffer_copy(buffer)  # the driver writes into what it is given back
+        taken = v4l2.V4l2Buffer.from_buffer_copy(buffer)  # the driver writes into what it is given back
         v4l2.call(self.fd, v4l2.QBUF, buffer)
         return taken, data
 
@@ -98,7 +98,7 @@ class V4l2Stream:
         self._resources.close()
 
     def _mapped(self, index: int) -> mmap.mmap:
-        buffer = v4l2.Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP)
+        buffer = v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP)
         v4l2.call(self.fd, v4l2.QUERYBUF, buffer)
         mapped = mmap.mmap(self.fd, buffer.length, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ, offset=buffer.m.offset)
         self._resources.callback(mapped.close)
@@ -106,7 +106,7 @@ class V4l2Stream:
 
     def _start(self) -> None:
         for index in range(len(self._maps)):
-            v4l2.call(self.fd, v4l2.QBUF, v4l2.Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP))
+            v4l2.call(self.fd, v4l2.QBUF, v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP))
         self._resources.callback(_stop, self.fd)
         v4l2.call(self.fd, v4l2.STREAMON, v4l2.Number(v4l2.CAPTURE))
 
@@ -130,7 +130,7 @@ def _require_capture(fd: int) -> str:
     return str(found.bus_info.decode("utf-8", "replace"))
 
 
-def _set_picture(fd: int, settings: V4l2Settings) -> Picture:
+def _set_image(fd: int, settings: V4l2Settings) -> CapturedImage:
     """Asks for format, size and rate, and gives what is in force; DriverError where that is something else."""
     size = settings.width_px, settings.height_px
     name = choose(modes(fd), settings.pixel_format, size, settings.rate_hz)
@@ -146,7 +146,7 @@ def _set_picture(fd: int, settings: V4l2Settings) -> Picture:
         raise DriverError(f"{name} {size[0]}x{size[1]} was asked, the device gave {found[0]} {found[1]}x{found[2]}; "
                           "choose a mode that `omnid cameras` lists")
     row = BYTES_PER_PIXEL.get(name, 0) * pix.width
-    return Picture(name, pix.width, pix.height, max(row, pix.bytesperline) if row else 0, _set_rate(fd, settings))
+    return CapturedImage(name, pix.width, pix.height, max(row, pix.bytesperline) if row else 0, _set_rate(fd, settings))
 
 
 def _set_rate(fd: int, settings: V4l2Settings) -> float:

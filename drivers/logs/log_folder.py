@@ -39,7 +39,7 @@ class Rotation:
     retry_s: float = 30.0  # longest wait between two tries on a disk that failed
 
 
-class Recording(NamedTuple):
+class RecordingFile(NamedTuple):
     """A file of the folder."""
 
     time: str
@@ -94,13 +94,13 @@ class LogFolder:
             raise DriverError(f"cannot record to {str(self.path)!r}: {free // _MB} MB are free and "
                               f"{-(-wanted_bytes // _MB)} wanted; make room, or keep fewer or smaller files")
 
-    def _recordings(self) -> Iterator[Recording]:
+    def _recordings(self) -> Iterator[RecordingFile]:
         with suppress(OSError), os.scandir(self.path) as entries:
             for entry in entries:
                 found = self._pattern.fullmatch(entry.name)
                 if found and entry.is_file(follow_symlinks=False):
                     with suppress(OSError):  # another program may have deleted it
-                        yield Recording(found[1], int(found[2]), Path(entry.path), entry.stat().st_size)
+                        yield RecordingFile(found[1], int(found[2]), Path(entry.path), entry.stat().st_size)
 
 
 def delete(path: Path) -> bool:

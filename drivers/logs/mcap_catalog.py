@@ -15,7 +15,7 @@ _MAX_DEFINITION_BYTES = 2**20
 _MAX_NAME = 256
 
 
-class Topic(NamedTuple):
+class LogTopic(NamedTuple):
     """A channel as its messages need it; type is a ROS name such as sensor_msgs/msg/Image, '' where it is not CDR."""
 
     name: str
@@ -43,12 +43,12 @@ class Catalog:
         except PARSE_ERRORS as error:
             raise RecordError("a channel or schema record is malformed") from error
 
-    def topic(self, channel_id: int) -> Topic | None:
+    def topic(self, channel_id: int) -> LogTopic | None:
         channel = self._channels.get(channel_id)
         if channel is None:
             return None
         known = channel.message_encoding == "cdr"
-        return Topic(channel.topic, self._types.get(channel.schema_id, "") if known else "")
+        return LogTopic(channel.topic, self._types.get(channel.schema_id, "") if known else "")
 
     def topics(self) -> dict[str, str]:
         """Topic name -> type."""

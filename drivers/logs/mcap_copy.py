@@ -14,10 +14,10 @@ from mcap.writer import Writer
 from drivers.logs.mcap_index import summary_section
 from drivers.logs.mcap_records import (
     PARSE_ERRORS,
+    ByteSource,
     LogFile,
     Record,
     RecordError,
-    Source,
     content,
     parsing,
     records,
@@ -67,7 +67,7 @@ class Copy:
             self.single(chunk, inner)
         self.broken += end != chunk.size
 
-    def single(self, source: Source, record: Record) -> None:
+    def single(self, source: ByteSource, record: Record) -> None:
         """Takes one record; what belongs to an index is made anew."""
         take = self._takers.get(record.opcode)
         if take is None:

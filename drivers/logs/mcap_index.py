@@ -16,7 +16,7 @@ from drivers.logs.mcap_records import (
     HEAD,
     MAGIC,
     PARSE_ERRORS,
-    Buffer,
+    ByteBuffer,
     LogFile,
     Record,
     RecordError,
@@ -75,7 +75,7 @@ def _footer(file: LogFile) -> bytes | None:
     return end[:size] if whole else None
 
 
-def summary_section(file: LogFile) -> Buffer | None:
+def summary_section(file: LogFile) -> ByteBuffer | None:
     """The records at the end of the log, None where read_summary would give none."""
     footer = _footer(file)
     if footer is None:
@@ -87,7 +87,7 @@ def summary_section(file: LogFile) -> Buffer | None:
     section = file.read(start, size)
     if len(section) < size or (crc and zlib.crc32(section + footer[:-4]) != crc):
         return None
-    return Buffer(section)
+    return ByteBuffer(section)
 
 
 def read_attachments(file: LogFile, summary: Summary | None) -> dict[str, bytes]:

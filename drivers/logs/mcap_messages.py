@@ -9,7 +9,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_records import MAGIC, LogFile, Record, RecordError, Source, content, records, unpack_chunk
+from drivers.logs.mcap_records import MAGIC, ByteSource, LogFile, Record, RecordError, content, records, unpack_chunk
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
@@ -19,7 +19,7 @@ class Message(NamedTuple):
 
     channel_id: int
     log_time_ns: int
-    source: Source
+    source: ByteSource
     place: Record
 
     def data(self) -> memoryview:
@@ -64,7 +64,7 @@ class DataSection:
             yield from self._single(chunk, inner)
         self.broken += end != chunk.size
 
-    def _single(self, source: Source, record: Record) -> Iterator[Message]:
+    def _single(self, source: ByteSource, record: Record) -> Iterator[Message]:
         try:
             if record.opcode == Opcode.MESSAGE:
                 yield _message(source, record)
@@ -74,7 +74,7 @@ class DataSection:
             self.broken += 1
 
 
-def _message(source: Source, record: Record) -> Message:
+def _message(source: ByteSource, record: Record) -> Message:
     try:
         channel_id, _, log_time_ns, _ = _MESSAGE.unpack(source.read(record.at, min(record.size, _MESSAGE.size)))
     except struct.error as error:

@@ -22,7 +22,7 @@ _SCAN_MESSAGES = 2000
 _WARNINGS = {
     "late": "dropped {} frames older than others given before: record with less delay or widen the window",
     "duplicate": "dropped {} frames whose camera had given one with the same stamp",
-    "broken": "skipped {} messages of the cameras' topics that hold no picture; the first: {fault}",
+    "broken": "skipped {} messages of the cameras' topics that hold no image; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
@@ -37,7 +37,7 @@ class LogReader:
     Raises DriverError where the path is no such log or the topics of the two cameras are not clear.
 
     During and after frames(): counts holds 'lower' and 'upper' (frames given), 'late', 'duplicate', 'unstamped' (used
-    the log's time), 'broken' (picture messages that were none) and 'broken_records' (chunks or records of the file);
+    the log's time), 'broken' (image messages that were none) and 'broken_records' (chunks or records of the file);
     after its end `truncated` tells whether the file was cut, and `warnings` says in one line each what was amiss.
     """
 
@@ -94,7 +94,7 @@ class LogReader:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = []
         self.truncated = False
-        self._fault = ""  # of the first message that held no picture
+        self._fault = ""  # of the first message that held no image
 
     def _known_channels(self) -> Catalog:
         """From the summary; a cut log has none, so there the start of the file is looked through."""
@@ -103,7 +103,7 @@ class LogReader:
         return scan(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
 
     def _image(self, message: Message) -> tuple[Camera, RosImage] | None:
-        """The message's picture, copied out of its chunk so that a waiting frame holds no more than itself."""
+        """The message's image, copied out of its chunk so that a waiting frame holds no more than itself."""
         topic = self._catalog.topic(message.channel_id)
         if topic is None or topic.name not in self._cameras or topic.type not in (IMAGE, COMPRESSED_IMAGE):
             return None

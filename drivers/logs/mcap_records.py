@@ -42,7 +42,7 @@ class RecordError(Exception):
     """A record's content contradicts itself; the records after it may be whole."""
 
 
-class Source(Protocol):
+class ByteSource(Protocol):
     """Bytes with a known end: a file or an unpacked chunk."""
 
     size: int
@@ -59,7 +59,7 @@ class Record(NamedTuple):
     size: int
 
 
-class Buffer:
+class ByteBuffer:
     """A Source of bytes in memory; what it gives are views."""
 
     def __init__(self, data: bytes | memoryview) -> None:
@@ -124,7 +124,7 @@ def _file_in(path: Path) -> Path:
     return logs[0]
 
 
-def records(source: Source, start: int, end: int) -> Iterator[Record]:
+def records(source: ByteSource, start: int, end: int) -> Iterator[Record]:
     """The records from start on, up to the first one that is cut or does not fit before end."""
     at = start
     while at + HEAD.size <= end:
@@ -139,7 +139,7 @@ def records(source: Source, start: int, end: int) -> Iterator[Record]:
         at += size
 
 
-def content(source: Source, record: Record) -> memoryview:
+def content(source: ByteSource, record: Record) -> memoryview:
     """What the record holds; raises RecordError where that is too much, or not all there."""
     if record.size > MAX_RECORD_BYTES:
         raise RecordError(f"{record.size} bytes are more than {MAX_RECORD_BYTES}")
@@ -154,7 +154,7 @@ def parsing(body: memoryview) -> ReadDataStream:
     return ReadDataStream(BytesIO(body))
 
 
-def unpack_chunk(body: memoryview) -> Buffer:
+def unpack_chunk(body: memoryview) -> ByteBuffer:
     """The records inside a chunk record; raises RecordError where size or CRC contradict them."""
     try:
         _, _, size, crc, name_size = _CHUNK.unpack_from(body)
@@ -166,7 +166,7 @@ def unpack_chunk(body: memoryview) -> Buffer:
     data = _decompress(bytes(body[_CHUNK.size : at][:16]), packed, size)
     if len(packed) != packed_size or len(data) != size or (crc and zlib.crc32(data) != crc):
         raise RecordError("the chunk's content does not match its size and CRC")
-    return Buffer(data)
+    return ByteBuffer(data)
 
 
 def _decompress(kind: bytes, packed: memoryview, size: int) -> bytes | memoryview:

@@ -27,7 +27,7 @@ _FLUSH_NS = 5 * 10**8
 class LogWriter:
     """Writes a log that loses at most the last chunk, or half a second of stamps, when the program dies.
 
-    attachments (name -> bytes) come first in the file, so they survive a crash. compression: lz4 or none; pictures that
+    attachments (name -> bytes) come first in the file, so they survive a crash. compression: lz4 or none; images that
     are JPEG already gain nothing by it. An existing file is replaced, unless exclusive. Until its end the file is
     locked. Raises DriverError where the file cannot be made or written (a full disk), and for a message type that
     ROS 2 does not know.

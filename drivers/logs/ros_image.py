@@ -1,4 +1,4 @@
-"""sensor_msgs/msg/Image and CompressedImage out of CDR bytes, without copying the picture.
+"""sensor_msgs/msg/Image and CompressedImage out of CDR bytes, without copying the image.
 
 Written out here, not left to a general deserialiser, because these two messages are nearly all of a log and must
 survive any bytes. The layout is that of the OMG's CDR (RTPS 2.2, 10.2): a 4-byte header, then each number aligned
@@ -15,7 +15,7 @@ from drivers.errors import BrokenFrame
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 
-# cv_bridge's names for pictures whose colours nobody declared, OpenCV's order being bgr; image_encodings.hpp's for YUV
+# cv_bridge's names for images whose colours nobody declared, OpenCV's order being bgr; image_encodings.hpp's for YUV
 _SAME_AS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16",
             "yuv422_yuy2": "yuyv", "yuv422": "uyvy"}
 _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
@@ -23,7 +23,7 @@ _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RosImage:
-    """One picture message; the fields after data are 0 for compressed pictures."""
+    """One image message; the fields after data are 0 for compressed images."""
 
     stamp_ns: int  # header stamp, 0 where the sender left it unset
     encoding: str
@@ -35,7 +35,7 @@ class RosImage:
 
 
 def parse_image(schema_name: str, message: memoryview) -> RosImage:
-    """The picture in a CDR message of type IMAGE or COMPRESSED_IMAGE; raises BrokenFrame where there is none."""
+    """The image in a CDR message of type IMAGE or COMPRESSED_IMAGE; raises BrokenFrame where there is none."""
     try:
         cdr = _Cdr(message)
         stamp_ns = _header(cdr)

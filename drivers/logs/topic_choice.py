@@ -57,7 +57,7 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
 def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
     """The topic named after the camera, compressed rather than raw; None without one, DriverError with several."""
     mine = [name for name in names if _camera_named(name) == camera]
-    if len(_pictures(mine)) > 1:
+    if len(_images(mine)) > 1:
         raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
     return max(mine, key=lambda name: name.endswith("/compressed"), default=None)
 
@@ -70,7 +70,7 @@ def _camera_named(topic: str) -> Camera | None:
 
 def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None]) -> dict[str, Camera]:
     lower, upper = found["lower"], found["upper"]
-    if lower is None and upper is None and len(_pictures(images)) > 1:
+    if lower is None and upper is None and len(_images(images)) > 1:
         raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
     if lower is None or upper is None:
         missing = "lower" if lower is None else "upper"
@@ -80,7 +80,7 @@ def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None
     return {lower: "lower", upper: "upper"}
 
 
-def _pictures(names: Iterable[str]) -> set[str]:
+def _images(names: Iterable[str]) -> set[str]:
     return {name.removesuffix("/compressed") for name in names}
 
 

@@ -1,1 +1,1 @@
-"""What stands between the calibration's commands and its numerics: pictures in, reports out."""
+"""What stands between the calibration's commands and its numerics: images in, reports out."""

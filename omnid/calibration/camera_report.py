@@ -13,10 +13,10 @@ from calib.models.ocam import OcamCamera
 from omnid.calibration.figures import (
     ARROW,
     Image,
-    coverage_picture,
+    coverage_image,
     error_by_radius,
-    panorama_picture,
-    residual_picture,
+    panorama_image,
+    residual_image,
 )
 from omnid.report.page import figure, page, table
 
@@ -24,17 +24,17 @@ MAX_SHOWN_VIEWS = 40
 
 
 def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequence[str], mask: Mask | None) -> str:
-    """The whole page; images by the views' names, missing: pictures without a board."""
+    """The whole page; images by the views' names, missing: images without a board."""
     first = images[found.views[0].name]
     pixels = np.array([view.pixels for view in found.views])
-    parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by picture</h2>",
+    parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by image</h2>",
              _views(found, missing), "<h2>Error by distance from the centre</h2>",
              table(("radius [px]", "mean error [px]", "corners"),
                     [(f"{r:.0f}", f"{e:.3f}", str(n)) for r, e, n in
                      error_by_radius(found.fit, pixels, found.camera.center)]),
-             "<h2>Coverage</h2>", figure(coverage_picture(first, found), "all corners; arrows are the residuals, "
+             "<h2>Coverage</h2>", figure(coverage_image(first, found), "all corners; arrows are the residuals, "
                                           f"{ARROW:.0f} times as long; the cross is the centre"),
-             "<h2>Unrolled</h2>", figure(panorama_picture(first, found.camera, mask), f"{found.views[0].name} about "
+             "<h2>Unrolled</h2>", figure(panorama_image(first, found.camera, mask), f"{found.views[0].name} about "
                                           "the ray of the centre: what runs along it in the world stands upright"),
              "<h2>Residuals</h2>", *_residuals(found, images)]
     return page("Camera calibration", parts)
@@ -67,11 +67,11 @@ def _views(found: Calibration, missing: Sequence[str]) -> str:
              f"<span class='bar' style='width:{200 * error / worst:.0f}px'></span>")
             for view, error, count in zip(found.views, errors, corners, strict=True)]
     none = f"<p>No board found in {escape(', '.join(missing))}.</p>" if missing else ""
-    return table(("picture", "mean error [px]", "corners", "confidence", ""), rows) + none
+    return table(("image", "mean error [px]", "corners", "confidence", ""), rows) + none
 
 
 def _residuals(found: Calibration, images: Mapping[str, Image]) -> list[str]:
     shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
-    return [figure(residual_picture(images[view.name], view.pixels, residuals),
+    return [figure(residual_image(images[view.name], view.pixels, residuals),
                     f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")
             for view, residuals, error in shown]

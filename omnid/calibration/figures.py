@@ -1,4 +1,4 @@
-"""Pictures for the report: corners with their residuals, what the boards covered, the world unrolled."""
+"""Images for the report: corners with their residuals, what the boards covered, the world unrolled."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ MARGIN_PX = 40
 PANORAMA_WIDTH = 1400
 
 
-def residual_picture(image: Image, pixels: Array, residuals: Array, width: int = 640) -> Image:
-    """The part of a picture around a board, its corners and ARROW times their residuals, so many pixels wide."""
+def residual_image(image: Image, pixels: Array, residuals: Array, width: int = 640) -> Image:
+    """The part of a image around a board, its corners and ARROW times their residuals, so many pixels wide."""
     known = pixels[np.isfinite(pixels[:, 0])]
     low = np.maximum(np.floor(known.min(axis=0)) - MARGIN_PX, 0).astype(int)
     high = np.minimum(np.ceil(known.max(axis=0)) + MARGIN_PX, image.shape[::-1]).astype(int)
@@ -32,8 +32,8 @@ def residual_picture(image: Image, pixels: Array, residuals: Array, width: int =
     return canvas
 
 
-def coverage_picture(image: Image, found: Calibration, width: int = 900) -> Image:
-    """All corners of all views over one picture, with ARROW times their residuals."""
+def coverage_image(image: Image, found: Calibration, width: int = 900) -> Image:
+    """All corners of all views over one image, with ARROW times their residuals."""
     scale = width / image.shape[1]
     canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
     for view, residuals in zip(found.views, found.fit.residuals, strict=True):
@@ -43,8 +43,8 @@ def coverage_picture(image: Image, found: Calibration, width: int = 900) -> Imag
     return canvas
 
 
-def panorama_picture(image: Image, camera: OmniCamera, mask: Mask | None) -> Image:
-    """The picture unrolled about the ray of its centre: azimuth along, equal angles down, straight where the world is.
+def panorama_image(image: Image, camera: OmniCamera, mask: Mask | None) -> Image:
+    """The image unrolled about the ray of its centre: azimuth along, equal angles down, straight where the world is.
 
     The farthest from the centre's ray is on top.
     """

@@ -1,4 +1,4 @@
-"""The pictures of two cameras, by instant: lower_*, upper_* of a folder, or the pairs of a log."""
+"""The images of two cameras, by instant: lower_*, upper_* of a folder, or the pairs of a log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from drivers.errors import BrokenFrame
 from drivers.frame import Frame, gray
 from drivers.logs.mcap_reader import LogReader
-from omnid.calibration.images import SUFFIXES, Image, Pictures, one_size, read_pictures
+from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
 from omnid.config import Config
 from omnid.errors import OmnidError
 
@@ -19,10 +19,10 @@ LOG_PAIRS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class PairedPictures:
-    """Pictures of the lower and the upper camera by the name of the instant; some are of one camera only."""
+class PairedImages:
+    """Images of the lower and the upper camera by the name of the instant; some are of one camera only."""
 
-    sides: tuple[Pictures, Pictures]
+    sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
 
     @property
@@ -31,39 +31,39 @@ class PairedPictures:
         return sorted({**self.sides[0], **self.sides[1]})
 
 
-def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedPictures:
-    """The pictures in a folder or a log; lower and upper name a log's topics. OmnidError where no two make a pair."""
+def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
+    """The images in a folder or a log; lower and upper name a log's topics. OmnidError where no two make a pair."""
     is_log = source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
     if not is_log and (lower or upper):
-        raise OmnidError(f"{source}: only a log has topics; found a folder of pictures")
+        raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     pairs = _of_log(source, lower, upper) if is_log else _of_folder(source)
     if not pairs.sides[0].keys() & pairs.sides[1].keys():
-        raise OmnidError(f"{source}: no two pictures of one instant: {_counted(pairs)}; a folder has to hold pairs "
-                         "like lower_001.png and upper_001.png, a log pictures with nearly equal stamps")
+        raise OmnidError(f"{source}: no two images of one instant: {_counted(pairs)}; a folder has to hold pairs "
+                         "like lower_001.png and upper_001.png, a log images with nearly equal stamps")
     return pairs
 
 
-def _counted(pairs: PairedPictures) -> str:
+def _counted(pairs: PairedImages) -> str:
     return ", ".join(f"{len(side)} of the {name} camera" for name, side in zip(SIDES, pairs.sides, strict=True))
 
 
-def _of_folder(folder: Path) -> PairedPictures:
+def _of_folder(folder: Path) -> PairedImages:
     if not folder.is_dir():
-        raise OmnidError(f"{folder}: expected a log (.mcap) or a folder with pictures lower_*, upper_*; found "
+        raise OmnidError(f"{folder}: expected a log (.mcap) or a folder with images lower_*, upper_*; found "
                          f"{'a file' if folder.exists() else 'nothing'}")
     lower, upper = (_of_side(folder, side) for side in SIDES)
-    return PairedPictures((lower, upper))
+    return PairedImages((lower, upper))
 
 
-def _of_side(folder: Path, side: str) -> Pictures:
+def _of_side(folder: Path, side: str) -> Images:
     paths = sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in SUFFIXES)
     if not paths:
-        raise OmnidError(f"{folder}: no pictures {side}_* in this folder; name them lower_001.png, upper_001.png ...")
-    found = read_pictures([str(path) for path in paths])
+        raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
+    found = read_images([str(path) for path in paths])
     return {Path(name).stem.removeprefix(f"{side}_"): image for name, image in found.items()}
 
 
-def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedPictures:
+def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedImages:
     reader = LogReader(log, lower, upper)
     try:
         stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
@@ -73,9 +73,9 @@ def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedPictures:
         reader.close()
     named = {f"pair{number * stride:05d}": pair for number, pair in enumerate(pairs) if pair}
     sides = [{name: pair[side] for name, pair in named.items()} for side in (0, 1)]
-    for pictures in sides:
-        one_size(pictures)
-    return PairedPictures((sides[0], sides[1]), (topics["lower"], topics["upper"]))
+    for images in sides:
+        one_size(images)
+    return PairedImages((sides[0], sides[1]), (topics["lower"], topics["upper"]))
 
 
 def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:

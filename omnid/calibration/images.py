@@ -1,4 +1,4 @@
-"""The pictures of one camera: from files, folders and patterns, or from one topic of a log."""
+"""The images of one camera: from files, folders and patterns, or from one topic of a log."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
-Pictures = dict[str, Image]  # by name, all of one size
+Images = dict[str, Image]  # by name, all of one size
 SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
-MAX_PICTURES = 400
+MAX_IMAGES = 400
 # So many frames of a log are looked at, evenly spread: a board held by hand does not move much between two of them.
 LOG_FRAMES = 120
 SCAN_BYTES, SCAN_MESSAGES = 64 * 2**20, 2000
 
 
-def read_pictures(sources: Sequence[str], topic: str | None = None) -> Pictures:
-    """Grey pictures of files, folders and patterns, or of a log's topic; OmnidError unless all are, and of one size."""
+def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
+    """Grey images of files, folders and patterns, or of a log's topic; OmnidError unless all are, and of one size."""
     logs = [source for source in sources if Path(source).suffix == ".mcap"]
     if logs and len(sources) > 1:
-        raise OmnidError(f"{logs[0]}: expected pictures, or one log alone; found {len(sources)} names")
+        raise OmnidError(f"{logs[0]}: expected images, or one log alone; found {len(sources)} names")
     if topic and not logs:
-        raise OmnidError(f"--topic {topic}: only a log has topics; found pictures")
-    pictures = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
-    one_size(pictures)
-    return pictures
+        raise OmnidError(f"--topic {topic}: only a log has topics; found images")
+    images = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
+    one_size(images)
+    return images
 
 
-def _of_files(sources: Sequence[str]) -> Pictures:
+def _of_files(sources: Sequence[str]) -> Images:
     paths = list(dict.fromkeys(path for source in sources for path in _expanded(source)))
-    if len(paths) > MAX_PICTURES:
-        raise OmnidError(f"calibrate: expected {MAX_PICTURES} pictures at most, found {len(paths)}; 40 are plenty")
+    if len(paths) > MAX_IMAGES:
+        raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are plenty")
     names = _short_names(paths)
     return {name: _read(path) for name, path in zip(names, paths, strict=True)}
 
@@ -55,7 +55,7 @@ def _expanded(source: str) -> list[Path]:
     else:
         found = [path] if path.exists() else sorted(map(Path, glob.glob(source)))
     if not found:
-        what = f"no picture ({' '.join(sorted(SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
+        what = f"no image ({' '.join(sorted(SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
         raise OmnidError(f"{source}: {what}; give files, a folder or a pattern like 'calib/*.png'")
     return found
 
@@ -75,21 +75,21 @@ def _read(path: Path) -> Image:
     except cv2.error:
         image = None
     if image is None or image.size > MAX_PIXELS:
-        raise OmnidError(f"{path}: expected a picture (PNG, JPEG, TIFF ...) of sane size, found none; leave it out")
+        raise OmnidError(f"{path}: expected a image (PNG, JPEG, TIFF ...) of sane size, found none; leave it out")
     return np.ascontiguousarray(image, np.uint8)
 
 
-def one_size(pictures: Pictures) -> None:
-    """OmnidError unless all pictures are of one size."""
+def one_size(images: Images) -> None:
+    """OmnidError unless all images are of one size."""
     sizes: dict[tuple[int, ...], str] = {}
-    for name, image in pictures.items():
+    for name, image in images.items():
         sizes.setdefault(image.shape[::-1], name)
     if len(sizes) > 1:
         shown = ", ".join(f"{size[0]}x{size[1]} ({name})" for size, name in list(sizes.items())[:4])
-        raise OmnidError(f"calibrate: expected pictures of one camera, all of one size, found {shown}")
+        raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {shown}")
 
 
-def _of_log(path: Path, topic: str | None) -> Pictures:
+def _of_log(path: Path, topic: str | None) -> Images:
     file = LogFile(path)
     try:
         catalog = scan(file, SCAN_BYTES, SCAN_MESSAGES)
@@ -101,7 +101,7 @@ def _of_log(path: Path, topic: str | None) -> Pictures:
 
 
 def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
-    """The topic asked for, or the only one with pictures."""
+    """The topic asked for, or the only one with images."""
     images = sorted(name for name, kind in catalog.topics().items() if kind in (IMAGE, COMPRESSED_IMAGE))
     if topic in images:
         return str(topic)
@@ -119,7 +119,7 @@ def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[Message]:
 
 
 def _frames(file: LogFile, catalog: Catalog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
-    """Every stride-th picture, named by its number; what cannot be decoded is left out."""
+    """Every stride-th image, named by its number; what cannot be decoded is left out."""
     for number, message in enumerate(_messages(file, catalog, topic)):
         kind = catalog.topic(message.channel_id)
         if number % stride or kind is None:

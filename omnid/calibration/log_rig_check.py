@@ -1,4 +1,4 @@
-"""Some pairs of a log's pictures, and what they say of a rig."""
+"""Some pairs of a log's images, and what they say of a rig."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PAIRS = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class RigCheckResult:
     """What some pairs say: the columns, and the rims of the lower and the upper mirror where they can be told."""
 
     finding: RigFinding
@@ -55,16 +55,16 @@ def read_pairs_of(reader: LogReader, rig: Rig) -> list[FramePair]:
     for number, (lower, upper) in enumerate(paired(reader.frames())):
         if number % stride:
             continue
-        pictures = decode(lower), decode(upper)
-        if pictures[0] is not None and pictures[1] is not None:
-            found.append(FramePair(number, lower.stamp_ns, pictures[0], pictures[1]))
+        images = decode(lower), decode(upper)
+        if images[0] is not None and images[1] is not None:
+            found.append(FramePair(number, lower.stamp_ns, images[0], images[1]))
     if not found:
-        raise OmnidError("calibrate check: no pair of pictures in the log; "
+        raise OmnidError("calibrate check: no pair of images in the log; "
                          f"{decode.fault or 'the stamps of both cameras must agree'}")
     return found
 
 
-def look(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> Looked:
+def look(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> RigCheckResult:
     """What the pairs say of a rig."""
     place = geometry(rig, config)
     dewarp, check = Dewarp(place, config), RigCheck(place.cylinder, len(pairs))
@@ -73,8 +73,8 @@ def look(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> Looked
         check.add(panoramas.lower, panoramas.upper, panoramas.visible)
     rims = tuple(rim_shift(_brightest([getattr(pair, side) for pair in pairs]), mounted.mask)
                  for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True))
-    return Looked(check.finding(), (rims[0], rims[1]))
+    return RigCheckResult(check.finding(), (rims[0], rims[1]))
 
 
-def _brightest(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    return np.asarray(np.max(np.stack(pictures), axis=0), np.uint8)
+def _brightest(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    return np.asarray(np.max(np.stack(images), axis=0), np.uint8)

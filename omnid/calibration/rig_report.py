@@ -12,8 +12,8 @@ from calib.errors import CalibError
 from calib.fit.rig_fit import MOTION_NAMES, RigCalibration
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
-from omnid.calibration.figures import ARROW, Image, residual_picture
-from omnid.calibration.image_pairs import SIDES, PairedPictures
+from omnid.calibration.figures import ARROW, Image, residual_image
+from omnid.calibration.image_pairs import SIDES, PairedImages
 from omnid.report.page import figure, page, table
 
 MAX_SHOWN_VIEWS = 20
@@ -21,15 +21,15 @@ LINES = 24  # columns drawn through both panoramas
 PANORAMA_WIDTH = 1400
 
 
-def rig_report_html(found: RigCalibration, pictures: PairedPictures, rig: Rig) -> str:
+def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
     """The whole page."""
     parts = [_head(found), "<h2>Between the cameras</h2>", _motion(found)]
     for name, rows in zip(SIDES, found.parameters, strict=True):
         told = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in rows]
         parts += [f"<h2>The {name} camera</h2>", table(("parameter", "value", "standard deviation"), told) if told
                   else "<p>Taken as it was given.</p>"]
-    parts += ["<h2>Error by instant</h2>", _views(found), "<h2>Rectified</h2>", *_rectified(found, pictures, rig),
-              "<h2>Residuals</h2>", *_residuals(found, pictures)]
+    parts += ["<h2>Error by instant</h2>", _views(found), "<h2>Rectified</h2>", *_rectified(found, images, rig),
+              "<h2>Residuals</h2>", *_residuals(found, images)]
     return page("Rig calibration", parts)
 
 
@@ -63,7 +63,7 @@ def _number(error: float) -> str:
     return f"{error:.3f}" if np.isfinite(error) else "not seen"
 
 
-def _rectified(found: RigCalibration, pictures: PairedPictures, rig: Rig) -> list[str]:
+def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> list[str]:
     """Both panoramas of one instant, one above the other: what lies on a line above lies on it below."""
     name = next(view.name for view in found.views if None not in view.seen)
     try:
@@ -71,20 +71,20 @@ def _rectified(found: RigCalibration, pictures: PairedPictures, rig: Rig) -> lis
     except CalibError as error:
         return [f"<p class='warn'>{escape(str(error))}</p>"]
     rows = [cv2.remap(side[name], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-            for side, mounted in zip(reversed(pictures.sides), (rig.upper, rig.lower), strict=True)]
+            for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)]
     canvas = np.asarray(cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR), np.uint8)
     for column in range(PANORAMA_WIDTH // (2 * LINES), PANORAMA_WIDTH, PANORAMA_WIDTH // LINES):
         canvas[:, column] = (80, 200, 0)
     return [figure(canvas, f"{name}: the upper panorama above the lower one; everything is on the same line in both")]
 
 
-def _residuals(found: RigCalibration, pictures: PairedPictures) -> list[str]:
+def _residuals(found: RigCalibration, images: PairedImages) -> list[str]:
     shown = []
     for k, view in enumerate(found.views[:MAX_SHOWN_VIEWS]):
         for side, seen in enumerate(view.seen):
             if seen is not None:
-                image: Image = pictures.sides[side][view.name]
+                image: Image = images.sides[side][view.name]
                 residuals = np.split(found.fit.residuals[k], 2)[side]
-                shown.append(figure(residual_picture(image, seen.pixels, residuals),
+                shown.append(figure(residual_image(image, seen.pixels, residuals),
                                     f"{SIDES[side]}, {view.name}: arrows {ARROW:.0f} times as long"))
     return shown

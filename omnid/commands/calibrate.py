@@ -1,4 +1,4 @@
-"""`omnid calibrate`: cameras and rigs from pictures of a board, checks of a rig; Kalibr and OCamCalib files."""
+"""`omnid calibrate`: cameras and rigs from images of a board, checks of a rig; Kalibr and OCamCalib files."""
 
 from __future__ import annotations
 

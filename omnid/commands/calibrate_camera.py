@@ -1,4 +1,4 @@
-"""`omnid calibrate camera`: a camera.toml from pictures of a checkerboard."""
+"""`omnid calibrate camera`: a camera.toml from images of a checkerboard."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calib.models.ocam import VIEWS
 from calib.rig_file import write_file
 from omnid.calibration.board_search import find_boards, spread
 from omnid.calibration.camera_report import report_html
-from omnid.calibration.images import Pictures, read_pictures
+from omnid.calibration.images import Images, read_images
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -30,8 +30,8 @@ MAX_LOG_VIEWS = 40
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `camera` to `omnid calibrate`."""
-    parser = actions.add_parser("camera", help="a camera.toml from pictures of a checkerboard")
-    parser.add_argument("pictures", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
+    parser = actions.add_parser("camera", help="a camera.toml from images of a checkerboard")
+    parser.add_argument("images", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
     parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="where four squares meet, "
                         "counted along both sides of the board")
     parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
@@ -60,16 +60,16 @@ def run(args: argparse.Namespace) -> int:
     columns, rows = args.corners
     board = Board(columns, rows, args.square_mm / 1e3)
     _check_outputs(args)
-    pictures = read_pictures(args.pictures, args.topic)
-    many = any(source.endswith(".mcap") for source in args.pictures)
-    views = find_boards(pictures, board, thorough=not many, tell=not args.quiet)
+    images = read_images(args.images, args.topic)
+    many = any(source.endswith(".mcap") for source in args.images)
+    views = find_boards(images, board, thorough=not many, tell=not args.quiet)
     views = spread(views, MAX_LOG_VIEWS) if many else views
-    found = _fitted(views, pictures, board, args)
-    mask = find_mask(list(pictures.values()), found.camera.center) if args.mask else None
+    found = _fitted(views, images, board, args)
+    mask = find_mask(list(images.values()), found.camera.center) if args.mask else None
     _write(found, mask, args)
     if args.report:
-        missing = sorted(set(pictures) - {view.name for view in views})
-        write_file(args.report, report_html(found, pictures, missing, mask).encode())
+        missing = sorted(set(images) - {view.name for view in views})
+        write_file(args.report, report_html(found, images, missing, mask).encode())
     for line in (*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
     print(f"{args.output}: {describe(found)}")
@@ -78,17 +78,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     named = [("--output", args.output), ("--report", args.report), ("--mask", args.mask)]
-    read = [("a picture that is read", Path(source)) for source in args.pictures if Path(source).is_file()]
+    read = [("a image that is read", Path(source)) for source in args.images if Path(source).is_file()]
     check_outputs([(option, path) for option, path in named if path is not None], read)
     if args.mask and (args.mask.suffix.lower() != ".png" or args.mask.parent.resolve() != args.output.parent.resolve()):
         raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}, where it is looked for")
 
 
-def _fitted(views: list[BoardView], pictures: Pictures, board: Board, args: argparse.Namespace) -> Calibration:
-    height, width = pictures[views[0].name].shape
+def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> Calibration:
+    height, width = images[views[0].name].shape
     model: Model = args.model
     found = calibrate(views, board, (width, height), model, args.view)
-    return sharpened(found, pictures, model, args.view)
+    return sharpened(found, images, model, args.view)
 
 
 def _write(found: Calibration, mask: Mask | None, args: argparse.Namespace) -> None:

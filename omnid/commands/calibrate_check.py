@@ -1,4 +1,4 @@
-"""`omnid calibrate check`: whether a rig is still as its file has it, from ordinary pictures, without a board."""
+"""`omnid calibrate check`: whether a rig is still as its file has it, from ordinary images, without a board."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calib.masks.rim_check import RimShift
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.image_pairs import SIDES
-from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_of
+from omnid.calibration.log_rig_check import RigCheckResult, look, open_log, read_pairs_of
 from omnid.config import Config
 from omnid.core.rig.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.errors import OmnidError
@@ -68,7 +68,7 @@ def _require_matches(finding: RigFinding, pairs: int) -> None:
                          f"found in both panoramas, {MIN_MATCHES} are needed; take a log where there is more to see")
 
 
-def report(found: Looked, pairs: int) -> str:
+def report(found: RigCheckResult, pairs: int) -> str:
     """What was found, some lines of text, the verdict first."""
     finding = found.finding
     lines = [f"{_verdict(found)}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
@@ -83,7 +83,7 @@ def report(found: Looked, pairs: int) -> str:
     return "\n".join(lines)
 
 
-def _verdict(found: Looked) -> str:
+def _verdict(found: RigCheckResult) -> str:
     return "drifted" if found.finding.verdict == "good" and not found.good else found.finding.verdict
 
 
@@ -110,13 +110,13 @@ def _bent(finding: RigFinding) -> bool:
 
 def _rim(name: str, rim: RimShift | None) -> str:
     if rim is None:
-        return f"{name} rim: not compared, as the mask or the rim in the pictures is not known"
+        return f"{name} rim: not compared, as the mask or the rim in the images is not known"
     fits = "the mask fits" if rim.fits else "the mask reaches beyond the mirror: drawn so, or the camera has moved"
     return (f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
             f"{rim.wider_px:+.1f} px: {fits}")
 
 
-def _refine(rig: Rig, pairs: list[FramePair], found: Looked, path: Path) -> None:
+def _refine(rig: Rig, pairs: list[FramePair], found: RigCheckResult, path: Path) -> None:
     """Turns the upper camera as the drift says, looks again, and writes the rig."""
     bent = _bent(found.finding)
     for _ in range(REFINEMENTS):

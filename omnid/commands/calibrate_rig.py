@@ -1,4 +1,4 @@
-"""`omnid calibrate rig`: a rig.toml from simultaneous pictures of a checkerboard."""
+"""`omnid calibrate rig`: a rig.toml from simultaneous images of a checkerboard."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
 from omnid.calibration.board_search import find_boards, spread
-from omnid.calibration.image_pairs import SIDES, PairedPictures, read_pairs
-from omnid.calibration.images import Pictures
+from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
+from omnid.calibration.images import Images
 from omnid.calibration.rig_report import rig_report_html
 from omnid.commands.calibrate_camera import corners
 from omnid.errors import OmnidError
@@ -38,8 +38,8 @@ EXPECTED_PART, DOUBTFUL_PART = 0.1, 0.02
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `rig` to `omnid calibrate`."""
-    parser = actions.add_parser("rig", help="a rig.toml from pictures of a checkerboard that both cameras saw at once")
-    parser.add_argument("pictures", type=Path, metavar="LOG|DIR", help="a log of both cameras, or a folder with "
+    parser = actions.add_parser("rig", help="a rig.toml from images of a checkerboard that both cameras saw at once")
+    parser.add_argument("images", type=Path, metavar="LOG|DIR", help="a log of both cameras, or a folder with "
                         "lower_*.png, upper_*.png of the same names")
     parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="where four squares meet, "
                         "counted along both sides of the board")
@@ -69,14 +69,14 @@ def run(args: argparse.Namespace) -> int:
     board = Board(columns, rows, args.square_mm / 1e3)
     given = _given(args)
     _check_outputs(args)
-    pictures = read_pairs(args.pictures, args.lower, args.upper)
-    _sizes_fit(pictures, given)
-    found = _fitted(pictures, board, given, args)
+    images = read_pairs(args.images, args.lower, args.upper)
+    _sizes_fit(images, given)
+    found = _fitted(images, board, given, args)
     doubts = _check_baseline(found, args)
-    rig, unmasked = _rig(found, pictures, given, args)
+    rig, unmasked = _rig(found, images, given, args)
     write_rig(args.output, rig)
     if args.report:
-        write_file(args.report, rig_report_html(found, pictures, rig).encode())
+        write_file(args.report, rig_report_html(found, images, rig).encode())
     for line in (*doubts, *unmasked, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
     print(f"{args.output}: {describe(found)}")
@@ -108,7 +108,7 @@ def _is_mirror(file: CameraFile) -> bool:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     named = [("--output", args.output), ("--report", args.report)]
-    read = [("a file that is read", path) for path in (args.pictures, args.lower_camera, args.upper_camera)
+    read = [("a file that is read", path) for path in (args.images, args.lower_camera, args.upper_camera)
             if path is not None and path.is_file()]
     check_outputs([(option, path) for option, path in named if path is not None], read)
     expected = args.expected_baseline_mm
@@ -116,28 +116,28 @@ def _check_outputs(args: argparse.Namespace) -> None:
         raise OmnidError(f"--expected-baseline-mm {expected:g}: expected a length above 0")
 
 
-def _sizes_fit(pictures: PairedPictures, given: tuple[CameraFile, CameraFile] | None) -> None:
-    for name, side, file in zip(SIDES, pictures.sides, given or (), strict=False):
+def _sizes_fit(images: PairedImages, given: tuple[CameraFile, CameraFile] | None) -> None:
+    for name, side, file in zip(SIDES, images.sides, given or (), strict=False):
         height, width = next(iter(side.values())).shape
         if (width, height) != tuple(file.camera.size):
             raise OmnidError(f"--{name}-camera: it is of {file.camera.size[0]}x{file.camera.size[1]} px, the {name} "
-                             f"pictures are {width}x{height} px; give the file of this camera")
+                             f"images are {width}x{height} px; give the file of this camera")
 
 
-def _fitted(pictures: PairedPictures, board: Board, given: tuple[CameraFile, CameraFile] | None,
+def _fitted(images: PairedImages, board: Board, given: tuple[CameraFile, CameraFile] | None,
             args: argparse.Namespace) -> RigCalibration:
     """The rig from all boards; the cameras' own fits come first unless they are given."""
-    views = _views(pictures, board, tell=not args.quiet)
+    views = _views(images, board, tell=not args.quiet)
     refined = given is None or args.refine_cameras
     if given:
         cameras, rejected = (given[0].camera, given[1].camera), list[Rejected]()
     else:
-        cameras, views, rejected = _own_cameras(views, pictures, board, args)
+        cameras, views, rejected = _own_cameras(views, images, board, args)
     if not refined:
         rejected += [Rejected(view.name, f"only the {name} camera saw the board, which with given cameras says nothing")
                      for view in views for name, seen in zip(SIDES, view.seen[::-1], strict=True) if seen is None]
     found = calibrate_rig(views, board, cameras, refined)
-    found = sharpened_rig(found, pictures.sides, refined)
+    found = sharpened_rig(found, images.sides, refined)
     return _with_rejected(found, rejected)
 
 
@@ -145,35 +145,35 @@ def _with_rejected(found: RigCalibration, rejected: list[Rejected]) -> RigCalibr
     return replace(found, rejected=(*rejected, *found.rejected))
 
 
-def _views(pictures: PairedPictures, board: Board, *, tell: bool) -> list[PairView]:
+def _views(images: PairedImages, board: Board, *, tell: bool) -> list[PairView]:
     """What both cameras saw of the board, by instant; of a log's many those that differ most."""
-    found = [_found(side, board, (name, bool(pictures.topics[0]), tell))
-             for name, side in zip(SIDES, pictures.sides, strict=True)]
-    both = [found[0][name] for name in pictures.names if name in found[0] and name in found[1]]
-    few = {view.name for view in spread(both, MAX_LOG_VIEWS)} if pictures.topics[0] and both else set(pictures.names)
-    seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in pictures.names if name in few]
+    found = [_found(side, board, (name, bool(images.topics[0]), tell))
+             for name, side in zip(SIDES, images.sides, strict=True)]
+    both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
+    few = {view.name for view in spread(both, MAX_LOG_VIEWS)} if images.topics[0] and both else set(images.names)
+    seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names if name in few]
     return [view for view in seen if any(view.seen)]
 
 
-def _found(pictures: Pictures, board: Board, how: tuple[str, bool, bool]) -> dict[str, BoardView]:
+def _found(images: Images, board: Board, how: tuple[str, bool, bool]) -> dict[str, BoardView]:
     name, is_log, tell = how
     try:
-        views = find_boards(pictures, board, thorough=not is_log, tell=tell)
+        views = find_boards(images, board, thorough=not is_log, tell=tell)
     except OmnidError as error:
         raise OmnidError(f"{name} camera: {error}") from error
     return {view.name: view for view in views}
 
 
-def _own_cameras(views: list[PairView], pictures: PairedPictures, board: Board, args: argparse.Namespace
+def _own_cameras(views: list[PairView], images: PairedImages, board: Board, args: argparse.Namespace
                  ) -> tuple[Sides, list[PairView], list[Rejected]]:
-    """Each camera from its own pictures, those alone among them; the views that are good, and which were left out."""
+    """Each camera from its own images, those alone among them; the views that are good, and which were left out."""
     model: Model = args.model
     cameras, rejected = [], list[Rejected]()
     for side, name in enumerate(SIDES):
         mine = [seen for view in views if (seen := view.seen[side]) is not None]
-        height, width = pictures.sides[side][mine[0].name].shape if mine else (0, 0)
+        height, width = images.sides[side][mine[0].name].shape if mine else (0, 0)
         found = calibrate(mine, board, (width, height), model, args.view)
-        found = sharpened(found, pictures.sides[side], model, args.view)
+        found = sharpened(found, images.sides[side], model, args.view)
         cameras.append(found.camera)
         rejected += [Rejected(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
         views = _without(views, side, {bad.name for bad in found.rejected})
@@ -206,25 +206,25 @@ def _check_baseline(found: RigCalibration, args: argparse.Namespace) -> list[str
         abs(off) > DOUBTFUL_PART)
 
 
-def _rig(found: RigCalibration, pictures: PairedPictures, given: tuple[CameraFile, CameraFile] | None,
+def _rig(found: RigCalibration, images: PairedImages, given: tuple[CameraFile, CameraFile] | None,
          args: argparse.Namespace) -> tuple[Rig, list[str]]:
     """The rig with its masks, and what is to be said where a mirror's rim was not found."""
-    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), pictures.topics)
+    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
     masks = [_mask(found_camera.center, side, file, painted=args.mask)
-             for found_camera, side, file in zip((found.lower, found.upper), pictures.sides, given or (None, None),
+             for found_camera, side, file in zip((found.lower, found.upper), images.sides, given or (None, None),
                                                  strict=True)]
-    said = [f"no rim of a mirror was found in the {name} camera's pictures: the daemon looks for it again, or add "
+    said = [f"no rim of a mirror was found in the {name} camera's images: the daemon looks for it again, or add "
             f"[{name}.mask] by hand" for name, mask in zip(SIDES, masks, strict=True) if mask is None]
     return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), said
 
 
-def _mask(center: tuple[float, float], pictures: Pictures, file: CameraFile | None, *, painted: bool) -> Mask | None:
-    """The mask to be painted, or that of the camera's file, or the rim in the brightest of all pictures."""
+def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, *, painted: bool) -> Mask | None:
+    """The mask to be painted, or that of the camera's file, or the rim in the brightest of all images."""
     if painted:
-        return find_mask(list(pictures.values()), center)
+        return find_mask(list(images.values()), center)
     if file is not None and file.mask is not None:
         return file.mask
-    return find_rim(np.max(list(pictures.values()), axis=0), center)
+    return find_rim(np.max(list(images.values()), axis=0), center)
 
 
 def describe(found: RigCalibration) -> str:

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import Config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
-    from omnid.runs.replay import Options, Replay
+    from omnid.runs.replay import Options, ReplayRun
     from omnid.settings import load
 
     _make(args.output)
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     config = load(Config, args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
-        code = Replay(log, config, options).run(rig=None, topics=(None, None))
+        code = ReplayRun(log, config, options).run(rig=None, topics=(None, None))
         if code == 0:
             print(f"\nagainst the truth:\n{format_metrics(evaluate(read_tum(tum), read_tum(truth)))}")
     print(f"\nfiles: {', '.join(str(path) for _, path in options.files)}")

@@ -11,7 +11,7 @@ AGREE, PART = 0, 1
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `diff` to the command line."""
-    parser = subparsers.add_parser("diff", help="where two recorded runs over the same pictures part; exit code 1 "
+    parser = subparsers.add_parser("diff", help="where two recorded runs over the same images part; exit code 1 "
                                    "where they do")
     parser.add_argument("a", type=Path, metavar="A.mcap", help="what `omnid run`, replay --record or listen --mcap "
                         "wrote, or any log with nav_msgs/msg/Odometry")
@@ -23,7 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--shared", type=float, default=90.0, metavar="PERCENT", help="the least share of the longer "
                         "run's poses that the other must have; default %(default)s")
     parser.add_argument("--align", action="store_true", help="lay the first common pose of B on that of A: for runs "
-                        "that began at different pictures")
+                        "that began at different images")
     parser.add_argument("--topic", help="that of the poses, where a recording has several")
     parser.set_defaults(run=run)
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """Prints what there is to say; 0 where the runs agree, 1 where they part."""
     from omnid.engine.logging_setup import WARNING, tell
     from omnid.monitor.robot_state import plain
-    from omnid.recordings.comparison import Comparison, Tolerance
+    from omnid.recordings.comparison import RunComparison, Tolerance
     from omnid.recordings.run_reader import read_run
 
     limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
         return AGREE
     tolerance = Tolerance(limits[0] * 1e-3, math.radians(limits[1]), limits[2] * 1e-2)
-    comparison = Comparison(a, b, tolerance, align=args.align)
+    comparison = RunComparison(a, b, tolerance, align=args.align)
     for warning in (*a.warnings, *b.warnings):
         tell(WARNING, warning)
     print("\n".join(map(plain, comparison.lines())))

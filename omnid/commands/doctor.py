@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from omnid.doctor.finding import Finding
 
 ROOT = Path("/")  # where sys, dev and proc are
-BYTES_PER_PIXEL = 0.3  # of a JPEG of a textured picture, on the safe side
+BYTES_PER_PIXEL = 0.3  # of a JPEG of a textured image, on the safe side
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,14 +43,16 @@ def examine(config: Config) -> Iterator[Finding]:
     from drivers.cameras.v4l2_devices import capture_devices
     from omnid.doctor import cameras, devices, machine, wiring
 
-    eyes, wanted = config.cameras, config.realtime
+    camera, wanted = config.cameras, config.realtime
     yield from machine.programs()
-    yield from cameras.cameras({name: eyes.settings(name) for name in ("lower", "upper")}, capture_devices(ROOT), ROOT)
-    yield from wiring.rig(Path(eyes.rig), (eyes.width_px, eyes.height_px))
+    yield from cameras.cameras(
+        {name: camera.settings(name) for name in ("lower", "upper")}, capture_devices(ROOT), ROOT
+    )
+    yield from wiring.rig(Path(camera.rig), (camera.width_px, camera.height_px))
     yield from wiring.motor(config.motor.port, ROOT)
     yield devices.memberships()
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield from machine.clock()
-    rate = 2 * eyes.width_px * eyes.height_px * BYTES_PER_PIXEL * (eyes.rate_hz or 30.0)
+    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
     yield from wiring.bus(config.bus)

@@ -1,4 +1,4 @@
-"""`omnid record`: the pictures of both cameras into a folder, for a calibration, or to be replayed."""
+"""`omnid record`: the images of both cameras into a folder, for a calibration, or to be replayed."""
 
 from __future__ import annotations
 

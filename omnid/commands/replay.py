@@ -13,8 +13,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
     parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap file, or the folder of ros2 bag record -s mcap")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
-    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's pictures; default: by name")
-    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's pictures; default: by name")
+    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's images; default: by name")
+    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's images; default: by name")
     _add_outputs(parser)
     _add_manner(parser)
     add_settings(parser)
@@ -46,13 +46,13 @@ def _add_manner(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replays the log."""
     from omnid.config import Config
-    from omnid.runs.replay import Options, Replay
+    from omnid.runs.replay import Options, ReplayRun
     from omnid.settings import load
 
     options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
                       inline=args.inline, realtime=args.realtime, quiet=args.quiet, settings=args.config)
     config = load(Config, args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
-    return Replay(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
+    return ReplayRun(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
 
 
 def _presets(args: argparse.Namespace) -> list[str]:

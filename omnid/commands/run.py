@@ -22,7 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log, "
                         "without a log cameras.rig of the settings")
     parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
-    parser.add_argument("--log", type=Path, metavar="LOG", help="pictures of a log in the place of cameras, to try it "
+    parser.add_argument("--log", type=Path, metavar="LOG", help="images of a log in the place of cameras, to try it "
                         "out: in real time, forwards and backwards until it is stopped")
     parser.add_argument("--pace", type=float, default=1.0, help="how many times as fast as it was recorded")
     parser.add_argument("--once", action="store_true", help="end with the log")
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     share_heap()  # before anything else: the next line loads numpy, which starts threads
     from omnid.config import Config
     from omnid.engine.logging_setup import say
-    from omnid.runs.live import Live
+    from omnid.runs.live import LiveRun
     from omnid.settings import load
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
@@ -45,15 +45,15 @@ def run(args: argparse.Namespace) -> int:
     config = load(Config, args.config, [*args.overrides, *shortcuts])
     if args.log is None:
         _refuse_what_needs_a_log(args)
-        return Live(config, _devices(config), say).run()
-    return Live(config, _recorded(args), say, None if args.rig else _rig_of(args.log)).run()
+        return LiveRun(config, _devices(config), say).run()
+    return LiveRun(config, _recorded(args), say, None if args.rig else _rig_of(args.log)).run()
 
 
 def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
     from omnid.errors import OmnidError
 
     if args.once or args.pace != 1.0:
-        raise OmnidError("--once and --pace are for the pictures of a log: give one with --log, or leave them out")
+        raise OmnidError("--once and --pace are for the images of a log: give one with --log, or leave them out")
 
 
 def _devices(config: Config) -> Opener:
@@ -64,11 +64,11 @@ def _devices(config: Config) -> Opener:
 
 
 def _recorded(args: argparse.Namespace) -> Opener:
-    from drivers.cameras.log_camera import LogCamera, Pictures
+    from drivers.cameras.log_camera import LogCamera, LogImages
 
-    pictures = Pictures.of(args.log)
+    images = LogImages.of(args.log)
     epoch_ns = time.monotonic_ns()
-    return lambda camera: LogCamera(pictures, camera, epoch_ns, pace=args.pace, once=args.once)
+    return lambda camera: LogCamera(images, camera, epoch_ns, pace=args.pace, once=args.once)
 
 
 def _rig_of(log: Path) -> Rig:

@@ -1,4 +1,4 @@
-"""`omnid view`: path, map, pictures with their features, depth and plots, in rerun."""
+"""`omnid view`: path, map, images with their features, depth and plots, in rerun."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # whoever asks for another command loads none of this
     from omnid.config import Config
-    from omnid.viewer.targets import Place
+    from omnid.viewer.targets import ViewerTarget
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `view` to the command line."""
     parser = subparsers.add_parser("view", help="see a log or a robot: path, map, features, depth, plots (needs rerun)")
     parser.add_argument("log", type=Path, nargs="?", metavar="LOG", help="a recording, which is shown as it stands, or "
-                        "a log of pictures, which goes through the stages; without one, a robot is listened to")
+                        "a log of images, which goes through the stages; without one, a robot is listened to")
     where = parser.add_argument_group("where it is shown; default: a window")
     where.add_argument("-o", "--output", type=Path, metavar="FILE.rrd", help="a file that `rerun FILE.rrd` opens, here "
                        "or elsewhere; needs no display")
@@ -30,10 +30,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _add_log(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a log")
-    group.add_argument("--replay", action="store_true", help="compute anew from the pictures of a recording")
+    group.add_argument("--replay", action="store_true", help="compute anew from the images of a recording")
     group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
-    group.add_argument("--lower", metavar="TOPIC", help="the lower camera's pictures; default: by name")
-    group.add_argument("--upper", metavar="TOPIC", help="the upper camera's pictures; default: by name")
+    group.add_argument("--lower", metavar="TOPIC", help="the lower camera's images; default: by name")
+    group.add_argument("--upper", metavar="TOPIC", help="the upper camera's images; default: by name")
     group.add_argument("--quiet", action="store_true", help="no progress")
 
 
@@ -62,14 +62,14 @@ def run(args: argparse.Namespace) -> int:
     return _robot(args, config, place) if args.log is None else _log(args, config, place)
 
 
-def _log(args: argparse.Namespace, config: Config, place: Place) -> int:
+def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
     from omnid.viewer.view import Log, show_log
 
     log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.quiet)
     return show_log(log, config, args.config, place)
 
 
-def _robot(args: argparse.Namespace, config: Config, place: Place) -> int:
+def _robot(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
     from dataclasses import replace
 
     from omnid.viewer.view import show_robot

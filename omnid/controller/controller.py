@@ -11,18 +11,18 @@ from typing import NamedTuple
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import Late
-from omnid.controller.statistics import Account, Tick
-from omnid.core.control.heading_controller import Drive, HeadingHold, HeadingLimits, Setpoint
+from omnid.controller.statistics import ControllerState, TickReport
+from omnid.core.control.heading_controller import HeadingController, HeadingLimits, Setpoint, Twist
 from omnid.core.control.heading_goal import HeadingGoal
-from omnid.core.control.safety_rules import COMMAND_STALE, IDLE, Deadlines, Situation, reason_to_stop
-from omnid.core.control.velocity_limits import STOP, CommandLimits
+from omnid.core.control.safety_rules import COMMAND_STALE, IDLE, Deadlines, SafetyInputs, stop_reason
+from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.engine.flow import nothing
 
 SURE = ("", IDLE, COMMAND_STALE)  # reasons for which the pose has been found good
 NS = 1e-9
 
 
-class Heading(NamedTuple):
+class ControllerPose(NamedTuple):
     """What the wheels need of a pose."""
 
     stamp_ns: int  # of the capture
@@ -35,7 +35,7 @@ class Heading(NamedTuple):
         return self.heading_rad + self.yaw_rate_radps * (now_ns - self.stamp_ns) * NS
 
 
-class Arrived(NamedTuple):
+class TimedSetpoint(NamedTuple):
     """A command and when it came (CLOCK_MONOTONIC)."""
 
     arrival_ns: int
@@ -43,36 +43,36 @@ class Arrived(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class HelmSettings:
+class ControllerSettings:
     """How the wheels are driven."""
 
     period_s: float
     deadlines: Deadlines = field(default_factory=Deadlines)
     hold: HeadingLimits = field(default_factory=HeadingLimits)
-    limits: CommandLimits = field(default_factory=CommandLimits)
+    limits: VelocityLimits = field(default_factory=VelocityLimits)
 
 
-class Helm:
+class Controller:
     """Takes poses and commands, the newest of which count, and drives with each call.
 
-    It stops, with the deceleration of its limits, for every reason of omnid.core.control.safety_rules. A stop voids all commands
-    that came before it: only one that comes later moves the wheels again. For one thread.
+    It stops, with the deceleration of its limits, for every reason in omnid.core.control.safety_rules. A stop voids
+    all commands that came before it: only a later one moves the wheels again. Not thread-safe.
     """
 
-    def __init__(self, driver: MotorDriver, settings: HelmSettings, report: Callable[[str], None] = nothing, *,
+    def __init__(self, driver: MotorDriver, settings: ControllerSettings, report: Callable[[str], None] = nothing, *,
                  clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._driver, self._settings, self._report = driver, settings, report
-        self._clock_ns = clock_ns  # that of the pictures' stamps
-        self._hold, self._goal = HeadingHold(settings.hold), HeadingGoal()
-        self._pose: Heading | None = None
-        self._command: Arrived | None = None
+        self._clock_ns = clock_ns  # that of the images' stamps
+        self._hold, self._goal = HeadingController(settings.hold), HeadingGoal()
+        self._pose: ControllerPose | None = None
+        self._command: TimedSetpoint | None = None
         self._void_ns = self._clock_ns()  # commands up to then count no more
         self._stop_ns = 0  # when a stop was asked for last
         self._last_ns = self._due_ns = 0  # when the last tick came, and when the next one should
         self._driven_ns = 0  # capture of the newest pose that was driven by
         self._ending = self._stopped = False
         self._sent = STOP
-        self.account = Account()
+        self.account = ControllerState()
 
     @property
     def due_ns(self) -> int:
@@ -84,11 +84,11 @@ class Helm:
         """Whether the wheels were told to stand, or the controller hears nothing and stops them itself."""
         return self._sent == STOP or self.account.failed
 
-    def see(self, pose: Heading) -> None:
+    def see(self, pose: ControllerPose) -> None:
         """Takes a pose."""
         self._pose = pose
 
-    def command(self, arrived: Arrived) -> None:
+    def command(self, arrived: TimedSetpoint) -> None:
         """Takes a command."""
         self._command = arrived
 
@@ -100,7 +100,7 @@ class Helm:
         """Stops the wheels for good."""
         self._ending = True
 
-    def __call__(self) -> Tick:
+    def __call__(self) -> TickReport:
         """One tick."""
         now_ns = self._clock_ns()
         dt_s, late_s = self._rhythm(now_ns)
@@ -115,14 +115,14 @@ class Helm:
             self._goal.heard(status.heading_rad, sure.at(now_ns) if sure else None)
         done_ns = self._clock_ns()
         to_wheel_s = self._followed(pose, done_ns) if status is not None else math.nan
-        return Tick(None if status is None else told, late_s, (done_ns - now_ns) * NS, to_wheel_s, self.account)
+        return TickReport(None if status is None else told, late_s, (done_ns - now_ns) * NS, to_wheel_s, self.account)
 
     def close(self) -> None:
         """Stops the wheels at once and releases the driver."""
         self._driver.close()
 
-    def _followed(self, pose: Heading | None, done_ns: int) -> float:
-        """How old the pictures of a pose are that is driven by for the first time, s; else NaN."""
+    def _followed(self, pose: ControllerPose | None, done_ns: int) -> float:
+        """How old the images of a pose are that is driven by for the first time, s; else NaN."""
         if pose is None or pose.stamp_ns <= self._driven_ns:
             return math.nan
         self._driven_ns = pose.stamp_ns
@@ -139,18 +139,20 @@ class Helm:
         self.account.missed += missed
         return dt_ns * NS, (now_ns - due_ns) * NS
 
-    def _situation(self, now_ns: int, late_s: float, pose: Heading | None, command: Arrived | None) -> Situation:
+    def _situation(
+        self, now_ns: int, late_s: float, pose: ControllerPose | None, command: TimedSetpoint | None
+    ) -> SafetyInputs:
         valid = command is not None and command.arrival_ns > self._void_ns
-        return Situation(
+        return SafetyInputs(
             pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * NS,
             pose_state="" if pose is None else pose.state,
             command_age_s=(now_ns - command.arrival_ns) * NS if command is not None and valid else math.inf,
             late_s=late_s, motor_failed=self.account.failed, motor_stopped=self._stopped,
             stop_asked=self._stop_ns > self._void_ns, ending=self._ending)
 
-    def _judge(self, situation: Situation, now_ns: int) -> None:
+    def _judge(self, situation: SafetyInputs, now_ns: int) -> None:
         """Notes why the wheels must stand, if they must; voids the commands so far, and counts what stopped a drive."""
-        before, reason = self.account.reason, reason_to_stop(situation, self._settings.deadlines)
+        before, reason = self.account.reason, stop_reason(situation, self._settings.deadlines)
         self.account.reason = reason
         if not reason:
             return
@@ -159,7 +161,9 @@ class Helm:
             self.account.stops[reason] += 1
             self._report(f"the wheels stop: {reason}")
 
-    def _steered(self, now_ns: int, dt_s: float, pose: Heading | None, command: Arrived | None) -> tuple[Drive, float]:
+    def _steered(
+        self, now_ns: int, dt_s: float, pose: ControllerPose | None, command: TimedSetpoint | None
+    ) -> tuple[Twist, float]:
         """The drive within the limits, and the controller's heading that it leads to."""
         if self.account.reason or pose is None or command is None:
             return self._settings.limits.step(STOP, self._sent, dt_s), self._goal.stay()
@@ -168,7 +172,7 @@ class Helm:
         drive = self._settings.limits.step(wanted, self._sent, dt_s)
         return drive, self._goal.towards(command.setpoint, heading_rad, drive.yaw_rate_radps * dt_s)
 
-    def _send(self, command: VelocityCommand, drive: Drive) -> MotorStatus | None:
+    def _send(self, command: VelocityCommand, drive: Twist) -> MotorStatus | None:
         """The controller's answer; None where it gave none."""
         try:
             status = self._driver.send(command)
@@ -188,7 +192,7 @@ class Helm:
         self.account.sent += 1
         return status
 
-    def _heed(self, status: MotorStatus, drive: Drive) -> None:
+    def _heed(self, status: MotorStatus, drive: Twist) -> None:
         """Takes to heart what the controller says: one that has stopped by itself did not obey."""
         self._stopped = status.watchdog_expired
         self.account.expiries += status.watchdog_expired

@@ -12,7 +12,7 @@ NOTHING: Final = object()
 _LONGEST_PACKET: Final = 1 << 16  # bytes
 
 
-class Line:
+class Channel:
     """One end of a pair of sockets.
 
     Objects are pickled, so it is for two processes of one program only: neither checks what the other one says.

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from omnid.controller.controller import NS, Arrived, Heading
-from omnid.controller.ipc import NOTHING, Line, pair
-from omnid.controller.messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
-from omnid.controller.statistics import Logbook, Tick
+from omnid.controller.controller import NS, ControllerPose, TimedSetpoint
+from omnid.controller.ipc import NOTHING, Channel, pair
+from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
+from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.odometry.odometry import LOST
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from omnid.stages.odometry import of_base
+from omnid.tracking_state import TrackingState
 
 START_S: Final = 30.0  # some boards start anew when their port is opened
 END_S: Final = LONGEST_RAMP_S + 2.0
@@ -34,22 +34,22 @@ LOOK_S: Final = 0.5
 PROCESS: Final = "omnid.controller.process"
 
 
-class HelmLink:
+class ControllerLink:
     """A sink for poses, a mailbox for commands, and a source of what the wheels were told.
 
     The tick is not in here but in a process of its own, which no stage can hold up. `stop` rides along with
     all that is said after it, so that it arrives whatever was lost.
     """
 
-    def __init__(self, orders: Orders, T_base_rig: NDArray[np.float64], stats: StageStats,
+    def __init__(self, orders: ControllerStart, T_base_rig: NDArray[np.float64], stats: StageStats,
                  report: Callable[[str], None]) -> None:
         """Starts the process; DriverError where the controller is not there."""
         self._T_base_rig, self._report = T_base_rig, report
-        self.logbook = Logbook(stats)
+        self.logbook = ControllerStatistics(stats)
         self._stop_ns = 0
         self._ended_ns = 0  # when it was told to end
         here, there = pair()
-        self._line = Line(here)
+        self._line = Channel(here)
         with there:
             self._process = _started(there.fileno())
         self._line.say(orders)
@@ -59,13 +59,13 @@ class HelmLink:
             self.close()
             raise
 
-    def process(self, odometry: Odometry) -> None:
+    def process(self, odometry: OdometryUpdate) -> None:
         """Passes a pose on."""
         self._say(heading_of(odometry, self._T_base_rig))
 
     def command(self, setpoint: Setpoint, arrival_ns: int) -> None:
         """Passes a command on that arrived then (CLOCK_MONOTONIC), from any thread; the newest wins."""
-        self._say(Arrived(arrival_ns, setpoint))
+        self._say(TimedSetpoint(arrival_ns, setpoint))
 
     def stop(self) -> None:
         """Stops the wheels, whatever was commanded until now; from any thread."""
@@ -87,11 +87,11 @@ class HelmLink:
         with suppress(EOFError):
             while not self._overdue():
                 thing = self._line.hear(LOOK_S)
-                if isinstance(thing, Tick):
+                if isinstance(thing, TickReport):
                     self.logbook.add(thing)
                     if thing.command is not None and thing.command.stamp_ns >= since_ns:
                         yield thing.command
-                elif isinstance(thing, Remark):
+                elif isinstance(thing, LogRecord):
                     self._report(thing.text)
         self.logbook.close()
         if not self._ended_ns:
@@ -107,8 +107,8 @@ class HelmLink:
             self._process.wait()
         self._line.close()
 
-    def _say(self, news: Heading | Arrived | None) -> None:
-        self._line.say(Heard(self._stop_ns, news))
+    def _say(self, news: ControllerPose | TimedSetpoint | None) -> None:
+        self._line.say(ControllerUpdate(self._stop_ns, news))
 
     def _overdue(self) -> bool:
         return bool(self._ended_ns) and (time.monotonic_ns() - self._ended_ns) * NS > END_S
@@ -120,7 +120,7 @@ class HelmLink:
             raise OmnidError(self._epitaph()) from None
         if word is NOTHING:
             raise OmnidError(f"the process that steers did not start within {START_S:.0f} s: is the host overloaded?")
-        if isinstance(word, Refused):
+        if isinstance(word, StartFailed):
             raise DriverError(word.why)
         if word.text:
             self._report(word.text)
@@ -132,12 +132,12 @@ class HelmLink:
                 "controller's own watchdog stops the wheels: start the daemon again")
 
 
-def heading_of(odometry: Odometry, T_base_rig: NDArray[np.float64]) -> Heading:
+def heading_of(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:
     """What the wheels need of a pose; one that is not finite is as good as none."""
     T_odom_base, _, velocity, _ = of_base(odometry, T_base_rig)
     heading_rad, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[5])
-    state = odometry.state if math.isfinite(heading_rad) and math.isfinite(rate_radps) else LOST
-    return Heading(odometry.stamp_ns, heading_rad, rate_radps, state)
+    state = odometry.state if math.isfinite(heading_rad) and math.isfinite(rate_radps) else TrackingState.LOST
+    return ControllerPose(odometry.stamp_ns, heading_rad, rate_radps, state)
 
 
 def _started(descriptor: int) -> subprocess.Popen[bytes]:

@@ -72,9 +72,9 @@ def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[SerialMotor, Si
                           f"give at least {least_ms:.0f}, {WATCHDOG_TICKS} ticks, or a higher rate")
     twin = None
     if config.port == SIMULATED:
-        twin = SimulatedMotor(TWINS[config.protocol](config.drive))
+        twin = SimulatedMotor(TWINS[config.protocol](config.drive.geometry()))
         closing.callback(twin.close)
-    protocol = PROTOCOLS[config.protocol](config.drive)
+    protocol = PROTOCOLS[config.protocol](config.drive.geometry())
     driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud,
                          timeout_s=ANSWER_SHARE / config.rate_hz, watchdog_ms=config.watchdog_ms)
     closing.callback(driver.close)

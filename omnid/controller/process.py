@@ -15,9 +15,9 @@ from typing import Final
 
 from drivers.errors import DriverError
 from omnid.config import RealtimeConfig
-from omnid.controller.controller import NS, Arrived, Heading, Helm
-from omnid.controller.ipc import NOTHING, Line
-from omnid.controller.messages import LONGEST_RAMP_S, Heard, Orders, Refused, Remark
+from omnid.controller.controller import NS, Controller, ControllerPose, TimedSetpoint
+from omnid.controller.ipc import NOTHING, Channel
+from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
 from omnid.engine.realtime import ThreadStart, prepare
 from omnid.engine.signals import STOPPING
@@ -27,10 +27,10 @@ ORDERS_S: Final = 10.0
 ABORTING: Final = signal.SIGABRT  # that is how systemd ends a daemon that is stuck, and all that belongs to it
 
 
-class Steering:
+class ControllerLoop:
     """Ticks in time, and hears in between."""
 
-    def __init__(self, line: Line, helm: Helm) -> None:
+    def __init__(self, line: Channel, helm: Controller) -> None:
         self._line, self._helm = line, helm
         self._until_ns = 0  # once the daemon has hung up: until when the wheels may slow down
 
@@ -70,26 +70,26 @@ class Steering:
         self._take(heard)
         return True
 
-    def _take(self, heard: Heard) -> None:
+    def _take(self, heard: ControllerUpdate) -> None:
         self._helm.stop(heard.stop_ns)
-        if isinstance(heard.news, Heading):
+        if isinstance(heard.news, ControllerPose):
             self._helm.see(heard.news)
-        elif isinstance(heard.news, Arrived):
+        elif isinstance(heard.news, TimedSetpoint):
             self._helm.command(heard.news)
 
 
-def steer(line: Line) -> int:
+def run_controller(line: Channel) -> int:
     """Does what the daemon orders; 2 where it cannot."""
     with ExitStack() as ends:
         ends.callback(line.close)  # last of all, when the wheels stand
-        orders: Orders = line.hear(ORDERS_S)
+        orders: ControllerStart = line.hear(ORDERS_S)
         try:
             driver, _ = open_motor(orders.motor, ends)
         except DriverError as error:
-            line.say(Refused(str(error)))
+            line.say(StartFailed(str(error)))
             return 2
-        line.say(Remark(settle(orders.realtime)))
-        Steering(line, Helm(driver, orders.settings, lambda text: line.say(Remark(text)))).run()
+        line.say(LogRecord(settle(orders.realtime)))
+        ControllerLoop(line, Controller(driver, orders.settings, lambda text: line.say(LogRecord(text)))).run()
     return 0
 
 
@@ -105,7 +105,7 @@ def main() -> int:
     """The process; its argument is the descriptor of its end of the line."""
     for number in (*STOPPING, ABORTING):
         signal.signal(number, signal.SIG_IGN)
-    return steer(Line(socket.socket(fileno=int(sys.argv[1]))))
+    return run_controller(Channel(socket.socket(fileno=int(sys.argv[1]))))
 
 
 if __name__ == "__main__":

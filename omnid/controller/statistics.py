@@ -14,7 +14,7 @@ from omnid.engine.telemetry import Histogram, StageStats
 
 
 @dataclass(slots=True)
-class Account:
+class ControllerState:
     """How the wheels have fared so far."""
 
     reason: str = IDLE  # why they must stand now; empty: they may turn
@@ -29,27 +29,27 @@ class Account:
     stops: Counter[str] = field(default_factory=Counter)  # of wheels that turned, by reason
 
 
-class Tick(NamedTuple):
+class TickReport(NamedTuple):
     """What came of one tick."""
 
     command: VelocityCommand | None  # that the controller took
     late_s: float
     work_s: float
-    to_wheel_s: float  # from the capture of a pose's pictures to this, the first command after it; else NaN
-    account: Account
+    to_wheel_s: float  # from the capture of a pose's images to this, the first command after it; else NaN
+    account: ControllerState
 
 
-class Logbook:
+class ControllerStatistics:
     """The book: the newest account, and how late, how long and how old things were."""
 
     def __init__(self, stats: StageStats) -> None:
         """stats: of the tick among the other stages; since the first it is busy until the next is heard of."""
-        self.account = Account()
+        self.account = ControllerState()
         self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
 
-    def add(self, tick: Tick) -> None:
+    def add(self, tick: TickReport) -> None:
         """One more tick."""
         self.account = tick.account
         self.lateness.add(tick.late_s)

@@ -5,36 +5,36 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from omnid.config import PairConfig
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.stages.log_pairing import PairSync
 from omnid.stages.stereo import Stereo
 
 
-def found_nothing(tally: Tally) -> bool:
+def no_pose(tally: RunStatistics) -> bool:
     """Whether there is not one pose that was measured."""
     return tally.poses == tally.states["lost"]
 
 
-def doubts(pair: PairSync, stereo: Stereo, tally: Tally, config: PairConfig) -> Iterator[str]:
+def input_warnings(pair: PairSync, stereo: Stereo, tally: RunStatistics, config: PairConfig) -> Iterator[str]:
     """One line for each thing that is amiss."""
     if pair.fault:
-        yield f"{pair.counts['broken']} pictures could not be decoded; the first: {pair.fault}"
+        yield f"{pair.counts['broken']} images could not be decoded; the first: {pair.fault}"
     counts = pair.counts
     if not counts["pairs"]:
         yield _no_pair(pair.nearest_ms, config.tolerance_ms)
     elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
-        yield (f"most pictures of both cameras found no partner: the next ones are {pair.nearest_ms or 0.0:.3f} ms "
+        yield (f"most images of both cameras found no partner: the next ones are {pair.nearest_ms or 0.0:.3f} ms "
                f"apart, pair.tolerance_ms is {config.tolerance_ms:g}; where none are missing, synchronise the cameras")
     if stereo.exchanged:
-        yield ("the pictures match better the other way round: is --lower the lower camera, and is the rig that of "
+        yield ("the images match better the other way round: is --lower the lower camera, and is the rig that of "
                "these cameras?")
     if tally.states["lost"] > tally.poses / 2:
         yield (f"the pose was lost in {tally.states['lost']} of {tally.poses} pairs: is the rig that of these cameras, "
-               "is --lower the lower one, are the pictures bright and sharp?")
+               "is --lower the lower one, are the images bright and sharp?")
 
 
 def _no_pair(nearest_ms: float | None, tolerance_ms: float) -> str:
     if nearest_ms is None:
-        return "not one pair of pictures: one camera or both gave none, see the drops below"
-    return (f"not one pair of pictures: the stamps of the two cameras are {nearest_ms:.3f} ms apart at best, "
+        return "not one pair of images: one camera or both gave none, see the drops below"
+    return (f"not one pair of images: the stamps of the two cameras are {nearest_ms:.3f} ms apart at best, "
             f"pair.tolerance_ms is {tolerance_ms:g}: set it higher, or the cameras' clocks right")

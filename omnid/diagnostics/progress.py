@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TextIO
 
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0
@@ -18,7 +18,7 @@ COLUMNS = 80  # of a terminal that does not say
 class Progress:
     """Draws a bar, or writes a line where stderr is no terminal; called at a fixed rate."""
 
-    def __init__(self, tally: Tally, expected: int | None, stream: TextIO | None = None) -> None:
+    def __init__(self, tally: RunStatistics, expected: int | None, stream: TextIO | None = None) -> None:
         self._tally, self._expected = tally, expected
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()

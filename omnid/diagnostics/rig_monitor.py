@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.rig.rig_check import Matches, RigFinding, Verdict, judge, match, together
 from omnid.messages import Panoramas
-from omnid.transport.codec import ERROR, OK, WARN, Status
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class _View:
     matches: Matches
 
 
-class RigWatch:
+class RigMonitor:
     """A sink of panoramas that takes one every every_s of their stamps; give it an inbox that forgets.
 
     10 to 20 ms for a view that is new, 20 to 50 ms more once in PAIRS of them; next to nothing for all others.
@@ -83,17 +83,17 @@ class RigWatch:
         self._views.append(_View(thumbnail, match(panoramas.lower, panoramas.upper, panoramas.visible)))
         return True
 
-    def status(self) -> Status:
+    def status(self) -> DiagnosticStatus:
         """What the newest finding says of the rig; age_s is the time in stamps since then."""
         values = {"views": f"{self._new} new of {PAIRS}"}
         if self._found is None:
-            return Status(NAME, OK, "not looked yet: that takes some driving", values)
+            return DiagnosticStatus(NAME, OK, "not looked yet: that takes some driving", values)
         finding, stamp_ns = self._found
         values |= {"verdict": finding.verdict, "turn_deg": f"{finding.turn_deg:.3f}",
                    "offset_px": f"{finding.offset_px:+.2f}", "left_px": f"{finding.left_px:.2f}",
                    "matches": f"{finding.matches} of {finding.tried}",
                    "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
-        return Status(NAME, LEVELS[finding.verdict], ADVICE[finding.verdict], values)
+        return DiagnosticStatus(NAME, LEVELS[finding.verdict], ADVICE[finding.verdict], values)
 
 
 def _thumbnail(panoramas: Panoramas) -> Array:

@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 
 
-class Tally:
+class RunStatistics:
     """A sink that adds up; other threads may read what it has."""
 
     def __init__(self) -> None:
@@ -18,10 +18,10 @@ class Tally:
         self.length_m = 0.0
         self.states: Counter[str] = Counter()
         self.resets = 0
-        self.newest: Odometry | None = None
+        self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
 
-    def process(self, odometry: Odometry) -> None:
+    def process(self, odometry: OdometryUpdate) -> None:
         """Counts a pose."""
         position = odometry.T_odom_rig[:3, 3]
         if self._position is not None:

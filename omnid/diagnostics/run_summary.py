@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.telemetry import SummaryRow
 
 QUIET_BOXES = ("progress", "tally")
 
 
-def counters(tally: Tally, dropped: Mapping[str, int]) -> dict[str, str]:
+def counters(tally: RunStatistics, dropped: Mapping[str, int]) -> dict[str, str]:
     """The counts of a run, by name."""
     states = {name: tally.states[name] for name in ("tracking", "degraded", "lost")}
     share = ", ".join(f"{name} {_share(count, tally.poses)}" for name, count in states.items())
@@ -19,7 +19,7 @@ def counters(tally: Tally, dropped: Mapping[str, int]) -> dict[str, str]:
             "resets": str(tally.resets), "drops": drops}
 
 
-def summary(values: Mapping[str, str], rows: Iterable[SummaryRow]) -> str:
+def run_summary(values: Mapping[str, str], rows: Iterable[SummaryRow]) -> str:
     """The counters, and a table of the stages' times."""
     lines = [f"{name:<9} {value}" for name, value in values.items()]
     lines += ["", f"{'stage':<11}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]

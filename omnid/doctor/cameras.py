@@ -1,4 +1,4 @@
-"""The cameras: there, two of them, with the modes that are asked for, and room for their pictures on USB.
+"""The cameras: there, two of them, with the modes that are asked for, and room for their images on USB.
 
 A high-speed USB 2 bus carries 480 Mbit/s, of which all streams together get 80 %, and one stream 3 packets of 1024
 bytes per microframe of 125 us (USB 2.0, 5.6.3 and 5.6.4).
@@ -29,7 +29,7 @@ _OTHER_PORT = "plug one into a port of another USB controller, see `lsusb -t`"
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class CameraStream:
     """What a camera will send, and where to."""
 
     name: str
@@ -46,7 +46,7 @@ def cameras(
 
     root: holds sys, dev and proc.
     """
-    streams: list[Stream] = []
+    streams: list[CameraStream] = []
     for name, settings in wanted.items():
         device = _found(settings, known, root)
         yield from _camera(name, settings, device, root)
@@ -58,16 +58,16 @@ def cameras(
     yield from buses(streams)
 
 
-def buses(streams: list[Stream]) -> Iterator[Finding]:
+def buses(streams: list[CameraStream]) -> Iterator[Finding]:
     """Whether what the cameras send fits through each USB bus."""
-    by_bus: defaultdict[str, list[Stream]] = defaultdict(list)
+    by_bus: defaultdict[str, list[CameraStream]] = defaultdict(list)
     for stream in streams:
         by_bus[stream.bus].append(stream)
     for bus, sharing in sorted(by_bus.items()):
         yield _bus(f"usb bus {bus}", sharing) if bus else Finding("ok", "usb", f"{_names(sharing)}: not on USB")
 
 
-def _bus(subject: str, sharing: list[Stream]) -> Finding:
+def _bus(subject: str, sharing: list[CameraStream]) -> Finding:
     slow = [stream for stream in sharing if stream.bus_mbps <= HIGH_SPEED_MBPS]
     needed_mbps = sum(stream.rate_mbps for stream in slow)
     for stream in slow:
@@ -79,7 +79,7 @@ def _bus(subject: str, sharing: list[Stream]) -> Finding:
                        f"which carries {BUS_MBPS:.0f}", f"{_OTHER_PORT}, or lower cameras.rate_hz")
     if len(slow) > 1 and not all(stream.rate_mbps for stream in slow):
         return Finding("warning", subject, f"{_names(slow)} share a USB 2 bus, on which many cameras reserve more than "
-                       "their compressed pictures need", f"if one does not start (no space left): {_OTHER_PORT}")
+                       "their compressed images need", f"if one does not start (no space left): {_OTHER_PORT}")
     sent = f"{needed_mbps:.0f} of {BUS_MBPS:.0f} Mbit/s" if needed_mbps else f"{sharing[0].bus_mbps:.0f} Mbit/s"
     return Finding("ok", subject, f"{_names(sharing)}: {sent}")
 
@@ -97,7 +97,7 @@ def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, roo
         others = [holder for holder in holders(path, root) if not is_ours(holder)]
         if others:
             against.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}", "end it"))
-        yield from against or [Finding("ok", subject, f"{device.name} at {device.node}, {_picture(settings, device)}")]
+        yield from against or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}")]
 
 
 def _troubles(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:
@@ -115,19 +115,19 @@ def _format(settings: V4l2Settings, device: CaptureDevice) -> str:
     return choose(device.modes, settings.pixel_format, size, settings.rate_hz)
 
 
-def _picture(settings: V4l2Settings, device: CaptureDevice) -> str:
+def _image(settings: V4l2Settings, device: CaptureDevice) -> str:
     rate = f" at {settings.rate_hz:g} Hz" if settings.rate_hz else ""
     return f"{_format(settings, device)} {settings.width_px}x{settings.height_px}{rate}"
 
 
-def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path) -> Stream | None:
+def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path) -> CameraStream | None:
     """What the camera will send; None where it cannot send what is asked for."""
     try:
         pixel_format = _format(settings, device)
     except DriverError:
         return None
     bits = settings.width_px * settings.height_px * BYTES_PER_PIXEL.get(pixel_format, 0.0) * 8
-    return Stream(name, pixel_format, bits * (settings.rate_hz or _USUAL_RATE_HZ) * 1e-6, *_usb(device, root))
+    return CameraStream(name, pixel_format, bits * (settings.rate_hz or _USUAL_RATE_HZ) * 1e-6, *_usb(device, root))
 
 
 def _usb(device: CaptureDevice, root: Path) -> tuple[str, float]:
@@ -149,5 +149,5 @@ def _resolved(device: str, root: Path) -> Path:
     return (root / device.lstrip("/")).resolve()
 
 
-def _names(streams: list[Stream]) -> str:
+def _names(streams: list[CameraStream]) -> str:
     return " and ".join(f"{stream.name} ({stream.pixel_format})" for stream in streams)

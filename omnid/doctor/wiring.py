@@ -43,7 +43,7 @@ def motor(port: str, root: Path = Path("/")) -> Iterator[Finding]:
 
 
 def rig(path: Path, size_px: tuple[int, int]) -> Iterator[Finding]:
-    """Whether the rig can be read and is of pictures of this size (width, height), and whether it has masks."""
+    """Whether the rig can be read and is of images of this size (width, height), and whether it has masks."""
     try:
         found = read_rig(path)
     except CalibError as error:

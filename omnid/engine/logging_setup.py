@@ -1,7 +1,7 @@
 """What the daemon says: a line each on stderr, with the journal's priorities where the journal reads it.
 
 The same line again and again is written a few times a minute, and the rest is counted: a fault that repeats itself at
-the rate of the pictures fills no disk.
+the rate of the images fills no disk.
 """
 
 from __future__ import annotations

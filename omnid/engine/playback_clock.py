@@ -10,7 +10,7 @@ from drivers.frame import Frame
 _NAP_S = 0.05
 
 
-class Pace:
+class PlaybackClock:
     """Frames no earlier than their stamps say, counted from the first; `wake` ends all waiting."""
 
     def __init__(self) -> None:

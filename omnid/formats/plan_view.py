@@ -1,4 +1,4 @@
-"""The map from above, as a picture that survives a black and white print: x (forward) to the right, y (left) up."""
+"""The map from above, as a image that survives a black and white print: x (forward) to the right, y (left) up."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Image = NDArray[np.uint8]
 SIDE_LIMIT_PX = 2000
 _MARGIN_PX = 64
 _SCALE_LIMIT_PX_PER_M = 100.0  # a tabletop is not blown up to a page
-_CELL_M = 0.05  # the map's usual voxel: a picture of finer scale draws squares, not scattered dots
+_CELL_M = 0.05  # the map's usual voxel: a image of finer scale draws squares, not scattered dots
 _LEAST_EXTENT_M = 2.0  # an empty map still has a place to draw
 _WHITE, _BLACK, _RED = (255, 255, 255), (0, 0, 0), (0, 0, 190)  # BGR
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -24,7 +24,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True, slots=True)
 class _Sheet:
-    """Where metres stand on the picture."""
+    """Where metres stand on the image."""
 
     low_m: NDArray[np.float64]  # (2,) x, y of the drawn area's lower left corner
     high_m: NDArray[np.float64]  # (2,)
@@ -37,7 +37,7 @@ class _Sheet:
         return int(size[0]), int(size[1])
 
     def pixels(self, xy_m: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Picture coordinates (N, 2) of points (N, 2); y grows downwards there."""
+        """Image coordinates (N, 2) of points (N, 2); y grows downwards there."""
         corner = np.array([_MARGIN_PX, _MARGIN_PX + self.area_px[1] - 1])
         return np.asarray(np.rint(corner + (xy_m - self.low_m) * self.px_per_m * [1, -1]), dtype=np.int32)
 
@@ -50,7 +50,7 @@ def plan_view(
     z_high_m: float = 1.5,
     max_side_px: int = 1400,
 ) -> Image:
-    """A BGR picture (H, W, 3) of the map's points between two heights and the path (N, 2) in metres over it.
+    """A BGR image (H, W, 3) of the map's points between two heights and the path (N, 2) in metres over it.
 
     Heights count from the first pose, which is the origin of the map's frame. The darker a cell, the more confident
     points stand above one another. Neither side exceeds `max_side_px` (at most 2000), however far the run went; the

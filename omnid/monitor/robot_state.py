@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Pose, Report, pose_from, report_from
 
 SILENT_S: Final = 2.0
@@ -22,7 +22,7 @@ _RATE_OVER: Final = 100  # poses
 _LONGEST_NS: Final = 3_600 * 10**9  # a message that is older, or from the future, was stamped by another clock
 
 
-class Letter(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """One message as it came."""
 
     received_ns: int  # of Unix time
@@ -31,39 +31,39 @@ class Letter(NamedTuple):
     note: bytes
 
 
-class Mailbox:
+class Inbox:
     """What has come and was not looked at yet; when too much waits, the oldest is forgotten and counted."""
 
     def __init__(self) -> None:
-        self._letters: SimpleQueue[Letter] = SimpleQueue()
+        self._letters: SimpleQueue[ReceivedMessage] = SimpleQueue()
         self.forgotten = 0
 
     def take(self, topic: str, payload: bytes, note: bytes) -> None:
         """Adds a message that has just come; never waits."""
-        self._letters.put(Letter(time.time_ns(), topic, payload, note))
+        self._letters.put(ReceivedMessage(time.time_ns(), topic, payload, note))
         if self._letters.qsize() > _MOST_WAITING:
             with suppress(Empty):
                 self._letters.get_nowait()
                 self.forgotten += 1
 
-    def next(self, timeout_s: float) -> Letter | None:
+    def next(self, timeout_s: float) -> ReceivedMessage | None:
         """The oldest message, waited for at most so long."""
         with suppress(Empty):
             return self._letters.get(timeout=max(0.0, timeout_s))
         return None
 
 
-class Heard:
+class RobotState:
     """What has come of one robot, in constant memory."""
 
     def __init__(self) -> None:
         self.pose: Pose | None = None
-        self.statuses: dict[str, Status] = {}
+        self.statuses: dict[str, DiagnosticStatus] = {}
         self.poses = self.missed = self.broken = 0
-        self.age, self.way = Histogram(), Histogram()  # from the pictures to here; from the robot's network to here
+        self.age, self.way = Histogram(), Histogram()  # from the images to here; from the robot's network to here
         self._arrivals: deque[float] = deque(maxlen=_RATE_OVER)
 
-    def take(self, letter: Letter) -> Pose | None:
+    def take(self, letter: ReceivedMessage) -> Pose | None:
         """Counts a message; the pose in it, if it is one."""
         try:
             if letter.topic == "odom":

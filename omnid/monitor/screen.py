@@ -9,7 +9,7 @@ from typing import IO, Final
 
 import numpy as np
 
-from omnid.monitor.robot_state import Heard, plain
+from omnid.monitor.robot_state import RobotState, plain
 from omnid.transport.decode import Pose
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")
@@ -29,7 +29,7 @@ class Screen:
             print(f"omnid: waiting: {text}", file=sys.stderr, flush=True)
         self._said = text
 
-    def show(self, heard: Heard, forgotten: int = 0) -> None:
+    def show(self, heard: RobotState, forgotten: int = 0) -> None:
         """The state of things now."""
         if self._out.isatty():
             self._out.write(_CLEAR + "\n".join(table(self._robot, heard, forgotten)) + "\n")
@@ -38,7 +38,7 @@ class Screen:
         self._out.flush()
 
 
-def line(robot: str, heard: Heard) -> str:
+def line(robot: str, heard: RobotState) -> str:
     """All that matters in one line."""
     if heard.pose is None:
         return f"{robot}: no pose yet"
@@ -46,7 +46,7 @@ def line(robot: str, heard: Heard) -> str:
     return f"{robot}: {heard.state}  {_where(heard.pose)}  {counts}  {_times(heard)}"
 
 
-def table(robot: str, heard: Heard, forgotten: int) -> Iterator[str]:
+def table(robot: str, heard: RobotState, forgotten: int) -> Iterator[str]:
     """The same, and what the parts of the robot say of themselves."""
     yield line(robot, heard)
     if heard.pose is not None:
@@ -65,7 +65,7 @@ def _where(pose: Pose) -> str:
     return f"x {pose.x_m:+.3f} y {pose.y_m:+.3f} z {pose.z_m:+.3f} m  yaw {yaw_deg:+.2f} deg"
 
 
-def _times(heard: Heard) -> str:
+def _times(heard: RobotState) -> str:
     """Ages and latencies in ms, median and 99th percentile."""
     named = (("age", heard.age), ("way", heard.way))
     return "  ".join(f"{name} {1e3 * times.p(0.5):.1f}/{1e3 * times.p(0.99):.1f} ms" for name, times in named

@@ -8,13 +8,13 @@ from typing import IO
 from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
 from omnid.formats.tum import tum_row
-from omnid.monitor.robot_state import Letter
+from omnid.monitor.robot_state import ReceivedMessage
 from omnid.transport.bus import ros_name
 from omnid.transport.decode import Pose
 from omnid.transport.topics import SAID
 
 
-class TumKeeper:
+class TumWriter:
     """Writes the poses of the base, a line each, as they come."""
 
     def __init__(self, path: Path) -> None:
@@ -22,7 +22,7 @@ class TumKeeper:
         self._file: IO[str] | None = None
         self._newest_ns = -1
 
-    def __call__(self, letter: Letter, pose: Pose | None) -> None:
+    def __call__(self, letter: ReceivedMessage, pose: Pose | None) -> None:
         """Adds a pose; one that is no later than the last is left out: a line for each moment."""
         if pose is None or pose.stamp_ns <= self._newest_ns:
             return
@@ -37,7 +37,7 @@ class TumKeeper:
             self._file.close()
 
 
-class LogKeeper:
+class BusLogWriter:
     """Writes all messages to a log, with the robot's rig and configuration."""
 
     def __init__(self, path: Path, robot: Robot) -> None:
@@ -45,7 +45,7 @@ class LogKeeper:
         asked = {f"{file}.toml": robot.ask(name).encode() for file, name in (("rig", "rig"), ("omnid", "config"))}
         self._writer = LogWriter(path, {name: text for name, text in asked.items() if text})
 
-    def __call__(self, letter: Letter, _: Pose | None) -> None:
+    def __call__(self, letter: ReceivedMessage, _: Pose | None) -> None:
         """Adds a message under its name in ROS 2; its time is that of its arrival."""
         for name in (letter.topic, f"/{letter.topic}"):
             if name in SAID:

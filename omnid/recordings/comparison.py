@@ -46,7 +46,7 @@ class Tolerance(NamedTuple):
         return f"{1e3 * self.distance_m:g} mm or {math.degrees(self.angle_rad):g} deg"
 
 
-class Comparison:
+class RunComparison:
     """Two runs side by side; OmnidError where no stamp is in both. align: B's first common pose is laid on A's."""
 
     def __init__(self, a: Run, b: Run, tolerance: Tolerance, *, align: bool = False) -> None:
@@ -84,7 +84,7 @@ class Comparison:
     def _refuse_strangers(self, common: Series) -> None:
         if not common.stamps_ns.size:
             raise OmnidError(f"no pose of {self._a.path} ({_span(self._a)}) and {self._b.path} ({_span(self._b)}) has "
-                             "the same stamp, so they saw other pictures: compare a recording with a replay of it, "
+                             "the same stamp, so they saw other images: compare a recording with a replay of it, "
                              f"`omnid replay {self._a.path} --record again.mcap`")
 
     def _rows(self) -> Rows:

@@ -1,6 +1,6 @@
 """A run out of its recording: poses, states, commands, rig and settings; any MCAP with Odometry will do.
 
-Pictures are passed over unread and a pose is kept in 64 bytes, so a recording may be as long as a working day.
+Images are passed over unread and a pose is kept in 64 bytes, so a recording may be as long as a working day.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _odometry_topic(found: Survey, topic: str | None) -> str:
         return names[0]
     if names:
         raise OmnidError(f"{found.path}: several topics with poses: {_listed(names)}; give one of them with --topic")
-    raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA} in it: found {_listed(found.topics)}; pictures alone become "
+    raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA} in it: found {_listed(found.topics)}; images alone become "
                      f"a run by `omnid replay {found.path} --record out.mcap`")
 
 

@@ -8,7 +8,7 @@ from html import escape
 from itertools import cycle, pairwise
 from typing import Final, NamedTuple, TypeAlias
 
-from omnid.report.downsampling import Thinned
+from omnid.report.downsampling import Downsampled
 from omnid.report.svg import (
     STYLES,
     Axis,
@@ -32,16 +32,16 @@ _UNITS: Final = ((300.0, 1.0, "s"), (10800.0, 60.0, "min"), (float("inf"), 3600.
 Spans: TypeAlias = tuple[list[Point], ...]  # of tracking, degraded and lost, as poses.STATES
 
 
-class Line(NamedTuple):
+class ChartLine(NamedTuple):
     """A course to draw; each of a chart has a style of its own."""
 
     name: str
     points: Sequence[Point]
 
 
-def line(name: str, course: Thinned) -> Line:
+def line(name: str, course: Downsampled) -> ChartLine:
     """A course as a line."""
-    return Line(name, course.points())
+    return ChartLine(name, course.points())
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +89,18 @@ def shades(spans: Spans, clock: Clock) -> str:
     return hidden(f"<g id='shades'>{drawn}</g>")
 
 
-def chart(title: str, lines: Sequence[Line], clock: Clock, *, unit: str = "", log: bool = False, zero: bool = False,
-          note: str = "") -> str:
+def chart(
+    title: str,
+    lines: Sequence[ChartLine],
+    clock: Clock,
+    *,
+    unit: str = "",
+    log: bool = False,
+    zero: bool = False,
+    note: str = "",
+) -> str:
     """A figure with some courses over time; "" where there is nothing to draw."""
-    shown = [Line(name, [p for p in clock.shown(points) if p[1] > 0 or not log]) for name, points in lines]
+    shown = [ChartLine(name, [p for p in clock.shown(points) if p[1] > 0 or not log]) for name, points in lines]
     styled = list(zip(cycle(STYLES), (drawn for drawn in shown if drawn.points), strict=False))
     if not styled:
         return ""
@@ -103,9 +111,9 @@ def chart(title: str, lines: Sequence[Line], clock: Clock, *, unit: str = "", lo
     keys = "".join(key(style, drawn.name) for style, drawn in styled if drawn.name)
     caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''} {keys}"
     remark = f"<small>{escape(note)}</small>" if note else ""
-    picture = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *courses])
+    image = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *courses])
     return (f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
-            f"aria-label='{escape(title)}'>{picture}</svg>{remark}</figure>")
+            f"aria-label='{escape(title)}'>{image}</svg>{remark}</figure>")
 
 
 def _grid(x: Axis, y: Axis) -> Iterator[str]:

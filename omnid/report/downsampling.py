@@ -20,7 +20,7 @@ class _Bin(NamedTuple):
     high: Point
 
 
-class Thinned:
+class Downsampled:
     """The course of one quantity: the lowest and the highest value in each of at most BINS spans of time.
 
     The spans are equally long and double in length whenever there are too many; values may come in any order.

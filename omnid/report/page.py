@@ -1,4 +1,4 @@
-"""The pieces of a page that needs nothing beside itself: a head, tables, pictures within the text."""
+"""The pieces of a page that needs nothing beside itself: a head, tables, images within the text."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def grid(figures: Sequence[str]) -> str:
     return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
 
 
-def figure(picture: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
-    """A picture within the page."""
-    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+def figure(image: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
+    """A image within the page."""
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     source = base64.b64encode(data.tobytes()).decode()
-    image = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    img_tag = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
+    return f"<figure>{img_tag}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -1,4 +1,4 @@
-"""What the cameras saw: panoramas out of a recording that holds pictures and a rig."""
+"""What the cameras saw: panoramas out of a recording that holds images and a rig."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from omnid.stages.log_pairing import Decoder
 
 WIDTH_PX: Final = 1200
 MOST_HEIGHT_PX: Final = 500
-MOST_FRAMES: Final = 40_000  # that are gone through for a picture: the loss of a long log may be hours away
+MOST_FRAMES: Final = 40_000  # that are gone through for a image: the loss of a long log may be hours away
 
 
-class Wanted(NamedTuple):
-    """A picture that would be good to have: the lower camera's first one from a time on."""
+class WantedImages(NamedTuple):
+    """A image that would be good to have: the lower camera's first one from a time on."""
 
     stamp_ns: int
     caption: str
 
 
-def panoramas(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[Image, str]]:
+def panoramas(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[tuple[Image, str]]:
     """Panoramas and their captions, as far as they are found; OmnidError where none can be had."""
     try:
         cylinder = fit_cylinder(rig, WIDTH_PX)
         maps = remap_tables(rig, rig.lower, cylinder)
-        for caption, picture in _found(path, rig, wanted):
-            panorama = cv2.remap(picture, *maps, cv2.INTER_LINEAR)[:MOST_HEIGHT_PX]
+        for caption, image in _found(path, rig, wanted):
+            panorama = cv2.remap(image, *maps, cv2.INTER_LINEAR)[:MOST_HEIGHT_PX]
             yield np.asarray(panorama, np.uint8), caption
     except (CalibError, DriverError, cv2.error) as error:
         raise OmnidError(" ".join(str(error).split())) from error
 
 
-def _found(path: Path, rig: Rig, wanted: Sequence[Wanted]) -> Iterator[tuple[str, Image]]:
+def _found(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[tuple[str, Image]]:
     decode, left = Decoder(rig), sorted(wanted)
     with closing(LogReader(path)) as reader:
         for frame in islice(reader.frames(), MOST_FRAMES):
             if not left:
                 return
-            if _fits(frame, left[0]) and (picture := decode(frame)) is not None:
-                yield left.pop(0).caption, picture
+            if _fits(frame, left[0]) and (image := decode(frame)) is not None:
+                yield left.pop(0).caption, image
 
 
-def _fits(frame: Frame, wanted: Wanted) -> bool:
+def _fits(frame: Frame, wanted: WantedImages) -> bool:
     return frame.camera == "lower" and frame.stamp_ns >= wanted.stamp_ns

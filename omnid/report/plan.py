@@ -26,7 +26,7 @@ _MOST_PX_PER_M: Final = 400.0
 _MARGIN: Final = (44.0, 26.0, 14.0, 44.0)  # left, top, right, bottom [px]
 _CELL_M: Final = 0.05  # the map's usual voxel
 _TIMES: Final = 6  # marks along the path
-_GREYS: Final = 12  # so few that the picture stays small
+_GREYS: Final = 12  # so few that the image stays small
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def _sheet(path: Sequence[Point], places: Array) -> _Sheet:
 
 
 def _map(sheet: _Sheet, places: Array, confidence: NDArray[np.float32]) -> Iterator[str]:
-    """The points as a grey picture, one of its pixels for a cell of the map or a pixel of the page."""
+    """The points as a grey image, one of its pixels for a cell of the map or a pixel of the page."""
     if not len(places):
         return
     cell_m = max(_CELL_M, 1.25 / sheet.px_per_m)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
-from omnid.report.downsampling import Corner, PathTrace, Thinned
+from omnid.report.downsampling import Corner, Downsampled, PathTrace
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.transport.codec import OdometryRecord
 
@@ -27,7 +27,7 @@ _COURSES: Final = ("speed", "yaw_rate", "sigma_position", "sigma_heading", "stat
 Array = NDArray[np.float64]
 
 
-class PoseCourse:
+class PoseHistory:
     """Takes the poses one after the other; times are in s since the first one."""
 
     def __init__(self, events: Events, keep: bool) -> None:
@@ -40,7 +40,7 @@ class PoseCourse:
         self.end_s = 0.0
         self.first = np.eye(4)
         self.path = PathTrace()
-        self.course = {name: Thinned() for name in _COURSES}
+        self.course = {name: Downsampled() for name in _COURSES}
         self.gaps: list[tuple[float, float]] = []
         self.states: Counter[int] = Counter()
         self.poses = self.late = self.absurd = 0

@@ -17,11 +17,11 @@ from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.chart import Clock
 from omnid.report.downsampling import Corner
 from omnid.report.page import figure, note, page
-from omnid.report.panorama_images import Wanted, panoramas
+from omnid.report.panorama_images import WantedImages, panoramas
 from omnid.report.poses import MOST_KEPT
-from omnid.report.report_data import Recording
+from omnid.report.report_data import ReportData
 from omnid.report.timeline import timeline
-from omnid.report.truth_comparison import Comparison, compare
+from omnid.report.truth_comparison import TruthComparison, compare
 
 _MOST_CROSSES: Final = 40
 _BEFORE_S: Final = 30.0  # that are shown of the time before the first pose, where something happened
@@ -48,7 +48,7 @@ h2{break-after:avoid}tr{break-inside:avoid}.grid2{grid-template-columns:1fr 1fr}
 .scroll{break-inside:avoid}.scroll,.events{overflow:visible;max-height:none;border:0}td,th{padding:.1em .5em}}"""
 
 
-def report_html(path: Path, recording: Recording, true: Trajectory | None = None) -> str:
+def report_html(path: Path, recording: ReportData, true: Trajectory | None = None) -> str:
     """The whole page; true: T_world_rig of the rig."""
     events = recording.events.in_order()
     before_s = min((event.start_s for event in events if event.start_s >= -_BEFORE_S), default=0.0)
@@ -63,13 +63,13 @@ def report_html(path: Path, recording: Recording, true: Trajectory | None = None
     measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(recording, clock),
                 *sections.sureness(recording, clock), *health.timing(recording, clock),
                 *health.parts(recording, clock)]
-    rest = [*_pictures(path, recording), *setup.setup(recording), *setup.contents(recording),
+    rest = [*_images(path, recording), *setup.setup(recording), *setup.contents(recording),
             f"<p><small>Made by omnid {__version__}.</small></p>"]
     parts = [*top, *story, *measured, *rest]
     return page(f"{recording.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE)
 
 
-def _head(path: Path, recording: Recording) -> list[str]:
+def _head(path: Path, recording: ReportData) -> list[str]:
     found, frames = recording.survey, recording.frames
     told = (f"{path}, {found.size / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
             f"{recording.topic}, from {_utc(recording.poses.start_ns)}.")
@@ -84,7 +84,7 @@ def _utc(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S}.{rest_ns // 10**6:03} UTC"
 
 
-def _warnings(recording: Recording, true: Trajectory | None) -> list[str]:
+def _warnings(recording: ReportData, true: Trajectory | None) -> list[str]:
     """What makes the rest of the page worth less."""
     found, poses = recording.survey, recording.poses
     lines = []
@@ -104,13 +104,13 @@ def _warnings(recording: Recording, true: Trajectory | None) -> list[str]:
     return [f"<p class='warn'>{escape(line)}</p>" for line in lines]
 
 
-def _states_missing(recording: Recording) -> list[str]:
+def _states_missing(recording: ReportData) -> list[str]:
     if recording.poses.states[-1] < recording.poses.poses:
         return []
     return [note("The log does not tell the state of the odometry (…/status of omnid).")]
 
 
-def _plan(recording: Recording, comparison: Comparison | None) -> plan.Plan:
+def _plan(recording: ReportData, comparison: TruthComparison | None) -> plan.Plan:
     corners, cloud = recording.poses.path.corners, recording.cloud
     drawn = cloud is not None and cloud.frame == recording.frames[0]
     points = cloud.points if cloud and drawn else np.empty((0, 3), np.float32)
@@ -121,7 +121,7 @@ def _plan(recording: Recording, comparison: Comparison | None) -> plan.Plan:
                      _losses(recording, corners))
 
 
-def _losses(recording: Recording, corners: list[Corner]) -> list[tuple[float, float]]:
+def _losses(recording: ReportData, corners: list[Corner]) -> list[tuple[float, float]]:
     """Where the path was when the pose was lost."""
     times = np.array([corner.t_s for corner in corners])
     places = [corners[max(0, int(np.searchsorted(times, t_s, "right")) - 1)]
@@ -129,22 +129,22 @@ def _losses(recording: Recording, corners: list[Corner]) -> list[tuple[float, fl
     return [(corner.x_m, corner.y_m) for corner in places]
 
 
-def _lost_s(recording: Recording) -> list[float]:
+def _lost_s(recording: ReportData) -> list[float]:
     """When the pose was lost."""
     return [event.start_s for event in recording.events.in_order() if (event.source, event.text) == ("state", "lost")]
 
 
-def _pictures(path: Path, recording: Recording) -> list[str]:
-    if not recording.pictures:
-        return ["<h2>What the cameras saw</h2>", note("The log holds no pictures.")]
+def _images(path: Path, recording: ReportData) -> list[str]:
+    if not recording.images:
+        return ["<h2>What the cameras saw</h2>", note("The log holds no images.")]
     if recording.rig is None:
-        return ["<h2>What the cameras saw</h2>", note(f"Pictures, but {recording.rig_fault}.")]
+        return ["<h2>What the cameras saw</h2>", note(f"Images, but {recording.rig_fault}.")]
     start_ns = recording.poses.start_ns
-    wanted = [Wanted(start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
-    wanted += [Wanted(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
+    wanted = [WantedImages(start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
+    wanted += [WantedImages(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
                for t_s in _lost_s(recording)[:1]]
     try:
-        shown = [figure(picture, caption, _JPEG_QUALITY) for picture, caption in panoramas(path, recording.rig, wanted)]
+        shown = [figure(image, caption, _JPEG_QUALITY) for image, caption in panoramas(path, recording.rig, wanted)]
     except OmnidError as error:
-        shown = [note(f"The pictures in the log cannot be shown: {error}")]
-    return ["<h2>What the cameras saw</h2>", *(shown or [note("No picture could be decoded.")])]
+        shown = [note(f"The images in the log cannot be shown: {error}")]
+    return ["<h2>What the cameras saw</h2>", *(shown or [note("No image could be decoded.")])]

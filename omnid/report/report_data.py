@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.mcap_catalog import Catalog, Topic
+from drivers.logs.mcap_catalog import Catalog, LogTopic
 from drivers.logs.mcap_index import read_attachments, read_summary
 from drivers.logs.mcap_info import Survey, survey
 from drivers.logs.mcap_messages import DataSection, Message
 from drivers.logs.mcap_records import LogFile, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
-from omnid.report.downsampling import Thinned
+from omnid.report.downsampling import Downsampled
 from omnid.report.events import Events
-from omnid.report.poses import PoseCourse
-from omnid.report.statuses import StatusCourse
+from omnid.report.poses import PoseHistory
+from omnid.report.statuses import StatusHistory
 from omnid.transport.codec import (
     DIAGNOSTICS_SCHEMA,
     ODOMETRY_SCHEMA,
@@ -44,15 +44,15 @@ STRAY_S: Final = 3600.0  # by which a stamp may leave the time of logging, once 
 
 
 @dataclass(slots=True)
-class Drive:
+class DriveCommand:
     """Speeds that the wheels were told, or asked for."""
 
-    speed: Thinned = field(default_factory=Thinned)  # m/s
-    yaw_rate: Thinned = field(default_factory=Thinned)  # deg/s
+    speed: Downsampled = field(default_factory=Downsampled)  # m/s
+    yaw_rate: Downsampled = field(default_factory=Downsampled)  # deg/s
 
 
 @dataclass(slots=True)
-class Recording:
+class ReportData:
     """What a log holds, in bounded memory."""
 
     survey: Survey
@@ -61,9 +61,9 @@ class Recording:
     rig: Rig | None
     rig_fault: str  # why there is none
     events: Events
-    poses: PoseCourse
-    statuses: StatusCourse
-    drives: dict[str, Drive] = field(default_factory=dict)  # "told" to the wheels, "asked" of the robot
+    poses: PoseHistory
+    statuses: StatusHistory
+    drives: dict[str, DriveCommand] = field(default_factory=dict)  # "told" to the wheels, "asked" of the robot
     frames: tuple[str, str] = ("odom", "base_link")  # of the odometry
     cloud: Cloud | None = None
     unread: int = 0  # messages that are not what their type says, or of a senseless time
@@ -80,12 +80,12 @@ class Recording:
         return np.eye(4) if self.rig is None else self.rig.T_base_rig
 
     @property
-    def pictures(self) -> bool:
-        """Whether the cameras' pictures are there as well."""
+    def images(self) -> bool:
+        """Whether the cameras' images are there as well."""
         return any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in self.survey.topics.values())
 
 
-def read_recording(path: Path, topic: str | None = None, keep_poses: bool = False) -> Recording:
+def read_recording(path: Path, topic: str | None = None, keep_poses: bool = False) -> ReportData:
     """All of a log; topic: the odometry where there are several; keep_poses: each of them, to compare with a truth.
 
     OmnidError where there is no odometry in it, DriverError where there is no log.
@@ -96,8 +96,8 @@ def read_recording(path: Path, topic: str | None = None, keep_poses: bool = Fals
         attachments = read_attachments(file, summary)
         rig, fault = _rig(attachments)
         events = Events()
-        recording = Recording(found, choose_odometry(found, topic), attachments, rig, fault, events,
-                              PoseCourse(events, keep_poses), StatusCourse(events))
+        recording = ReportData(found, choose_odometry(found, topic), attachments, rig, fault, events,
+                              PoseHistory(events, keep_poses), StatusHistory(events))
         reading = _Reading(recording)
         section = DataSection(file, summary.catalog if summary else Catalog())
         reading.take(section.messages(), section.catalog)
@@ -123,7 +123,7 @@ def choose_odometry(found: Survey, topic: str | None) -> str:
 def _no_odometry(found: Survey) -> str:
     if any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in found.topics.values()):
         rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        return (f"{found.path}: pictures but no poses: first `omnid replay {found.path}{rig} --record out.mcap`, then "
+        return (f"{found.path}: images but no poses: first `omnid replay {found.path}{rig} --record out.mcap`, then "
                 "`omnid report out.mcap`")
     return f"{found.path}: no {ODOMETRY_SCHEMA} in it; there is {_listed(list(found.topics))}"
 
@@ -145,7 +145,7 @@ def _rig(attachments: Mapping[str, bytes]) -> tuple[Rig | None, str]:
 class _Reading:
     """One way through the messages."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: ReportData) -> None:
         self._to = recording
         self._waiting: OdometryRecord | None = None  # the report of a new state comes right after its first pose
         self._offset_ns: int | None = None  # from the stamps of the poses to the time of logging
@@ -165,7 +165,7 @@ class _Reading:
         self._settle()
         self._to.cloud = self._last_cloud()
 
-    def _message(self, topic: Topic, message: Message) -> None:
+    def _message(self, topic: LogTopic, message: Message) -> None:
         if message.place.size > LARGEST_MESSAGE:
             raise OmnidError(f"{message.place.size} bytes")
         if topic.name == self._to.topic:
@@ -209,7 +209,7 @@ class _Reading:
         kind = "told" if topic.endswith("/drive") else "asked" if topic.endswith("/cmd/twist") else ""
         if kind and self._offset_ns is not None:
             stamp_ns, _, speed_mps, yaw_rate_radps = twist_from_cdr(payload)
-            drive = self._to.drives.setdefault(kind, Drive())
+            drive = self._to.drives.setdefault(kind, DriveCommand())
             t_s = self._to.poses.seconds(stamp_ns)
             drive.speed.add(t_s, speed_mps)
             drive.yaw_rate.add(t_s, math.degrees(yaw_rate_radps))

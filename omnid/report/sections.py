@@ -7,21 +7,21 @@ from collections.abc import Iterator
 from html import escape
 from typing import Final
 
-from omnid.report.chart import Clock, Line, chart, line
-from omnid.report.downsampling import Thinned
+from omnid.report.chart import ChartLine, Clock, chart, line
+from omnid.report.downsampling import Downsampled
 from omnid.report.events import Event, Events
 from omnid.report.health import number
 from omnid.report.page import facts, grid, note, table
 from omnid.report.poses import STATES
-from omnid.report.report_data import Recording
+from omnid.report.report_data import ReportData
 from omnid.report.statuses import ODOMETRY
 from omnid.report.svg import label
-from omnid.report.truth_comparison import Comparison
+from omnid.report.truth_comparison import TruthComparison
 
 _LEVELS: Final = ("", "warning", "error")
 
 
-def key_figures(recording: Recording) -> str:
+def key_figures(recording: ReportData) -> str:
     """The run in a few numbers."""
     poses, statuses = recording.poses, recording.statuses
     rate_hz = (poses.poses - 1) / poses.end_s if poses.end_s > 0 else math.nan
@@ -30,12 +30,12 @@ def key_figures(recording: Recording) -> str:
              *_shares(recording)]
     p50, p99 = (number(statuses.values(ODOMETRY).get(f"capture_to_pose_{p}_ms", "")) for p in ("p50", "p99"))
     if p50:
-        tiles.append(("picture to pose, p50 / p99", f"{p50} / {p99} ms"))
+        tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in tiles)
     return f"<div class='tiles'>{cells}</div>"
 
 
-def _shares(recording: Recording) -> Iterator[tuple[str, str]]:
+def _shares(recording: ReportData) -> Iterator[tuple[str, str]]:
     poses = recording.poses
     if poses.states[-1] < poses.poses:
         told = poses.poses - poses.states[-1]
@@ -88,7 +88,7 @@ def _what(event: Event) -> str:
     return f"{event.text} ({event.count})" if event.count else event.text
 
 
-def motion(recording: Recording, clock: Clock) -> list[str]:
+def motion(recording: ReportData, clock: Clock) -> list[str]:
     """Speed, yaw rate and height; what the wheels were told along with it."""
     course, drives = recording.poses.course, recording.drives
     speed, yaw_rate = [line("measured", course["speed"])], [line("measured", course["yaw_rate"])]
@@ -103,7 +103,7 @@ def motion(recording: Recording, clock: Clock) -> list[str]:
     return ["<h2>Motion</h2>", grid(figures), *missing]
 
 
-def sureness(recording: Recording, clock: Clock) -> list[str]:
+def sureness(recording: ReportData, clock: Clock) -> list[str]:
     """Deviations out of the covariances, and the landmarks."""
     course, statuses = recording.poses.course, recording.statuses
     found, agree = (statuses.series(ODOMETRY, name) for name in ("found", "agree"))
@@ -119,7 +119,7 @@ def sureness(recording: Recording, clock: Clock) -> list[str]:
     return ["<h2>How sure it is</h2>", grid(figures), *missing]
 
 
-def _few_landmarks(found: Thinned, agree: Thinned) -> str:
+def _few_landmarks(found: Downsampled, agree: Downsampled) -> str:
     if not found.count:
         return "The log holds no numbers of landmarks."
     told = ", ".join(f"{a:.0f} of {f:.0f} at {label(round(t, 2))} s" for (t, a), (_, f) in
@@ -127,7 +127,7 @@ def _few_landmarks(found: Thinned, agree: Thinned) -> str:
     return f"Landmarks that agree with the pose are told only where the state changes: {told}."
 
 
-def truth(comparison: Comparison, clock: Clock) -> list[str]:
+def truth(comparison: TruthComparison, clock: Clock) -> list[str]:
     """How far the path is from the true one."""
     m = comparison.metrics
     ratio = "" if math.isnan(m.length_error_ratio) else f" ({100 * m.length_error_ratio:+.3f} %)"
@@ -139,8 +139,8 @@ def truth(comparison: Comparison, clock: Clock) -> list[str]:
             ("from pose to pose (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}")]
     heading = [(t, math.degrees(rad)) for t, rad in comparison.heading_rad.points()]
     position = [(t, 1e3 * error_m) for t, error_m in comparison.position_m.points()]
-    figures = [chart("Error of the position", [Line("", position)], clock, unit="mm", zero=True),
-               chart("Error of the heading, to the left", [Line("", heading)], clock, unit="deg", zero=True)]
+    figures = [chart("Error of the position", [ChartLine("", position)], clock, unit="mm", zero=True),
+               chart("Error of the heading, to the left", [ChartLine("", heading)], clock, unit="deg", zero=True)]
     remark = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
     return ["<h2>Against the truth</h2>", facts(rows), remark, grid(figures)]
 

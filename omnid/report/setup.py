@@ -14,7 +14,7 @@ from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
 from omnid.report.page import facts, note, table
-from omnid.report.report_data import Recording
+from omnid.report.report_data import ReportData
 from omnid.settings import dump
 
 _LARGEST: Final = 1 << 18  # bytes of settings
@@ -23,7 +23,7 @@ _MOST_TOPICS: Final = 60
 _LONGEST: Final = 120  # characters of a value
 
 
-def setup(recording: Recording) -> list[str]:
+def setup(recording: ReportData) -> list[str]:
     """The rig, and the settings that are not the usual ones."""
     rig = [facts([(name, escape(value)) for name, value in _rig_rows(recording.rig)])] if recording.rig else \
         [note(recording.rig_fault)]
@@ -39,7 +39,7 @@ def setup(recording: Recording) -> list[str]:
     return ["<h2>Rig and settings</h2>", *rig, *told]
 
 
-def contents(recording: Recording) -> list[str]:
+def contents(recording: ReportData) -> list[str]:
     """The topics of the file."""
     topics = list(recording.survey.topics.items())
     rows = [(escape(name), escape(kind), str(count)) for name, (kind, count) in topics[:_MOST_TOPICS]]

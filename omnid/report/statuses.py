@@ -6,10 +6,10 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from omnid.report.downsampling import Thinned
+from omnid.report.downsampling import Downsampled
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.report.poses import STATES, UNKNOWN
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Report
 
 ODOMETRY: Final = "omnid: odometry"
@@ -30,7 +30,7 @@ _MOST_COUNTS: Final = 1024
 _TROUBLES: Final = ("stopped, ", "refused, ")  # beginnings of such
 
 
-class StatusCourse:
+class StatusHistory:
     """Takes the diagnostics one after the other; seconds: from a stamp [ns] to s since the first pose."""
 
     def __init__(self, events: Events) -> None:
@@ -42,8 +42,8 @@ class StatusCourse:
         self.rank = UNKNOWN
         self.resets = 0
         self.reports = 0
-        self.newest: dict[str, Status] = {}
-        self.course: dict[tuple[str, str], Thinned] = {}
+        self.newest: dict[str, DiagnosticStatus] = {}
+        self.course: dict[tuple[str, str], Downsampled] = {}
 
     def process(self, report: Report, seconds: Callable[[int], float]) -> None:
         """Takes what the parts of the robot said at a time."""
@@ -57,9 +57,9 @@ class StatusCourse:
         """What a part said last."""
         return dict(self.newest[name].values) if name in self.newest else {}
 
-    def series(self, name: str, key: str) -> Thinned:
+    def series(self, name: str, key: str) -> Downsampled:
         """The course of a number that a part told."""
-        return self.course.get((name, key), Thinned())
+        return self.course.get((name, key), Downsampled())
 
     def stages(self) -> Iterator[tuple[str, dict[str, str]]]:
         """Name and newest values of every stage."""
@@ -67,7 +67,7 @@ class StatusCourse:
             if name.startswith(STAGE):
                 yield name.removeprefix(STAGE), self.values(name)
 
-    def _take(self, status: Status, stamp_ns: int, t_s: float) -> None:
+    def _take(self, status: DiagnosticStatus, stamp_ns: int, t_s: float) -> None:
         if status.name == ODOMETRY:
             self._note_state(status, stamp_ns, t_s)
         elif status.name != SUMMARY:
@@ -76,9 +76,9 @@ class StatusCourse:
             self._note_value(status.name, key, (t_s, value))
         known = self.newest[status.name].values if status.name in self.newest else {}
         merged = dict(list({**known, **status.values}.items())[:_MOST_VALUES])
-        self.newest[status.name] = Status(status.name, status.level, status.message, merged)
+        self.newest[status.name] = DiagnosticStatus(status.name, status.level, status.message, merged)
 
-    def _note_state(self, status: Status, stamp_ns: int, t_s: float) -> None:
+    def _note_state(self, status: DiagnosticStatus, stamp_ns: int, t_s: float) -> None:
         """Reports may overtake each other: an older one changes nothing."""
         said = status.values.get("state", status.message)
         if stamp_ns >= self._state_ns and said in STATES:
@@ -90,7 +90,7 @@ class StatusCourse:
                 self.resets += self._resets - before
                 self._events.add(Event(t_s, t_s, ERROR, "state", "odometry began anew, with an unknown gap"))
 
-    def _note_words(self, status: Status, t_s: float) -> None:
+    def _note_words(self, status: DiagnosticStatus, t_s: float) -> None:
         """A part that says something new; figures within do not count, they change all the time."""
         said = re.sub(r"\d+", "#", status.message)
         before, self._said[status.name] = self._said.get(status.name), said
@@ -111,7 +111,7 @@ class StatusCourse:
 
     def _add(self, name: str, key: str, point: tuple[float, float]) -> None:
         if (name, key) in self.course or (key in _DRAWN and len(self.course) < _MOST_COURSES):
-            self.course.setdefault((name, key), Thinned()).add(*point)
+            self.course.setdefault((name, key), Downsampled()).add(*point)
 
     def _note_count(self, name: str, key: str, point: tuple[float, int]) -> None:
         """A counter that rose. Where it stood at the first report is of the time before."""
@@ -130,13 +130,13 @@ def short(name: str) -> str:
 
 
 def _worded(key: str) -> str:
-    words = {"drops": "pictures dropped", "dropped": "messages dropped", "missed": "deadlines missed",
-             "broken": "pictures that cannot be decoded", "losses": "camera lost", "expiries": "watchdog expired",
-             "restarts": "stream started anew", "unpaired_lower": "lower pictures without a partner",
-             "unpaired_upper": "upper pictures without a partner"}
+    words = {"drops": "images dropped", "dropped": "messages dropped", "missed": "deadlines missed",
+             "broken": "images that cannot be decoded", "losses": "camera lost", "expiries": "watchdog expired",
+             "restarts": "stream started anew", "unpaired_lower": "lower images without a partner",
+             "unpaired_upper": "upper images without a partner"}
     return words.get(key, key)
 
 
-def _bounded(status: Status) -> Status:
+def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
     values = {key[:_LONGEST]: value[:2 * _LONGEST] for key, value in list(status.values.items())[:_MOST_VALUES]}
-    return Status(status.name[:_LONGEST], status.level, status.message[:2 * _LONGEST], values)
+    return DiagnosticStatus(status.name[:_LONGEST], status.level, status.message[:2 * _LONGEST], values)

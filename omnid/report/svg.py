@@ -117,7 +117,7 @@ def rectangles(spans: Iterable[Point], rows: Point) -> str:
 
 
 def hidden(definitions: str) -> str:
-    """Definitions that the page's pictures refer to."""
+    """Definitions that the page's images refer to."""
     return f"<svg style='position:absolute;width:0;height:0' aria-hidden='true'><defs>{definitions}</defs></svg>"
 
 

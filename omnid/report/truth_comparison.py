@@ -11,24 +11,24 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.report.downsampling import Corner, PathTrace, Point, Thinned
-from omnid.report.poses import PoseCourse
+from omnid.report.downsampling import Corner, Downsampled, PathTrace, Point
+from omnid.report.poses import PoseHistory
 
 Array = NDArray[np.float64]
 TOLERANCE_S: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class TruthComparison:
     """Errors of the rig's poses, the first one aligned and nothing else."""
 
     metrics: Metrics
     path: list[Point]  # x, y of the base on its true path, in odom
-    position_m: Thinned
-    heading_rad: Thinned
+    position_m: Downsampled
+    heading_rad: Downsampled
 
 
-def compare(poses: PoseCourse, T_base_rig: Array, truth: Trajectory) -> Comparison:
+def compare(poses: PoseHistory, T_base_rig: Array, truth: Trajectory) -> TruthComparison:
     """How far the path is from the truth, T_world_rig; OmnidError where not two poses are of the same time."""
     T_rig_base = se3.inverse(T_base_rig)
     base = poses.trajectory
@@ -37,7 +37,7 @@ def compare(poses: PoseCourse, T_base_rig: Array, truth: Trajectory) -> Comparis
     ours, theirs = _associated(estimate.stamps_ns, truth.stamps_ns)
     T_true = estimate.T[ours[0]] @ se3.inverse(truth.T[theirs[0]]) @ truth.T[theirs]
     T_estimate = estimate.T[ours]
-    position_m, heading_rad, trace = Thinned(), Thinned(), PathTrace()
+    position_m, heading_rad, trace = Downsampled(), Downsampled(), PathTrace()
     errors_m = np.linalg.norm(T_estimate[:, :3, 3] - T_true[:, :3, 3], axis=1)
     turns_rad = se3.yaw(se3.inverse(T_true) @ T_estimate)
     places = (T_base_rig @ T_true @ T_rig_base)[:, :2, 3]
@@ -46,7 +46,7 @@ def compare(poses: PoseCourse, T_base_rig: Array, truth: Trajectory) -> Comparis
         position_m.add(t_s, float(error_m))
         heading_rad.add(t_s, float(turn_rad))
         trace.add(Corner(float(x), float(y), t_s, 0))
-    return Comparison(metrics, [(c.x_m, c.y_m) for c in trace.corners], position_m, heading_rad)
+    return TruthComparison(metrics, [(c.x_m, c.y_m) for c in trace.corners], position_m, heading_rad)
 
 
 def _associated(stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

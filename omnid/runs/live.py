@@ -15,13 +15,13 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.v4l2_buffers import CameraState
 from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
-from omnid.controller.controller import HelmSettings
-from omnid.controller.link import HelmLink
-from omnid.controller.messages import Orders
+from omnid.controller.controller import ControllerSettings
+from omnid.controller.link import ControllerLink
+from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.latency import Latency
-from omnid.diagnostics.rig_monitor import RigWatch
-from omnid.diagnostics.run_statistics import Tally
-from omnid.diagnostics.status import StatusReport, StatusTick, Watched
+from omnid.diagnostics.rig_monitor import RigMonitor
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.status import StatusReport, StatusSources, StatusTick
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.logging_setup import WARNING
@@ -29,11 +29,10 @@ from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from omnid.messages import Odometry
-from omnid.runs.pipeline import Ends, wire
+from omnid.messages import OdometryUpdate
+from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.record import open_recorder
-from omnid.runs.systemd import Service, show_stacks_at_the_end
-from omnid.runs.systemd import Status as StatusLine
+from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import keeper_of_commands
@@ -42,11 +41,11 @@ from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.live_pairing import LivePair
 from omnid.transport.bus import Bus
-from omnid.transport.codec import Status, compile_serialisers
+from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import Commands
 
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
-LOOKS = 60  # pictures of either camera in which the rim is looked for, where the rig has no mask
+LOOKS = 60  # images of either camera in which the rim is looked for, where the rig has no mask
 TICKERS = frozenset({"motor", "status", "watchdog", "router"})
 Say = Callable[[int, str], None]  # severity as syslog has it, and one line
 
@@ -60,14 +59,14 @@ class LiveCamera(FrameSource, Protocol):
 Opener = Callable[[Camera], LiveCamera]  # may be asked twice for a camera, once the first has been closed
 
 
-class Live:
+class LiveRun:
     """One run of the daemon; rig: None for that of the configuration."""
 
     def __init__(self, config: Config, open_camera: Opener, say: Say, rig: Rig | None = None) -> None:
         self._config, self._open, self._say, self._rig = config, open_camera, say, rig
         on_thread = ThreadStart(priorities(config.realtime, *CAMERAS), say)
         self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
-        self._tally, self._latency = Tally(), Latency()
+        self._tally, self._latency = RunStatistics(), Latency()
         self.offset_ns = time.time_ns() - time.monotonic_ns()  # from the stamps in here to Unix time
         self._running = False
 
@@ -85,46 +84,56 @@ class Live:
         return 0
 
     def _geometry(self) -> Geometry:
-        """The rig; the mirrors' rims are looked for in the first pictures where it has no masks."""
+        """The rig; the mirrors' rims are looked for in the first images where it has no masks."""
         rig = self._rig or read_rig(Path(self._config.cameras.rig))
         if rig.lower.mask is None or rig.upper.mask is None:
             with ExitStack() as ends:
-                rig = with_rims(rig, chain.from_iterable(zip(*self._first_pictures(ends), strict=False)))
+                rig = with_rims(rig, chain.from_iterable(zip(*self._first_images(ends), strict=False)))
             self._tell_of_rims(rig)
         return geometry(rig, self._config.panorama)
 
-    def _first_pictures(self, ends: ExitStack) -> Iterator[Iterator[Frame]]:
+    def _first_images(self, ends: ExitStack) -> Iterator[Iterator[Frame]]:
         for name in CAMERAS:
             camera = ends.enter_context(closing(self._open(name)))
-            pictures = iter(camera.frames())
-            ends.callback(getattr(pictures, "close", nothing))  # a generator holds the device until it is closed
-            yield islice(pictures, LOOKS)
+            images = iter(camera.frames())
+            ends.callback(getattr(images, "close", nothing))  # a generator holds the device until it is closed
+            yield islice(images, LOOKS)
 
     def _tell_of_rims(self, rig: Rig) -> None:
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
             if camera.mask is None:
-                self._say(WARNING, f"no rim was found in the first pictures of the {name} camera, so all of each "
-                          f"picture is used: the rig may say otherwise in [{name}.mask]")
+                self._say(WARNING, f"no rim was found in the first images of the {name} camera, so all of each "
+                          f"image is used: the rig may say otherwise in [{name}.mask]")
 
-    def _wire(self, place: Geometry, eyes: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
+    def _wire(self, place: Geometry, cameras: Mapping[Camera, LiveCamera], ends: ExitStack) -> None:
         config, graph = self._config, self._graph
         helm = self._helm(place, ends) if config.motor.port else None
         bus = self._bus(place, ends)
         pair = LivePair(place.rig, config.pair)
-        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in eyes.items()]
+        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         recorder = self._recorder(place, ends) if config.record.enabled else None
-        poses: dict[str, Sink[Odometry]] = {"tally": self._tally, "latency": self._latency}
+        poses: dict[str, Sink[OdometryUpdate]] = {"tally": self._tally, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, self.offset_ns)
-        watch = RigWatch(place.cylinder, config.live.check_s) if config.live.check_s else None
-        sinks = Ends(poses=poses, bus=BusSink(bus, self._encoder(place, config.live.cloud_points)), helm=helm,
-                     rig=watch, map_every_s=config.live.cloud_s, recorder=recorder, pictures=tuple(frames),
+        watch = RigMonitor(place.cylinder, config.live.check_s) if config.live.check_s else None
+        sinks = Sinks(poses=poses, bus=BusSink(bus, self._encoder(place, config.live.cloud_points)), helm=helm,
+                     rig=watch, map_every_s=config.live.cloud_s, recorder=recorder, images=tuple(frames),
                      record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pair, *frames), place, config, sinks)
         commands = self._commands(bus, helm, recorder) if helm else None
-        report = StatusReport(Watched(graph.telemetry, {name: camera.state for name, camera in eyes.items()}, pair,
-                                      self._tally, self._latency.to_pose, helm.logbook if helm else None, commands,
-                                      TICKERS, tuple(part.status for part in (bus, recorder, watch) if part)))
+        report = StatusReport(
+            StatusSources(
+                graph.telemetry,
+                {name: camera.state for name, camera in cameras.items()},
+                pair,
+                self._tally,
+                self._latency.to_pose,
+                helm.logbook if helm else None,
+                commands,
+                TICKERS,
+                tuple(part.status for part in (bus, recorder, watch) if part),
+            )
+        )
         wants = [self._publisher(bus), *([] if recorder is None else [_keeper(recorder, self.offset_ns)])]
         graph.ticker("status", config.live.status_s, StatusTick(report, *wants))
         service = Service(graph.telemetry, StatusLine(self._tally, graph.telemetry, TICKERS), config.service.hung_s)
@@ -140,11 +149,11 @@ class Live:
             self._graph.ticker("router", self._config.bus.retry_s, bus.join)
         return bus
 
-    def _helm(self, place: Geometry, ends: ExitStack) -> HelmLink:
+    def _helm(self, place: Geometry, ends: ExitStack) -> ControllerLink:
         config = self._config
-        settings = HelmSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
+        settings = ControllerSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
                                 config.helm.limits)
-        helm = HelmLink(Orders(config.motor, settings, config.realtime), place.rig.T_base_rig,
+        helm = ControllerLink(ControllerStart(config.motor, settings, config.realtime), place.rig.T_base_rig,
                         self._graph.telemetry.add(StageStats("motor")), lambda text: self._say(WARNING, text))
         ends.callback(helm.close)
         return helm
@@ -158,7 +167,7 @@ class Live:
     def _encoder(self, place: Geometry, points: int) -> Encoder:
         return Encoder(place.rig.T_base_rig, clouds_of(self._config, points), self.offset_ns)
 
-    def _commands(self, bus: Bus, helm: HelmLink, recorder: FrameRecorder | None) -> Commands:
+    def _commands(self, bus: Bus, helm: ControllerLink, recorder: FrameRecorder | None) -> Commands:
         commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
         keep = nothing if recorder is None else keeper_of_commands(recorder, self.offset_ns)
 
@@ -169,10 +178,10 @@ class Live:
         bus.hear(take)
         return commands
 
-    def _publisher(self, bus: Bus) -> Callable[[list[Status]], None]:
+    def _publisher(self, bus: Bus) -> Callable[[list[DiagnosticStatus]], None]:
         """What publishes statuses; the bus may be slow, and only the ticker waits for it."""
 
-        def publish(statuses: list[Status]) -> None:
+        def publish(statuses: list[DiagnosticStatus]) -> None:
             with suppress(OmnidError):  # the next one comes in a second; a clock may be set to what is no time
                 said = status_report(time.time_ns(), statuses)
                 bus.publish(said.topic, said.payload)
@@ -187,13 +196,13 @@ class Live:
         """
         self._graph.stop()
         if not self._running:
-            raise SystemExit(0)  # the first pictures are waited for; the cameras are closed on the way
+            raise SystemExit(0)  # the first images are waited for; the cameras are closed on the way
 
 
-def _keeper(recorder: FrameRecorder, offset_ns: int) -> Callable[[list[Status]], None]:
+def _keeper(recorder: FrameRecorder, offset_ns: int) -> Callable[[list[DiagnosticStatus]], None]:
     """What records statuses."""
 
-    def keep(statuses: list[Status]) -> None:
+    def keep(statuses: list[DiagnosticStatus]) -> None:
         now_ns = time.monotonic_ns() + offset_ns  # as the stamps of all else, also when the clock has been set
         with suppress(OmnidError):  # a clock may be set to what is no time
             recorder.add(status_report(now_ns, statuses), now_ns)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.controller.link import HelmLink
+from omnid.controller.link import ControllerLink
 from omnid.controller.motor import MotorTick
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, Odometry, Panoramas
+from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
@@ -22,29 +22,29 @@ from omnid.stages.stereo import Stereo
 
 
 @dataclass(frozen=True, slots=True)
-class Ends:
+class Sinks:
     """Where the flow goes; what nobody wants is not computed."""
 
-    poses: dict[str, Sink[Odometry]] = field(default_factory=dict)
+    poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
-    recorder: Sink[Any] | None = None  # of all that is said, and of the pictures
+    recorder: Sink[Any] | None = None  # of all that is said, and of the images
     bus: Sink[Outgoing] | None = None
     motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
-    helm: HelmLink | None = None  # of a live robot: it decides by itself, at its own rate, in its own process
+    helm: ControllerLink | None = None  # of a live robot: it decides by itself, at its own rate, in its own process
     rig: Sink[Panoramas] | None = None  # looks now and then whether the cameras stand as calibrated
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
-    pictures: tuple[Stream[Frame], ...] = ()  # that are recorded as well
+    images: tuple[Stream[Frame], ...] = ()  # that are recorded as well
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
 
 
-class Watched(NamedTuple):
+class WiredStages(NamedTuple):
     """The stages that know what the input is worth and what was left out."""
 
     stereo: Stereo
     mapping: Mapping | None
 
 
-def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, ends: Ends) -> Watched:
+def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, ends: Sinks) -> WiredStages:
     """Joins the stages from the pairs on; gives those that are asked at the end."""
     stereo = Stereo(geometry, config.stereo)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
@@ -63,14 +63,14 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     for name, sink in ends.poses.items():
         graph.sink(name, sink, odometry)
     if ends.recorder:
-        graph.sink("record", ends.recorder, *ends.pictures, *spoken.values(), depth=ends.record_depth)
+        graph.sink("record", ends.recorder, *ends.images, *spoken.values(), depth=ends.record_depth)
     if ends.bus:
         for name, stream in spoken.items():  # one each, for a map takes longer than a pose may wait
             graph.sink(name, ends.bus, stream, policy=NEWEST)
-    return Watched(stereo, mapping)
+    return WiredStages(stereo, mapping)
 
 
-def _commands(graph: Graph, odometry: Stream[Odometry], geometry: Geometry, config: Config, ends: Ends
+def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, ends: Sinks
               ) -> Stream[VelocityCommand]:
     """What the wheels are told. Their deadline waits for nobody: the newest pose or command lies in a slot."""
     if ends.helm:

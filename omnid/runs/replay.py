@@ -19,18 +19,18 @@ from drivers.logs.mcap_reader import LogReader
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.motor import MotorTick, open_motor
-from omnid.diagnostics.input_warnings import doubts, found_nothing
+from omnid.diagnostics.input_warnings import input_warnings, no_pose
 from omnid.diagnostics.progress import Progress
-from omnid.diagnostics.run_statistics import Tally
-from omnid.diagnostics.run_summary import QUIET_BOXES, counters, summary
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import QUIET_BOXES, counters, run_summary
 from omnid.diagnostics.status import stage_status
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
-from omnid.engine.playback_clock import Pace
+from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.signals import ended_by_signals
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.runs.log_rig import attached_rig
-from omnid.runs.pipeline import Ends, Watched, wire
+from omnid.runs.pipeline import Sinks, WiredStages, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Encoder, Outgoing, clouds_of
@@ -39,7 +39,7 @@ from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.log_pairing import PairSync
 from omnid.transport.bus import Bus
-from omnid.transport.codec import OK, Status
+from omnid.transport.codec import OK, DiagnosticStatus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
@@ -71,14 +71,14 @@ class Options:
         return [(name, path) for name, path in named if path is not None]
 
 
-class Replay:
+class ReplayRun:
     """One run over one log."""
 
     def __init__(self, log: Path, config: Config, options: Options) -> None:
         self._log, self._config, self._options = log, config, options
         self._graph = Graph(policy=NEWEST if options.realtime else LOSSLESS, threaded=not options.inline,
                             depth=config.graph.depth)
-        self._tally = Tally()
+        self._tally = RunStatistics()
         self._twin: SimulatedMotor | None = None
         self._signal = 0
         self._warnings: list[str] = []
@@ -106,7 +106,7 @@ class Replay:
                     self._conclude(reader, pair, watched)
                 raise
             self._conclude(reader, pair, watched)
-        return 128 + self._signal if self._signal else int(found_nothing(self._tally))
+        return 128 + self._signal if self._signal else int(no_pose(self._tally))
 
     def _inputs(self, rig: Path | None) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
@@ -129,17 +129,17 @@ class Replay:
         rimmed = with_rims(rig, reader.frames())
         for name, camera in (("lower", rimmed.lower), ("upper", rimmed.upper)):
             if camera.mask is None:
-                self._warnings.append(f"no rim was found in the first pictures of the {name} camera, so all of each "
-                                      f"picture is used: the rig may say otherwise in [{name}.mask]")
+                self._warnings.append(f"no rim was found in the first images of the {name} camera, so all of each "
+                                      f"image is used: the rig may say otherwise in [{name}.mask]")
         return geometry(rimmed, self._config.panorama)
 
     def _frames(self, reader: LogReader) -> Stream[Frame]:
         if not self._options.realtime:
             return self._graph.source("read", reader.frames)
-        pace = Pace()
+        pace = PlaybackClock()
         return self._graph.source("read", lambda: pace.frames(reader.frames()), wake=pace.wake)
 
-    def _ends(self, place: Geometry, closing: ExitStack) -> Ends:
+    def _ends(self, place: Geometry, closing: ExitStack) -> Sinks:
         """Opens all outputs: what cannot be opened is said now."""
         options, config = self._options, self._config
         encode = Encoder(place.rig.T_base_rig, clouds_of(config, config.record.cloud_points))
@@ -153,7 +153,7 @@ class Replay:
             attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
             recorder = Recorder(options.record, attachments, config.bus.robot, encode)
             closing.callback(recorder.close)
-        ends = Ends({"tally": self._tally}, {}, recorder, bus, motor, map_every_s=options.map_every_s)
+        ends = Sinks({"tally": self._tally}, {}, recorder, bus, motor, map_every_s=options.map_every_s)
         if options.tum:
             ends.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map:
@@ -181,9 +181,9 @@ class Replay:
             progress = Progress(self._tally, reader.pair_estimate())
             self._graph.ticker("progress", progress.period_s, progress)
 
-    def _conclude(self, reader: LogReader, pair: PairSync, watched: Watched) -> None:
+    def _conclude(self, reader: LogReader, pair: PairSync, watched: WiredStages) -> None:
         found = self._tally.poses or not self._signal
-        doubtful = doubts(pair, watched.stereo, self._tally, self._config.pair) if found else ()
+        doubtful = input_warnings(pair, watched.stereo, self._tally, self._config.pair) if found else ()
         for warning in [*self._warnings, *reader.warnings, *doubtful]:
             print(f"omnid: warning: {warning}", file=sys.stderr)
         values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
@@ -192,12 +192,12 @@ class Replay:
         if self._twin is not None:
             values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
         spoken = sys.stderr if on_stdout(self._options.files) else sys.stdout
-        print(summary(values, self._graph.telemetry.summary()), file=spoken)
+        print(run_summary(values, self._graph.telemetry.summary()), file=spoken)
 
-    def _report(self, values: dict[str, str]) -> list[Status]:
+    def _report(self, values: dict[str, str]) -> list[DiagnosticStatus]:
         """The counts of the run and of its stages, for the log."""
         boxes = (stats for stats in self._graph.telemetry.stages if stats.name not in QUIET_BOXES)
-        return [Status("omnid: summary", OK, "the run has ended", values), *map(stage_status, boxes)]
+        return [DiagnosticStatus("omnid: summary", OK, "the run has ended", values), *map(stage_status, boxes)]
 
     def _dropped(self, reader: LogReader, pair: PairSync) -> dict[str, int]:
         """Everything that was lost on the way, by reason; zeros too."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Final
 
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.logging_setup import ERROR, NOTICE, say
 from omnid.engine.telemetry import StageStats, Telemetry
 
@@ -101,10 +101,10 @@ class Service:
         self._hung = frozenset(stuck)
 
 
-class Status:
+class StatusLine:
     """One line about the run: state, poses per second since the last look, what was lost."""
 
-    def __init__(self, tally: Tally, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
+    def __init__(self, tally: RunStatistics, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
         """tickers: the names whose `dropped` are deadlines, not messages."""
         self._tally, self._telemetry, self._tickers = tally, telemetry, frozenset(tickers)
         self._poses, self._looked_ns = tally.poses, time.monotonic_ns()
@@ -114,7 +114,7 @@ class Status:
         now_ns, poses, newest = time.monotonic_ns(), self._tally.poses, self._tally.newest
         rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._looked_ns) * 1e-9)
         self._poses, self._looked_ns = poses, now_ns
-        state = newest.state if newest is not None and rate_hz > 0 else "waiting for pictures"
+        state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"
         dropped = sum(stats.dropped for stats in self._telemetry.stages if stats.name not in self._tickers)
         late = sum(stats.dropped for stats in self._telemetry.stages if stats.name in self._tickers)
         return f"{state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} deadlines missed"

@@ -7,7 +7,7 @@ import time
 import cv2
 
 from drivers.frame import Frame
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
 from omnid.transport.features_attachment import features_bytes
@@ -23,15 +23,15 @@ class BusSink:
 
     def process(self, message: Outgoing) -> None:
         """Sends what there is to say about a message."""
-        note = note_bytes(_note(message)) if isinstance(message, Odometry) else None
+        note = note_bytes(_note(message)) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, note if topic == "odom" else None)
-        if isinstance(message, Odometry):
+        if isinstance(message, OdometryUpdate):
             for topic, _, payload in self._states(message):
                 self._bus.publish(topic, payload)
 
 
-def _note(odometry: Odometry) -> Note:
+def _note(odometry: OdometryUpdate) -> Note:
     return Note(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks, time.time_ns())
 
 
@@ -42,13 +42,13 @@ class PanoramaSink:
         self._bus, self._period_ns, self._offset_ns = bus, 1e9 / rate_hz, offset_ns
         self._next_ns = 0.0
 
-    def process(self, odometry: Odometry) -> None:
-        """Sends the picture that a pose was found in, and beside it its features, when it is time."""
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Sends the image that a pose was found in, and beside it its features, when it is time."""
         if odometry.stamp_ns < self._next_ns:
             return
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
         features = odometry.features
-        pixels = {"agreeing": features.agreeing, "rejected": features.rejected, "new": features.new}
+        pixels = {"agreeing": features.inliers, "rejected": features.rejected, "new": features.new}
         self._bus.publish("panorama", image_cdr(frame, odometry.stamp_ns + self._offset_ns)[1], features_bytes(pixels))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.errors import OmnidError
-from omnid.sinks.encoder import Encoded
+from omnid.sinks.encoder import OutgoingMessage
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import message_from_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD
@@ -30,15 +30,15 @@ def keeper_of_commands(recorder: FrameRecorder, offset_ns: int) -> Callable[[str
     return keep
 
 
-def command_as_logged(key: str, payload: bytes) -> Encoded | None:
+def command_as_logged(key: str, payload: bytes) -> OutgoingMessage | None:
     """The message of a log, whatever came with a stop; None for what no reader could decode. Any bytes may come."""
     schema = HEARD.get(key)
     if schema is None or len(payload) > LONGEST_PAYLOAD:
         return None
     if schema == EMPTY_SCHEMA:
-        return Encoded(key, schema, _EMPTY)
+        return OutgoingMessage(key, schema, _EMPTY)
     try:
         message_from_cdr(payload, schema)
     except OmnidError:
         return None
-    return Encoded(key, schema, payload)
+    return OutgoingMessage(key, schema, payload)

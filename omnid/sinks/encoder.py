@@ -12,14 +12,14 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, Odometry
+from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.stages.odometry import of_base
 from omnid.transport import codec
 
-Outgoing: TypeAlias = Odometry | VelocityCommand | MapUpdate
+Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate
 
 
-class Encoded(NamedTuple):
+class OutgoingMessage(NamedTuple):
     """A message ready to go."""
 
     topic: str
@@ -49,35 +49,35 @@ class Encoder:
     def __init__(self, T_base_rig: NDArray[np.float64], clouds: Clouds, offset_ns: int = 0) -> None:
         self._T_base_rig, self._clouds, self.offset_ns = T_base_rig, clouds, offset_ns
 
-    def __call__(self, message: Outgoing) -> Iterator[Encoded]:
+    def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """All that is said about a message."""
         match message:
-            case Odometry():
+            case OdometryUpdate():
                 yield from self._poses(message)
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
                 payload = codec.twist_stamped_cdr(stamp_ns + self.offset_ns, "base_link", velocity_mps, yaw_rate_radps)
-                yield Encoded("drive", codec.TWIST_SCHEMA, payload)
+                yield OutgoingMessage("drive", codec.TWIST_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
 
-    def _poses(self, odometry: Odometry) -> Iterator[Encoded]:
+    def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
         T_odom_base, covariance, *velocity = of_base(odometry, self._T_base_rig)
         pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
-        yield Encoded("odom", codec.ODOMETRY_SCHEMA, pose)
-        yield Encoded("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
+        yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
+        yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
         edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
                  codec.FrameTransform("base_link", "rig", self._T_base_rig)]
-        yield Encoded("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
 
-    def _map(self, update: MapUpdate) -> Iterator[Encoded]:
+    def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
         payload = codec.point_cloud_cdr(stamp_ns, "odom", *_surest(update.points, self._clouds.points),
                                         T_frame_points=self._T_base_rig)
-        yield Encoded("cloud", codec.POINT_CLOUD_SCHEMA, payload)
+        yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
         grid = occupancy(self._moved(update.points.xyz), update.points.confidence,
                          self._moved(_level(update.path_xy))[:, :2], self._clouds.heights_m, self._clouds.cell_m)
-        yield Encoded("map", codec.GRID_SCHEMA, codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m,
+        yield OutgoingMessage("map", codec.GRID_SCHEMA, codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m,
                                                                 grid.corner))
 
     def _moved(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -95,7 +95,7 @@ class StateReports:
         self._offset_ns = offset_ns
         self._last: tuple[str, int] | None = None
 
-    def __call__(self, odometry: Odometry) -> Iterator[Encoded]:
+    def __call__(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         """What there is to report about a pose."""
         now = (odometry.state, odometry.reset_counter)
         if now != self._last:
@@ -103,13 +103,13 @@ class StateReports:
             level = ("tracking", "degraded", "lost").index(odometry.state)
             values = {"state": odometry.state, "resets": str(odometry.reset_counter),
                       "landmarks": f"{odometry.inliers} of {odometry.tracks}"}
-            said = codec.Status("omnid: odometry", level, odometry.state, values)
+            said = codec.DiagnosticStatus("omnid: odometry", level, odometry.state, values)
             yield status_report(odometry.stamp_ns + self._offset_ns, [said])
 
 
-def status_report(stamp_ns: int, statuses: Sequence[codec.Status]) -> Encoded:
+def status_report(stamp_ns: int, statuses: Sequence[codec.DiagnosticStatus]) -> OutgoingMessage:
     """Statuses as one diagnostic message."""
-    return Encoded("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
+    return OutgoingMessage("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
 
 
 def _level(xy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
-from omnid.messages import MapUpdate, Odometry
+from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 
@@ -89,7 +89,7 @@ class TrajectoryFile:
         self._file: FileIO | None = None
         self._whole_bytes = 0
 
-    def process(self, odometry: Odometry) -> None:
+    def process(self, odometry: OdometryUpdate) -> None:
         """Adds the row of a pose."""
         try:
             self._append(tum_row(odometry.stamp_ns, odometry.T_odom_rig).encode("ascii") + b"\n")
@@ -133,9 +133,9 @@ class PlanFile:
         self._path = path
 
     def process(self, update: MapUpdate) -> None:
-        """Writes the picture."""
-        picture = cv2.imencode(".png", plan_view(update.points, update.path_xy))[1]
+        """Writes the image."""
+        image = cv2.imencode(".png", plan_view(update.points, update.path_xy))[1]
         try:
-            self._path.write_bytes(picture.tobytes())
+            self._path.write_bytes(image.tobytes())
         except OSError as error:
             raise OmnidError(f"{self._path}: cannot be written: {error.strerror or error}") from error

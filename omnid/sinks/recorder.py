@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TypeAlias
 
 from drivers.logs.mcap_writer import LogWriter
-from omnid.diagnostics.run_statistics import Tally
-from omnid.messages import Odometry
-from omnid.sinks.encoder import Encoded, Encoder, Outgoing, StateReports, status_report
-from omnid.transport.codec import Status
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.messages import OdometryUpdate
+from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
+from omnid.transport.codec import DiagnosticStatus
 
-Report: TypeAlias = Callable[[Tally], list[Status]]
+Report: TypeAlias = Callable[[RunStatistics], list[DiagnosticStatus]]
 
 
 class Recorder:
@@ -26,14 +26,14 @@ class Recorder:
         self._writer: LogWriter | None = None
         self._robot, self._encode, self._states = robot, encode, StateReports()
         self._newest_ns = 0
-        self._tally = Tally()  # its own: the end of the run may reach others later
+        self._tally = RunStatistics()  # its own: the end of the run may reach others later
         self.report: Report = lambda _: []
 
     def process(self, message: Outgoing) -> None:
         """Adds what there is to say about a message."""
         self._newest_ns = max(self._newest_ns, message.stamp_ns)
         self._write(self._encode(message), message.stamp_ns)
-        if isinstance(message, Odometry):
+        if isinstance(message, OdometryUpdate):
             self._tally.process(message)
             self._write(self._states(message), message.stamp_ns)
 
@@ -49,7 +49,7 @@ class Recorder:
         if self._writer is not None:
             self._writer.close()
 
-    def _write(self, messages: Iterable[Encoded], stamp_ns: int) -> None:
+    def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         if self._writer is None:
             self._writer = LogWriter(self._path, self._attachments)
         for topic, schema, payload in messages:

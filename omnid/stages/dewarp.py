@@ -1,4 +1,4 @@
-"""Mirror pictures to panoramas (Dang et al. 2012, section III.A)."""
+"""Mirror images to panoramas (Dang et al. 2012, section III.A)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig
-from omnid.core.odometry.tracking import Wrapped
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
@@ -17,7 +17,7 @@ LEAST_SHARE = 0.05  # of the panorama that both cameras must see
 
 
 class Dewarp:
-    """Rectifies both pictures of a pair; the tables are made once."""
+    """Rectifies both images of a pair; the tables are made once."""
 
     def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
         self._pad_px = config.pad_px
@@ -38,8 +38,8 @@ class Dewarp:
         lower, upper = self._wrapped(pair.lower, self._lower), self._wrapped(pair.upper, self._upper)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible)
 
-    def _wrapped(self, picture: NDArray[np.uint8], maps: Maps) -> Wrapped:
-        return Wrapped(np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), np.uint8), self._pad_px)
+    def _wrapped(self, image: NDArray[np.uint8], maps: Maps) -> PaddedPanorama:
+        return PaddedPanorama(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8), self._pad_px)
 
 
 def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from omnid.stages.log_pairing import Decoder
 
 Array = NDArray[np.float64]
 
-LOOKS, FRAMES_A_LOOK = 5, 12  # so often the rim is looked for, each time in the maximum of so many more pictures
+LOOKS, FRAMES_A_LOOK = 5, 12  # so often the rim is looked for, each time in the maximum of so many more images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +42,12 @@ class Geometry:
 
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
-    """The geometry of a rig; a camera without a mask counts as far as its picture goes."""
+    """The geometry of a rig; a camera without a mask counts as far as its image goes."""
     return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg))
 
 
 def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
-    """The rig with the mirrors' rims where it has no masks, as seen in its first pictures; else as it is."""
+    """The rig with the mirrors' rims where it has no masks, as seen in its first images; else as it is."""
     missing: list[Camera] = [name for name, camera in _cameras(rig).items() if camera.mask is None]
     if not missing:
         return rig
@@ -60,15 +60,15 @@ def _cameras(rig: Rig) -> dict[Camera, MountedCamera]:
 
 
 def _look(rig: Rig, missing: list[Camera], frames: Iterable[Frame]) -> dict[Camera, Mask]:
-    """The rims in the brightest of the first pictures: one alone may be dark at some side."""
+    """The rims in the brightest of the first images: one alone may be dark at some side."""
     decode, stream = Decoder(rig), iter(frames)
     brightest: dict[Camera, NDArray[np.uint8]] = {}
     found: dict[Camera, Mask] = {}
     for _ in range(LOOKS):
         for frame in islice(stream, FRAMES_A_LOOK):
-            picture = decode(frame)
-            if picture is not None:
-                brightest[frame.camera] = np.maximum(brightest.get(frame.camera, picture), picture)
+            image = decode(frame)
+            if image is not None:
+                brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)
         for name in set(missing) & brightest.keys() - found.keys():
             rim = find_rim(brightest[name], _cameras(rig)[name].camera.center)
             if rim is not None:

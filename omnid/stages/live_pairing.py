@@ -1,4 +1,4 @@
-"""Two pictures of one instant out of the frames of two cameras that run freely."""
+"""Two images of one instant out of the frames of two cameras that run freely."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ class LivePair:
 
     @property
     def fault(self) -> str:
-        """Why the first of the broken pictures could not be decoded; empty where there is none."""
+        """Why the first of the broken images could not be decoded; empty where there is none."""
         return self._decode.fault
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pairs made, frames of either camera that found no partner, pictures that could not be decoded."""
+        """Pairs made, frames of either camera that found no partner, images that could not be decoded."""
         return {"pairs": self._pairs, "unpaired_lower": self._unpaired["lower"],
                 "unpaired_upper": self._unpaired["upper"], "broken": self._decode.broken}
 
@@ -93,14 +93,14 @@ class LivePair:
 
     def _joined(self, lower: Frame, upper: Frame) -> FramePair | None:
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
-        pictures = self._pictures(lower, upper)
-        if pictures is None:
+        images = self._images(lower, upper)
+        if images is None:
             return None
         seq = self._pairs
         self._pairs += 1
-        return FramePair(seq, lower.stamp_ns, *pictures)
+        return FramePair(seq, lower.stamp_ns, *images)
 
-    def _pictures(self, lower: Frame, upper: Frame) -> tuple[Image, Image] | None:
+    def _images(self, lower: Frame, upper: Frame) -> tuple[Image, Image] | None:
         below = self._decode(lower)
         above = self._decode(upper)
         return None if below is None or above is None else (below, above)

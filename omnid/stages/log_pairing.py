@@ -1,4 +1,4 @@
-"""Two pictures of one instant out of the frames of two cameras."""
+"""Two images of one instant out of the frames of two cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Image = NDArray[np.uint8]
 
 
 class Decoder:
-    """Grey pictures of the size the rig was calibrated for; `broken` counts the frames that gave none.
+    """Grey images of the size the rig was calibrated for; `broken` counts the frames that gave none.
 
     `fault` says why the first of these did not.
     """
@@ -31,19 +31,19 @@ class Decoder:
         self.fault = ""
 
     def __call__(self, frame: Frame) -> Image | None:
-        """The picture (H, W), or None; OmnidError where a camera's first one has another size than the rig's."""
+        """The image (H, W), or None; OmnidError where a camera's first one has another size than the rig's."""
         try:
-            picture = gray(frame)
+            image = gray(frame)
         except BrokenFrame as error:
             self._skip(str(error))
             return None
-        found, expected = picture.shape[::-1], self._sizes[frame.camera]
+        found, expected = image.shape[::-1], self._sizes[frame.camera]
         if found == expected:
             self._fitted.add(frame.camera)
-            return picture
+            return image
         if frame.camera not in self._fitted:
             raise OmnidError(
-                f"the {frame.camera} camera's pictures are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
+                f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
                 f"{expected[1]} px: give the rig of these cameras with --rig"
             )
         self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
@@ -57,7 +57,7 @@ class Decoder:
 class _Waiting(NamedTuple):
     camera: Camera
     stamp_ns: int
-    picture: Image
+    image: Image
 
 
 class PairSync:
@@ -76,26 +76,26 @@ class PairSync:
 
     @property
     def fault(self) -> str:
-        """Why the first of the broken pictures could not be decoded; empty where there is none."""
+        """Why the first of the broken images could not be decoded; empty where there is none."""
         return self._decode.fault
 
     @property
     def nearest_ms(self) -> float | None:
-        """How near in time two pictures came of which no pair was made; None where there were no such two."""
+        """How near in time two images came of which no pair was made; None where there were no such two."""
         return None if self._nearest_ns is None else self._nearest_ns * 1e-6
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pairs made, frames of either camera that found no partner, pictures that could not be decoded."""
+        """Pairs made, frames of either camera that found no partner, images that could not be decoded."""
         return {"pairs": self._pairs, "unpaired_lower": self._unpaired["lower"],
                 "unpaired_upper": self._unpaired["upper"], "broken": self._decode.broken}
 
     def process(self, frame: Frame) -> FramePair | None:
         """The pair that this frame completes."""
-        picture = self._decode(frame)
-        if picture is None:
+        image = self._decode(frame)
+        if image is None:
             return None
-        late, self._waiting = self._waiting, _Waiting(frame.camera, frame.stamp_ns, picture)
+        late, self._waiting = self._waiting, _Waiting(frame.camera, frame.stamp_ns, image)
         if late is None:
             return None
         gap_ns = frame.stamp_ns - late.stamp_ns
@@ -117,4 +117,4 @@ class PairSync:
         lower, upper = (a, b) if a.camera == "lower" else (b, a)
         self._waiting, seq = None, self._pairs
         self._pairs += 1
-        return FramePair(seq, lower.stamp_ns, lower.picture, upper.picture)
+        return FramePair(seq, lower.stamp_ns, lower.image, upper.image)

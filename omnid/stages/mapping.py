@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import MappingConfig
 from omnid.core.mapping.voxel_map import VoxelMap
-from omnid.core.odometry.odometry import TRACKING
-from omnid.messages import MapUpdate, Odometry
+from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
@@ -60,12 +60,12 @@ class Mapping:
         """Voxels held, voxels given up for want of room, points that were no use."""
         return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
 
-    def process(self, odometry: Odometry) -> MapUpdate | None:
+    def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
         """Takes the points of a pair, and gives the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
         self._frames += 1
         self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
-        if odometry.state == TRACKING:
+        if odometry.state == TrackingState.TRACKING:
             depth = odometry.depth
             sure = depth.variance_m2 < self._config.max_sigma_m**2
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])

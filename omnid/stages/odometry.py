@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import OdometryConfig
-from omnid.core.odometry.odometry import Ego, EgoMotion
-from omnid.core.odometry.stereo_frame import Sight
-from omnid.messages import Depth, Odometry
+from omnid.core.odometry.odometry import OdometryEstimate, VisualOdometry
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
 
 
-class Follower(Protocol):
+class OdometryMethod(Protocol):
     """Whatever follows the rectified frame through sights."""
 
-    def process(self, sight: Sight, dt_s: float) -> Ego:
+    def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
 
 
@@ -33,17 +33,19 @@ class OdometryStage:
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
 
-    def process(self, depth: Depth) -> Odometry:
+    def process(self, depth: StereoDepth) -> OdometryUpdate:
         """The pose at a pair."""
         dt_s = 0.0 if self._last_ns is None else (depth.stamp_ns - self._last_ns) * 1e-9
         self._last_ns = depth.stamp_ns
         seen = depth.panoramas
-        ego = self._follower.process(Sight(depth.seq, seen.lower, seen.upper, depth.disparity, seen.visible), dt_s)
+        ego = self._follower.process(
+            StereoFrame(depth.seq, seen.lower, seen.upper, depth.disparity, seen.visible), dt_s
+        )
         T_odom_rig = self._T_rig_rect @ ego.T_odom_rect @ se3.inverse(self._T_rig_rect)
         covariance = in_axes(T_odom_rig, self._in_rig(ego.covariance))
         velocity = self._to_rig @ ego.velocity
-        return Odometry(depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity,
-                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.agreeing, ego.tracked, depth,
+        return OdometryUpdate(depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity,
+                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.inliers, ego.tracked, depth,
                         ego.features)
 
     def _in_rig(self, covariance: Array) -> Array:
@@ -58,7 +60,7 @@ def in_axes(T_a_b: Array, covariance: Array) -> Array:
     return np.asarray(R @ covariance @ R.T)
 
 
-def of_base(odometry: Odometry, T_base_rig: Array) -> tuple[Array, Array, Array, Array]:
+def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, Array, Array]:
     """What a base that carries the rig does: T_odom_base, its covariance in odom axes, velocity and its covariance.
 
     odom is here the base's frame at the first pair; the velocity is in the base frame.
@@ -71,10 +73,10 @@ def of_base(odometry: Odometry, T_base_rig: Array) -> tuple[Array, Array, Array,
     return T_odom_base, covariance, A @ odometry.velocity, A @ odometry.velocity_covariance @ A.T
 
 
-def _follower(geometry: Geometry, config: OdometryConfig) -> Follower:
+def _follower(geometry: Geometry, config: OdometryConfig) -> OdometryMethod:
     model = geometry.model(config.noise_px)
     if config.method == "default":
-        return EgoMotion(model, config.klt, config.limits)
-    from omnid.core.odometry.paper.paper_odometry import PaperMotion  # only whoever asks for it pays for it
+        return VisualOdometry(model, config.klt, config.limits)
+    from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # only whoever asks for it pays for it
 
-    return PaperMotion(model, config.klt, config.tracker, config.reference)
+    return PaperOdometry(model, config.klt, config.tracker, config.reference)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
-from omnid.core.stereo.matcher import Matcher, Matching
+from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import Depth, Panoramas
+from omnid.messages import Panoramas, StereoDepth
 from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
@@ -33,14 +33,14 @@ class Stereo:
 
     @property
     def exchanged(self) -> bool:
-        """Whether more points of the first pairs match when the upper picture is taken for the lower one.
+        """Whether more points of the first pairs match when the upper image is taken for the lower one.
 
         With a disparity of the wrong sign there is no true match, but walls that repeat themselves give false ones:
         on rendered rooms 0.1 to 0.8 times as many the right way round, 1.1 to 3.6 times as many the wrong way.
         """
         return self._exchanged_points > max(POINTS_TO_COMPARE, self._points)
 
-    def process(self, panoramas: Panoramas) -> Depth:
+    def process(self, panoramas: Panoramas) -> StereoDepth:
         """The disparities, and their points in the rig frame."""
         columns, rows, found = self._match(panoramas)
         if self._compared < PAIRS_COMPARED:
@@ -52,7 +52,9 @@ class Stereo:
         kept = np.isfinite(points).all(axis=1)
         variance_m2 = self._variance_m2(points[kept])
         points = se3.apply(self._T_rig_rect, points[kept])
-        return Depth(panoramas.seq, panoramas.stamp_ns, panoramas, disparity, views[kept, :2], points, variance_m2)
+        return StereoDepth(
+            panoramas.seq, panoramas.stamp_ns, panoramas, disparity, views[kept, :2], points, variance_m2
+        )
 
     def _match(self, panoramas: Panoramas) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
         """Columns (N,), rows (N,) and disparities (N,) [px] of the located pixels."""
@@ -76,7 +78,7 @@ class Stereo:
         return np.asarray((1 + z2 / r2) * (per_px * self._config.noise_px) ** 2)
 
 
-    def _fitting(self, height: int) -> Matching:
+    def _fitting(self, height: int) -> MatchingSettings:
         """The matching whose disparities reach the nearest points wanted, in panoramas of so many rows."""
         nearest_px = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m / self._config.min_range_m
         wanted = math.ceil(nearest_px / STEP_PX) * STEP_PX
@@ -84,12 +86,12 @@ class Stereo:
         return _limited(replace(matching, disparities=min(matching.disparities, wanted)), height)
 
 
-def _limited(matching: Matching, height: int) -> Matching:
+def _limited(matching: MatchingSettings, height: int) -> MatchingSettings:
     """The matching for panoramas of so many rows: a larger disparity than they are high cannot be."""
     most = (height - SPARE_ROWS) // STEP_PX * STEP_PX
     if most < STEP_PX:
         raise OmnidError(
             f"the panoramas are only {height} px high, {STEP_PX + SPARE_ROWS} px are needed for stereo: larger "
-            "pictures, or a rig whose cameras share more of their view"
+            "images, or a rig whose cameras share more of their view"
         )
     return replace(matching, disparities=min(matching.disparities, most))

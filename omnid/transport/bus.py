@@ -16,7 +16,7 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.codec import OK, WARN, Status
+from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.session import open_session, reason
 from omnid.transport.topics import HEARD, SAID, Topic
 
@@ -57,11 +57,13 @@ class Bus:
             with suppress(OmnidError):  # the configuration has been checked: it is not there yet
                 self._open()
 
-    def status(self) -> Status:
+    def status(self) -> DiagnosticStatus:
         """Whether there is anybody to speak to, and what was said to nobody."""
         waiting = self._session is None
         said = f"no router yet at {', '.join(self._config.connect)}" if waiting else "open"
-        return Status("omnid: bus", WARN if waiting else OK, said, {"mode": self._config.mode, "lost": str(self.lost)})
+        return DiagnosticStatus(
+            "omnid: bus", WARN if waiting else OK, said, {"mode": self._config.mode, "lost": str(self.lost)}
+        )
 
     def publish(self, topic: str, payload: bytes, note: bytes | None = None) -> None:
         """Sends CDR bytes as `<robot>/<topic>`, and as ROS 2 wants them; dropped in congestion.

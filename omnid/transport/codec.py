@@ -67,7 +67,7 @@ OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/msg/DiagnosticStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class DiagnosticStatus:
     """What one part has to say of itself."""
 
     name: str
@@ -212,13 +212,13 @@ def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, 
     return _cdr(ros.nav_msgs__msg__OccupancyGrid(_header(stamp_ns, frame), info, cells.reshape(-1)), GRID_SCHEMA)
 
 
-def diagnostics_cdr(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
+def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """A diagnostic_msgs/msg/DiagnosticArray."""
     entries = [_status(status) for status in statuses]
     return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA)
 
 
-def _status(status: Status) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
+def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
     if not 0 <= status.level <= 3:
         raise OmnidError(
             f"diagnostic level {status.level} of {status.name} is none of 0 ok, 1 warning, 2 error, 3 stale")

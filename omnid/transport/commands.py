@@ -21,7 +21,7 @@ ANY_SPEED_MPS, ANY_RATE_RADPS, ANY_HEADING_RAD = 20.0, 50.0, 1000.0  # beyond th
 SAME_CLOCK_S = 60.0  # a stamp that far from now is of another clock, or of none: the arrival alone counts
 
 
-class Refused(OmnidError):  # noqa: N818 - it is what becomes of the command
+class RefusedCommand(OmnidError):  # noqa: N818 - it is what becomes of the command
     """A command that nobody should obey; its first argument is the reason, for counting."""
 
 
@@ -49,15 +49,15 @@ def heading_command(payload: bytes) -> Wish:
 
 def _within(value: float, most: float) -> float:
     if not math.isfinite(value):
-        raise Refused("not finite")
+        raise RefusedCommand("not finite")
     if abs(value) > most:
-        raise Refused("out of range")
+        raise RefusedCommand("out of range")
     return value
 
 
 def _expect_frame(frame: str, expected: str) -> None:
     if frame not in ("", expected):
-        raise Refused("another frame")
+        raise RefusedCommand("another frame")
 
 
 class Commands:
@@ -81,7 +81,7 @@ class Commands:
             return
         try:
             wish = self._judged(key, payload)
-        except Refused as refusal:
+        except RefusedCommand as refusal:
             self.refused[str(refusal)] += 1
             return
         except OmnidError:
@@ -92,11 +92,11 @@ class Commands:
 
     def _judged(self, key: str, payload: bytes) -> Wish:
         if key not in self._parsers:
-            raise Refused("unknown")
+            raise RefusedCommand("unknown")
         if len(payload) > LONGEST_PAYLOAD:
-            raise Refused("too long")
+            raise RefusedCommand("too long")
         wish = self._parsers[key](payload)
         age_s = time.time() - wish.stamp_ns * 1e-9
         if self._stale_s < age_s < SAME_CLOCK_S:
-            raise Refused("sent long ago")
+            raise RefusedCommand("sent long ago")
         return wish

@@ -15,7 +15,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
-from omnid.transport.codec import NS_PER_S, Status
+from omnid.transport.codec import NS_PER_S, DiagnosticStatus
 from omnid.transport.pose_attachment import Note, note_from_bytes
 
 ALIGNED = 0.999_999  # w of a quaternion that hardly turns
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 class Pose:
     """Where the robot's base is, how it moves, and how sure that is."""
 
-    stamp_ns: int  # of Unix time, when the pictures were taken
+    stamp_ns: int  # of Unix time, when the images were taken
     T_odom_base: Array  # (4, 4) m
     covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
     velocity: Array  # (6,) m/s, rad/s in the base's axes
@@ -65,7 +65,7 @@ class Report:
     """How the parts of a robot are: cameras, stages, wheels."""
 
     stamp_ns: int
-    statuses: tuple[Status, ...]
+    statuses: tuple[DiagnosticStatus, ...]
 
     def value(self, name: str, key: str) -> str:
         """What the part of that name, such as "omnid: odometry", says under a key; "" where it does not."""
@@ -109,7 +109,7 @@ def report_from(payload: bytes, _: bytes = b"") -> Report:
     """The statuses in a DiagnosticArray; OmnidError unless it is one."""
     message = codec.message_from_cdr(payload, codec.DIAGNOSTICS_SCHEMA)
     assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
-    statuses = tuple(Status(entry.name, int(entry.level), entry.message,
+    statuses = tuple(DiagnosticStatus(entry.name, int(entry.level), entry.message,
                             {pair.key: pair.value for pair in entry.values}) for entry in message.status)
     return Report(_stamp_ns(message.header), statuses)
 

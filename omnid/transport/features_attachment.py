@@ -1,4 +1,4 @@
-"""What goes along with a panorama on the bus: where its features are, as JSON beside the picture."""
+"""What goes along with a panorama on the bus: where its features are, as JSON beside the image."""
 
 from __future__ import annotations
 

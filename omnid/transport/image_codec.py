@@ -1,7 +1,7 @@
-"""Frames as the picture messages of ROS 2, under names that its own tools and `omnid replay` know.
+"""Frames as the image messages of ROS 2, under names that its own tools and `omnid replay` know.
 
-Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as drivers.logs.ros_image reads it:
-pictures are nearly all of a recording, and this copies each of them once.
+Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as
+drivers.logs.ros_image reads it: images are nearly all of a recording, and this copies each of them once.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
 
 
 def _rows(frame: Frame) -> int:
-    """How many rows a whole picture has; a driver's buffer may be longer, which ROS does not take."""
+    """How many rows a whole image has; a driver's buffer may be longer, which ROS does not take."""
     return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # colours in rows of their own
 
 

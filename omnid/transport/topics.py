@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from omnid.transport import codec
 
-PICTURE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
+IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 
 
@@ -27,7 +27,7 @@ SAID: Final = {
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, late=True),
     "map": Topic(codec.GRID_SCHEMA, late=True),
     "drive": Topic(codec.TWIST_SCHEMA),
-    "panorama": Topic(PICTURE_SCHEMA),
+    "panorama": Topic(IMAGE_SCHEMA),
 }
 HEARD: Final = {
     "cmd/twist": codec.TWIST_SCHEMA,

@@ -1,1 +1,1 @@
-"""A run in pictures, for rerun: of a log, of a recording, or of a robot as it drives."""
+"""A run in images, for rerun: of a log, of a recording, or of a robot as it drives."""

@@ -1,4 +1,4 @@
-"""Pictures as they can be put on the board: compressed."""
+"""Images as they can be put on the board: compressed."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ COMPRESSED: Final = ("jpeg", "png")
 QUALITY: Final = 85
 
 
-def jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """A picture (H, W) as JPEG."""
-    return cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
+def jpeg(image: NDArray[np.uint8]) -> bytes:
+    """A image (H, W) as JPEG."""
+    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
 
 
 def compressed(image: RosImage) -> tuple[bytes, str]:
-    """The bytes of a picture message and their kind; what came raw becomes grey JPEG. BrokenFrame where it is broken.
+    """The bytes of a image message and their kind; what came raw becomes grey JPEG. BrokenFrame where it is broken.
     """
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding

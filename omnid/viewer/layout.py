@@ -11,12 +11,12 @@ ROBOT: Final = "odom/base_link"  # which the eye goes along with
 EYE_M: Final = (-5.0, -4.0, 8.0)  # from behind, the right and above
 
 
-def layout(picture: str, depth: bool) -> Any:
-    """The world at the left, what there is of pictures at the right, plots below them.
+def layout(image: str, depth: bool) -> Any:
+    """The world at the left, what there is of images at the right, plots below them.
 
-    picture: the title of the pictures, '' where there are none.
+    image: the title of the images, '' where there are none.
     """
-    seen = [_picture("panorama", picture)] * bool(picture) + [_picture("depth", "Depth")] * depth
+    seen = [_image("panorama", image)] * bool(image) + [_image("depth", "Depth")] * depth
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(_world(), rrb.Vertical(*seen, _told()), column_shares=[5, 4]),
@@ -43,7 +43,7 @@ def _world() -> Any:
                                                             eye_up=(0.0, 0.0, 1.0), tracking_entity=ROBOT))
 
 
-def _picture(name: str, title: str) -> Any:
+def _image(name: str, title: str) -> Any:
     return rrb.Spatial2DView(origin=name, name=title)
 
 

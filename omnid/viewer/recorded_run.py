@@ -18,9 +18,9 @@ from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, POINT_CLO
 from omnid.transport.decode import Pose, Report, cloud_from, pose_from, report_from
 from omnid.viewer import status_plots as reports
 from omnid.viewer.image_encoding import compressed
-from omnid.viewer.rerun_scene import Board
+from omnid.viewer.rerun_scene import RerunScene
 
-PICTURES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # whichever comes first
+IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # whichever comes first
 _LISTED: Final = 8
 
 
@@ -47,10 +47,10 @@ class Way(NamedTuple):
     draw: Callable[[Any], None]
 
 
-class Recorded:
+class RecordedRunView:
     """Draws a recording; broken: messages that could not be read, damaged: pieces of the file."""
 
-    def __init__(self, found: Survey, topic: str, board: Board) -> None:
+    def __init__(self, found: Survey, topic: str, board: RerunScene) -> None:
         self._found, self._board = found, board
         self._ways = self._by_topic(topic)
         self._pending: Pose | None = None  # until its state is known, which is written after it
@@ -58,10 +58,10 @@ class Recorded:
         self.broken = self.damaged = 0
 
     @staticmethod
-    def pictures(found: Survey, poses: str) -> str:
-        """The topic of the pictures that are shown beside the poses of a topic; '' where there is none."""
+    def images(found: Survey, poses: str) -> str:
+        """The topic of the images that are shown beside the poses of a topic; '' where there is none."""
         robot = poses.removesuffix("odom")
-        return next((robot + name for name in PICTURES if robot + name in found.topics), "")
+        return next((robot + name for name in IMAGES if robot + name in found.topics), "")
 
     def show(self) -> None:
         """Draws all of it."""
@@ -76,12 +76,12 @@ class Recorded:
 
     def _by_topic(self, poses: str) -> dict[str, dict[str, Way]]:
         """What becomes of a message, by its topic and type."""
-        robot, pictures = poses.removesuffix("odom"), self.pictures(self._found, poses)
+        robot, images = poses.removesuffix("odom"), self.images(self._found, poses)
         return {
             poses: {ODOMETRY_SCHEMA: Way(lambda data: pose_from(bytes(data), b"", 0), self._pose)},
             f"{robot}cloud": {POINT_CLOUD_SCHEMA: Way(lambda data: cloud_from(bytes(data)), self._board.cloud)},
             f"{robot}status": {DIAGNOSTICS_SCHEMA: Way(lambda data: report_from(bytes(data)), self._report)},
-            pictures: {kind: Way(partial(self._picture, kind), self._show) for kind in (IMAGE, COMPRESSED_IMAGE)},
+            images: {kind: Way(partial(self._image, kind), self._show) for kind in (IMAGE, COMPRESSED_IMAGE)},
         }
 
     def _messages(self) -> Iterator[tuple[Way, Message]]:
@@ -116,13 +116,13 @@ class Recorded:
             self._board.landmarks(report.stamp_ns, *counts)
         reports.draw(report, self._changes, self._board)
 
-    def _picture(self, kind: str, data: memoryview) -> tuple[int, bytes, str] | None:
-        """Stamp, bytes and kind of a picture; None unless it is wanted."""
-        if not self._board.wants("picture"):
+    def _image(self, kind: str, data: memoryview) -> tuple[int, bytes, str] | None:
+        """Stamp, bytes and kind of a image; None unless it is wanted."""
+        if not self._board.wants("image"):
             return None
         image = parse_image(kind, data)
         return image.stamp_ns, *compressed(image)
 
-    def _show(self, picture: tuple[int, bytes, str] | None) -> None:
-        if picture is not None:
-            self._board.panorama(*picture)
+    def _show(self, image: tuple[int, bytes, str] | None) -> None:
+        if image is not None:
+            self._board.panorama(*image)

@@ -1,6 +1,6 @@
 """The board that everything is drawn on: what a robot says and sees, as rerun has it.
 
-Entities: odom (the world) with path, covariance, map, base_link and its rig with the points of the present pictures;
+Entities: odom (the world) with path, covariance, map, base_link and its rig with the points of the present images;
 panorama with its features; depth; plots of speed, turn, landmarks, deviation, latency; state; log. Time is the stamp.
 """
 
@@ -18,8 +18,8 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.transport.decode import Cloud, Pose
 from omnid.viewer import style as looks
 from omnid.viewer.layout import CLOCK
-from omnid.viewer.style import Look
-from omnid.viewer.targets import Place
+from omnid.viewer.style import Style
+from omnid.viewer.targets import ViewerTarget
 from omnid.viewer.thinning import Thinning
 
 Array = NDArray[np.float64]
@@ -46,25 +46,25 @@ LEGEND: Final = f"""
 """
 
 
-class Board:
+class RerunScene:
     """Draws what it is given at its stamp; opened at the first of it, so that a run of nothing leaves no trace.
 
     layout: what lies where. expected: how many poses there will be, 0 unknown. From one thread only.
     """
 
-    def __init__(self, place: Place, layout: Any, expected: int = 0) -> None:
+    def __init__(self, place: ViewerTarget, layout: Any, expected: int = 0) -> None:
         self._place, self._layout = place, layout
         self._stream: rr.RecordingStream | None = None
         self._wants = {"pose": Thinning(MOST_POSES, expected), "sight": Thinning(MOST_SIGHTS, expected),
-                       "picture": Thinning(MOST_SIGHTS, expected), "cloud": Thinning(MOST_CLOUDS)}
+                       "image": Thinning(MOST_SIGHTS, expected), "cloud": Thinning(MOST_CLOUDS)}
         self._last: Array | None = None  # (3,) m, where the path has come to
         self._state = ""
         self._lines = 0
         self._latencies: set[tuple[str, ...]] = set()
-        self.poses = self.offered = self.pictures = 0
+        self.poses = self.offered = self.images = 0
 
     def wants(self, kind: str) -> bool:
-        """Whether the next pose, sight, picture or cloud is to be drawn at all."""
+        """Whether the next pose, sight, image or cloud is to be drawn at all."""
         return self._wants[kind]()
 
     def rig(self, T_base_rig: Array) -> None:
@@ -97,11 +97,11 @@ class Board:
             self._at(stamp_ns).log("state", rr.StateChange(state=state))
             self.line(stamp_ns, f"odometry: {state}", "INFO" if state == "tracking" else "WARN")
 
-    def landmarks(self, stamp_ns: int, agreeing: int, found: int) -> None:
+    def landmarks(self, stamp_ns: int, inliers: int, found: int) -> None:
         """How many were found, and how many of them agree."""
         self._at(stamp_ns)
         self._plot("landmarks", "found", found)
-        self._plot("landmarks", "agreeing", agreeing)
+        self._plot("landmarks", "agreeing", inliers)
 
     def latency(self, stamp_ns: int, name: tuple[str, ...], value_ms: float) -> None:
         """How long something took, ms."""
@@ -110,14 +110,14 @@ class Board:
             self._at(stamp_ns).log(["latency", *name], rr.Scalars(value_ms))
 
     def panorama(self, stamp_ns: int, data: bytes, kind: str = "jpeg") -> None:
-        """The picture, compressed; kind: jpeg or png."""
+        """The image, compressed; kind: jpeg or png."""
         self._at(stamp_ns).log("panorama", rr.EncodedImage(contents=data, media_type=f"image/{kind}"))
-        self.pictures += 1
+        self.images += 1
 
     def features(self, stamp_ns: int, features: Features) -> None:
         """What became of the panorama's features."""
         stream = self._at(stamp_ns)
-        dots = rr.Points2D(features.agreeing, colors=looks.AGREEING.colour, radii=_px(looks.AGREEING.size_px))
+        dots = rr.Points2D(features.inliers, colors=looks.AGREEING.colour, radii=_px(looks.AGREEING.size_px))
         stream.log("panorama/agreeing", dots)
         stream.log("panorama/rejected", _lines_2d(looks.crosses(features.rejected, looks.REJECTED.size_px),
                                                   looks.REJECTED))
@@ -168,7 +168,7 @@ class Board:
         if np.isfinite(value):
             self._opened().log([plot, name], rr.Scalars(value))
 
-    def _path(self, position: Array, look: Look) -> None:
+    def _path(self, position: Array, look: Style) -> None:
         """A piece of the way, of its own, so that each moment adds to the file what is new and no more."""
         start = position if self._last is None else self._last
         self._last = position
@@ -205,7 +205,7 @@ def _px(size: float) -> Any:
     return rr.components.Radius.ui_points(size)
 
 
-def _lines_2d(strips: NDArray[np.float32], look: Look) -> Any:
+def _lines_2d(strips: NDArray[np.float32], look: Style) -> Any:
     return rr.LineStrips2D(strips, colors=look.colour, radii=_px(1.0))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Final, Protocol
 
 from omnid.monitor.robot_state import plain
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Report
 from omnid.viewer.style import STATES
 
@@ -60,7 +60,7 @@ class Changes:
                 told = f"{status.name.removeprefix('omnid: ')}: {status.message or 'no message'}"
                 yield plain(told), LEVELS[status.level % len(LEVELS)]
 
-    def _is_new(self, status: Status) -> bool:
+    def _is_new(self, status: DiagnosticStatus) -> bool:
         before, now = self._said.get(status.name, (0, "")), (status.level, status.message)
         if status.name in self._said or len(self._said) < self._most_parts:
             self._said[status.name] = now

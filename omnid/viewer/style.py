@@ -19,29 +19,29 @@ SIGMAS: Final = 3.0  # of the ellipsoid
 VISIBLE_M: Final = 0.05  # a smaller ellipsoid is magnified
 MOST_MAGNIFIED: Final = 1000
 FARTHEST_MM: Final = 65535
-SPOT_PX: Final = 3  # side of what a located pixel becomes in the depth picture
+SPOT_PX: Final = 3  # side of what a located pixel becomes in the depth image
 
 
-class Look(NamedTuple):
+class Style(NamedTuple):
     """A colour and a size in pixels of the screen."""
 
     colour: Colour
     size_px: float
 
 
-UNKNOWN: Final = Look((150, 150, 150), 1.5)
+UNKNOWN: Final = Style((150, 150, 150), 1.5)
 STATES: Final = {  # the worse, the thicker
-    "tracking": Look((86, 180, 233), 1.5),
-    "degraded": Look((230, 159, 0), 3.0),
-    "lost": Look((213, 94, 0), 5.0),
+    "tracking": Style((86, 180, 233), 1.5),
+    "degraded": Style((230, 159, 0), 3.0),
+    "lost": Style((213, 94, 0), 5.0),
 }
-AGREEING: Final = Look((86, 180, 233), 2.5)  # dots
-REJECTED: Final = Look((213, 94, 0), 5.0)  # crosses
-NEW: Final = Look((240, 228, 66), 4.0)  # squares
+AGREEING: Final = Style((86, 180, 233), 2.5)  # dots
+REJECTED: Final = Style((213, 94, 0), 5.0)  # crosses
+NEW: Final = Style((240, 228, 66), 4.0)  # squares
 AXES: Final[tuple[Colour, ...]] = ((213, 94, 0), (0, 158, 115), (0, 114, 178))  # x, y, z
 
 
-def state_look(state: str) -> Look:
+def state_look(state: str) -> Style:
     """The look of a way in that state."""
     return STATES.get(state, UNKNOWN)
 
@@ -93,7 +93,7 @@ def squares(pixels: Array, half_px: float) -> NDArray[np.float32]:
     return (pixels[:, None, :] + corners).astype(np.float32)
 
 
-def depth_picture(disparity: NDArray[np.float32], focal_baseline: float) -> NDArray[np.uint16]:
+def depth_image(disparity: NDArray[np.float32], focal_baseline: float) -> NDArray[np.uint16]:
     """Distances [mm] from the rig's axis (H, W), 0 unknown, each located pixel as a spot; the nearest covers others.
 
     disparity: (H, W) px, NaN unknown; focal_baseline: of the panorama, px times m.

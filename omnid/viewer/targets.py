@@ -36,7 +36,7 @@ class ClosedError(OmnidError):
     """Whoever looked has closed the viewer."""
 
 
-class Place(Protocol):
+class ViewerTarget(Protocol):
     """Where a board stands: started once, left once."""
 
     def start(self, layout: Any) -> rr.RecordingStream:

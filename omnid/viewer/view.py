@@ -12,15 +12,15 @@ from typing import Final
 from drivers.logs.mcap_info import Survey, survey
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.runs.replay import Options, Replay, Topics
+from omnid.runs.replay import Options, ReplayRun, Topics
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.viewer.layout import layout
-from omnid.viewer.live_robot import Live
-from omnid.viewer.recorded_run import Recorded, poses_topic
-from omnid.viewer.replayed_run import MAP_EVERY_S, Computed
-from omnid.viewer.rerun_scene import Board
-from omnid.viewer.targets import ClosedError, Place, RrdFile, Viewer
+from omnid.viewer.live_robot import LiveRobotView
+from omnid.viewer.recorded_run import RecordedRunView, poses_topic
+from omnid.viewer.replayed_run import MAP_EVERY_S, ReplayedRunView
+from omnid.viewer.rerun_scene import RerunScene
+from omnid.viewer.targets import ClosedError, RrdFile, Viewer, ViewerTarget
 
 PANORAMA: Final = "Panorama"
 
@@ -31,13 +31,13 @@ class Log:
 
     path: Path
     robot: str | None = None
-    replay: bool = False  # from its pictures, though it has poses
+    replay: bool = False  # from its images, though it has poses
     rig: Path | None = None
     topics: Topics = (None, None)
     quiet: bool = False
 
 
-def place_for(out: Path | None, web: bool) -> Place:
+def place_for(out: Path | None, web: bool) -> ViewerTarget:
     """The file that is named, else a viewer."""
     return RrdFile(out) if out is not None else Viewer(web)
 
@@ -48,33 +48,33 @@ def check_file(out: Path | None, *read: tuple[str, Path | None]) -> None:
         check_outputs([("-o", out)], [(what, path) for what, path in read if path is not None])
 
 
-def show_log(log: Log, config: Config, settings: Path | None, place: Place) -> int:
-    """Shows a log: the poses that are recorded in it, else what can be computed from its pictures; the exit code."""
+def show_log(log: Log, config: Config, settings: Path | None, place: ViewerTarget) -> int:
+    """Shows a log: the poses that are recorded in it, else what can be computed from its images; the exit code."""
     found = survey(log.path)
     topic = None if log.replay else poses_topic(found, log.robot)
-    picture = PANORAMA if topic is None else _title(Recorded.pictures(found, topic))
-    board = Board(place, layout(picture, depth=topic is None), _most_messages(found, topic))
+    image = PANORAMA if topic is None else _title(RecordedRunView.images(found, topic))
+    board = RerunScene(place, layout(image, depth=topic is None), _most_messages(found, topic))
     code = 0
     with _closing(board, place):
         code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
     return _ended(board, place, code)
 
 
-def show_robot(bus: BusConfig, seconds: float | None, place: Place) -> int:
+def show_robot(bus: BusConfig, seconds: float | None, place: ViewerTarget) -> int:
     """Shows a robot; the exit code, 1 where not one pose came."""
-    board = Board(place, layout(PANORAMA, depth=False))
+    board = RerunScene(place, layout(PANORAMA, depth=False))
     with _closing(board, place):
-        Live(board).follow(bus, place, seconds)
+        LiveRobotView(board).follow(bus, place, seconds)
     return _ended(board, place, int(not board.poses))
 
 
 def _title(topic: str) -> str:
-    """Of the pictures of a topic."""
+    """Of the images of a topic."""
     return "" if not topic else PANORAMA if topic.endswith("panorama") else "Lower camera"
 
 
 @contextmanager
-def _closing(board: Board, place: Place) -> Iterator[None]:
+def _closing(board: RerunScene, place: ViewerTarget) -> Iterator[None]:
     """Has all arrive that was drawn, whatever ends it; that somebody closes the window is an end like others."""
     try:
         yield
@@ -89,14 +89,14 @@ def _closing(board: Board, place: Place) -> Iterator[None]:
             board.close()
 
 
-def _computed(log: Log, config: Config, settings: Path | None, board: Board) -> int:
+def _computed(log: Log, config: Config, settings: Path | None, board: RerunScene) -> int:
     options = Options(quiet=log.quiet, settings=settings, map_every_s=MAP_EVERY_S,
-                      watch=lambda place, telemetry: Computed(board, place, telemetry))
-    return Replay(log.path, config, options).run(log.rig, log.topics)
+                      watch=lambda place, telemetry: ReplayedRunView(board, place, telemetry))
+    return ReplayRun(log.path, config, options).run(log.rig, log.topics)
 
 
-def _recorded(found: Survey, topic: str, board: Board) -> int:
-    recorded = Recorded(found, topic, board)
+def _recorded(found: Survey, topic: str, board: RerunScene) -> int:
+    recorded = RecordedRunView(found, topic, board)
     recorded.show()
     if recorded.broken or recorded.damaged:
         print(f"omnid: warning: {found.path}: {recorded.broken} messages and {recorded.damaged} pieces of the file "
@@ -113,10 +113,10 @@ def _most_messages(found: Survey, topic: str | None) -> int:
     return max((count for kind, count in found.topics.values() if kind.startswith("sensor_msgs/msg/")), default=0)
 
 
-def _ended(board: Board, place: Place, code: int) -> int:
+def _ended(board: RerunScene, place: ViewerTarget, code: int) -> int:
     if board.poses:
         of_all = f" of {board.offered}" if board.offered > board.poses else ""
-        print(f"{board.poses} poses{of_all} and {board.pictures} pictures shown")
+        print(f"{board.poses} poses{of_all} and {board.images} images shown")
     if board.poses and not place.left:
         print(place.leave(), flush=True)
     return code

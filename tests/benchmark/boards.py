@@ -27,19 +27,19 @@ Image = NDArray[np.uint8]
 Detect = Callable[[Image, Board], Array | None]  # corners (N, 2) [px], NaN where hidden
 
 
-def _ours(picture: Image, board: Board) -> Array | None:
-    view = find_board(picture, board).view
+def _ours(image: Image, board: Board) -> Array | None:
+    view = find_board(image, board).view
     return None if view is None else view.pixels
 
 
-def _plain(picture: Image, board: Board) -> Array | None:
+def _plain(image: Image, board: Board) -> Array | None:
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    return _corners(*cv2.findChessboardCorners(picture, (board.columns, board.rows), flags=flags))
+    return _corners(*cv2.findChessboardCorners(image, (board.columns, board.rows), flags=flags))
 
 
-def _sector(picture: Image, board: Board) -> Array | None:
+def _sector(image: Image, board: Board) -> Array | None:
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    return _corners(*cv2.findChessboardCornersSB(picture, (board.columns, board.rows), flags=flags))
+    return _corners(*cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags))
 
 
 def _corners(found: bool, corners: Array | None) -> Array | None:
@@ -68,16 +68,16 @@ def _ways(truth: Array, board: Board) -> list[Array]:
 
 def count(shots: Sequence[Hard], detect: Detect, *, empty: bool = True) -> Counter[str]:
     """How many boards a detector found, missed and got wrong."""
-    counts = Counter(judged(detect(shot.picture, shot.board), shot) for shot in shots)
+    counts = Counter(judged(detect(shot.image, shot.board), shot) for shot in shots)
     counts["wrong"] += sum(detect(shot.empty, shot.board) is not None for shot in shots) if empty else 0
     return counts
 
 
 def main(arguments: list[str]) -> int:
-    """Prints what each detector makes of every picture, and the sums; 1 where a board was wrong or too few found."""
+    """Prints what each detector makes of every image, and the sums; 1 where a board was wrong or too few found."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmark.boards", description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--first", type=int, default=0, help="number of the first picture")
+    parser.add_argument("--first", type=int, default=0, help="number of the first image")
     parser.add_argument("--count", type=int, default=50)
     args = parser.parse_args(arguments)
     sums = {name: Counter[str]() for name in DETECTORS}
@@ -96,10 +96,10 @@ def _said(verdict: Counter[str]) -> str:
     return "/".join(kind for kind in ("found", "missed", "wrong") if verdict[kind])
 
 
-def enough(sums: dict[str, Counter[str]], pictures: int) -> bool:
+def enough(sums: dict[str, Counter[str]], images: int) -> bool:
     """No wrong board, and as many as OpenCV's best detector finds and half of what it misses."""
     best = max(sums[name]["found"] for name in DETECTORS if name != "omnid")
-    return sums["omnid"]["wrong"] == 0 and sums["omnid"]["found"] >= best + (pictures - best) / 2
+    return sums["omnid"]["wrong"] == 0 and sums["omnid"]["found"] >= best + (images - best) / 2
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Checkerboards in mirror and fisheye pictures that are hard to find, each from one number, with exact corners."""
+"""Checkerboards in mirror and fisheye images that are hard to find, each from one number, with exact corners."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ BEHIND_THE_WALLS = se3.transform(np.eye(3), [0.0, 0.0, 100.0])
 
 @dataclass(frozen=True, slots=True)
 class Hard:
-    """A picture of a board, or of the same place without it, and what there is to know about it."""
+    """A image of a board, or of the same place without it, and what there is to know about it."""
 
     name: str
     board: Board
-    picture: Image
+    image: Image
     empty: Image
     corners: Array  # (N, 2) px
 
 
 def hard(seed: int, number: int) -> Hard:
-    """The picture of that number, mirror, walls and board taking turns, all else by chance."""
+    """The image of that number, mirror, walls and board taking turns, all else by chance."""
     rng = np.random.default_rng([seed, number])
     kind, walls = MIRRORS[number % len(MIRRORS)], WALLS[number % len(WALLS)]
     size, board = SIZES[rng.integers(len(SIZES))], Board(*BOARDS[number % len(BOARDS)], SQUARE_M)
@@ -57,11 +57,11 @@ def hard(seed: int, number: int) -> Hard:
     shot = studio.photograph(_pose(rng, kind, studio), **looks)
     empty = studio.photograph(BEHIND_THE_WALLS, **looks)
     exposure = Exposure.of(sensor, mask, size)
-    pictures = [cv2.imdecode(np.frombuffer(exposure.jpeg(made.picture), np.uint8), cv2.IMREAD_GRAYSCALE)
+    images = [cv2.imdecode(np.frombuffer(exposure.jpeg(made.image), np.uint8), cv2.IMREAD_GRAYSCALE)
                 for made in (shot, empty)]
     name = (f"{number:03d} {kind} {size[0]}x{size[1]} {walls} {board.columns}x{board.rows} noise "
             f"{sensor.noise_sigma:.1f} blur {sensor.blur_px:.1f} step {light:.0f}")
-    return Hard(name, board, pictures[0].astype(np.uint8), pictures[1].astype(np.uint8), shot.corners)
+    return Hard(name, board, images[0].astype(np.uint8), images[1].astype(np.uint8), shot.corners)
 
 
 def _camera(rng: Random, kind: str, size: tuple[int, int]) -> tuple[OmniCamera, Mask]:

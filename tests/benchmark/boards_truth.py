@@ -23,7 +23,7 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from omnid.calibration.board_search import find_boards
-from omnid.calibration.image_pairs import PairedPictures, read_pairs
+from omnid.calibration.image_pairs import PairedImages, read_pairs
 from tests.simulation.boards import Studio, around_both
 from tests.simulation.sensor import Sensor
 
@@ -44,27 +44,27 @@ def rig_by_chance(seed: int, size: int) -> Rig:
     return Rig(mounted[0], mounted[1])
 
 
-def photographed(rig: Rig, folder: Path, seed: int, pairs: int) -> PairedPictures:
-    """Pictures of a board held all around a rig."""
+def photographed(rig: Rig, folder: Path, seed: int, pairs: int) -> PairedImages:
+    """Images of a board held all around a rig."""
     studios = {"lower": Studio(BOARD, rig.lower), "upper": Studio(BOARD, rig.upper)}
     for k, T in enumerate(around_both(rig, BOARD, pairs, seed=seed, distance_m=(0.2, 0.42))):
         for name, studio in studios.items():
             shot = studio.photograph(T, seed=1000 * seed + k, sensor=Sensor(noise_sigma=1.0))
-            cv2.imwrite(str(folder / f"{name}_{k:02d}.png"), shot.picture)
+            cv2.imwrite(str(folder / f"{name}_{k:02d}.png"), shot.image)
     return read_pairs(folder)
 
 
-def calibrated(pictures: PairedPictures) -> RigCalibration:
+def calibrated(images: PairedImages) -> RigCalibration:
     """What `omnid calibrate rig --model omni` makes of them."""
     seen, cameras = [], []
-    for side in pictures.sides:
+    for side in images.sides:
         views = find_boards(side, BOARD, thorough=True, tell=False)
         height, width = next(iter(side.values())).shape
         cameras.append(sharpened(calibrate(views, BOARD, (width, height), "omni"), side, "omni", "mirror").camera)
         seen.append({view.name: view for view in views})
-    pairs = [PairView(name, (seen[0].get(name), seen[1].get(name))) for name in pictures.names]
+    pairs = [PairView(name, (seen[0].get(name), seen[1].get(name))) for name in images.names]
     found = calibrate_rig([view for view in pairs if any(view.seen)], BOARD, (cameras[0], cameras[1]))
-    return sharpened_rig(found, pictures.sides)
+    return sharpened_rig(found, images.sides)
 
 
 def errors(found: RigCalibration, truth: Rig) -> dict[str, tuple[float, float]]:
@@ -88,7 +88,7 @@ def errors(found: RigCalibration, truth: Rig) -> dict[str, tuple[float, float]]:
 
 
 def _scale(camera: UnifiedCamera, truth: UnifiedCamera, sigma_px: float) -> list[tuple[float, float]]:
-    """How much larger the camera's picture is at the horizon [%]: fu and xi do nearly the same."""
+    """How much larger the camera's image is at the horizon [%]: fu and xi do nearly the same."""
     at: list[Array] = [one.project(np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]]))
                        for one in (camera, truth)]
     sizes = [np.array([np.ptp(p[:2, 0]), np.ptp(p[2:, 1])]) for p in at]

@@ -22,7 +22,7 @@ import pytest
 from calib import se3
 from omnid.client import Report, Robot, Subscription
 from omnid.engine.telemetry import Histogram
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
@@ -80,9 +80,11 @@ def counter(endpoint: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def odometry(seq: int) -> Odometry:
+def odometry(seq: int) -> OdometryUpdate:
     T = se3.transform(se3.rotation_exp([0.0, 0.0, 1e-3 * seq]), [1e-3 * seq, 0.0, 0.0])
-    return Odometry(seq, time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 50, 60, cast("Any", None))
+    return OdometryUpdate(
+        seq, time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 50, 60, cast("Any", None)
+    )
 
 
 def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:

@@ -14,10 +14,10 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_statistics import Tally
-from omnid.diagnostics.run_summary import counters, summary
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import counters, run_summary
 from omnid.engine.graph import Graph
-from omnid.runs.pipeline import Ends, wire
+from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.log_pairing import PairSync
@@ -29,7 +29,7 @@ WANTED_HZ = 20.0
 
 
 def recording() -> tuple[LogReader, Rig]:
-    """Pictures of 768x768 where they are at hand, else the sample's of 512x512."""
+    """Images of 768x768 where they are at hand, else the sample's of 512x512."""
     if TWO_WALLS.is_dir():
         return LogReader(TWO_WALLS / "log.mcap"), import_kalibr(TWO_WALLS / "camchain.yaml")
     reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
@@ -40,15 +40,15 @@ def recording() -> tuple[LogReader, Rig]:
 @pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
 def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
     reader, rig = recording()
-    config, frames, tally = Config(), list(reader.frames()), Tally()
+    config, frames, tally = Config(), list(reader.frames()), RunStatistics()
     cv2.setNumThreads(config.graph.opencv_threads)
     place = geometry(with_rims(rig, frames), config.panorama)
     graph = Graph(threaded=threaded)
-    ends = Ends({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
+    ends = Sinks({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
     wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)
-    print(f"\n{rate_hz:.1f} pairs/s\n{summary(counters(tally, {}), graph.telemetry.summary())}")
+    print(f"\n{rate_hz:.1f} pairs/s\n{run_summary(counters(tally, {}), graph.telemetry.summary())}")
     assert not threaded or rate_hz >= WANTED_HZ

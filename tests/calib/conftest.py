@@ -17,7 +17,7 @@ from calib.rig import MountedCamera, Rig
 T_DOWN = se3.transform([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], [0, 0, 0])
 
 
-def crooked(lower: OmniCamera, upper: OmniCamera) -> Rig:
+def misaligned(lower: OmniCamera, upper: OmniCamera) -> Rig:
     """A rig that is turned and shifted about every axis, so that no transform passes for its inverse."""
     T_lower_rig = se3.exp([0.01, -0.02, 0.03, 0.04, -0.05, 0.6]) @ T_DOWN
     T_upper_lower = se3.exp([-0.008, 0.011, 0.17, 0.03, 0.02, -0.25])
@@ -39,17 +39,17 @@ def ocam_cameras() -> tuple[OcamCamera, OcamCamera]:
 
 @pytest.fixture(params=["omni", "ocam"])
 def rig(request: pytest.FixtureRequest) -> Rig:
-    return crooked(*(omni_cameras() if request.param == "omni" else ocam_cameras()))
+    return misaligned(*(omni_cameras() if request.param == "omni" else ocam_cameras()))
 
 
 @pytest.fixture
 def omni_rig() -> Rig:
-    return crooked(*omni_cameras())
+    return misaligned(*omni_cameras())
 
 
 @pytest.fixture
 def ocam_rig() -> Rig:
-    return crooked(*ocam_cameras())
+    return misaligned(*ocam_cameras())
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from calib.transform_file import straight_up
 FOCAL_PX = 200.0
 CENTER = (384.0, 380.0)
 # A camera under a mirror, or a lens, that looks up in a world with x forward, y left, z up: forward is up in its
-# picture. From below, left is then on the right, whether in a mirror or directly.
+# image. From below, left is then on the right, whether in a mirror or directly.
 SEEN_FROM_BELOW = {"forward": (0, -1), "left": (1, 0), "right": (-1, 0), "backward": (0, 1)}
 DIRECTIONS = {"forward": (1.0, 0, 0), "left": (0, 1.0, 0), "right": (0, -1.0, 0), "backward": (-1.0, 0, 0)}
 
@@ -34,7 +34,7 @@ def reflected(points: Array) -> Array:
     """Pixels of world points in an orthographic camera that looks up at a convex paraboloid with focus at the origin.
 
     The paraboloid r^2 = 1 + 2 z hangs with its vertex down: |p| = 1 + z. A ray towards the focus leaves it straight
-    down, which is proved here by the law of reflection. The picture's u runs left, its v backward: u x v is up.
+    down, which is proved here by the law of reflection. The image's u runs left, its v backward: u x v is up.
     """
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     on_mirror = rays / (1 - rays[:, 2:])
@@ -80,7 +80,7 @@ def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -
 
 @pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
 @pytest.mark.parametrize("side", DIRECTIONS)
-def test_left_of_the_robot_is_on_the_right_of_a_picture_taken_from_below(mounted: MountedCamera, side: str) -> None:
+def test_left_of_the_robot_is_on_the_right_of_a_image_taken_from_below(mounted: MountedCamera, side: str) -> None:
     (pixel,) = mounted.camera.project(se3.apply(mounted.T_cam_rig, np.array([DIRECTIONS[side]])))
     np.testing.assert_allclose((pixel - CENTER) / FOCAL_PX, SEEN_FROM_BELOW[side], rtol=0, atol=1e-9)
 
@@ -93,7 +93,7 @@ def test_higher_things_are_further_out_in_a_mirror() -> None:
 
 
 def rectified(rig: Rig, points: Array, cylinder: Cylinder) -> tuple[Array, Array]:
-    """Panorama pixels of points (rig frame), through each camera's picture: project, lift, turn to the cylinder."""
+    """Panorama pixels of points (rig frame), through each camera's image: project, lift, turn to the cylinder."""
     found = []
     for mounted in (rig.lower, rig.upper):
         rays = mounted.camera.lift(mounted.camera.project(se3.apply(mounted.T_cam_rig, points)))
@@ -135,7 +135,7 @@ def test_the_panorama_is_seen_from_inside_left_on_the_left_and_up_is_up() -> Non
     np.testing.assert_allclose(cylinder.pixels(cylinder.rays(grid)), grid, rtol=0, atol=1e-9)
 
 
-def test_a_turn_to_the_left_moves_the_picture_right(rig: Rig, around: Array) -> None:
+def test_a_turn_to_the_left_moves_the_image_right(rig: Rig, around: Array) -> None:
     cylinder, turn = Cylinder(1200, 400, 200.0), 0.2
     T_before_after = se3.transform(se3.rotation_exp(turn * se3.inverse(rig.T_rect_rig)[:3, 2]), np.zeros(3))
     away = around * 1e6
@@ -168,17 +168,17 @@ def test_a_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
     np.testing.assert_array_equal(seen, (maps[0] >= 0) & (radius >= 122) & (radius <= 298))
 
 
-def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_picture_runs() -> None:
+def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_image_runs() -> None:
     lower, upper = parabolic_omni().camera, parabolic_ocam().camera
     for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
         rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
         np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], rtol=0, atol=1e-15)
-        # The picture's u axis runs to the robot's left here, and the rig's x is that axis.
+        # The image's u axis runs to the robot's left here, and the rig's x is that axis.
         np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], rtol=0, atol=1e-12)
 
 
-def first_pictures(log: Path, topics: tuple[str, str]) -> list[Any]:
-    """The first picture of each topic of a log."""
+def first_images(log: Path, topics: tuple[str, str]) -> list[Any]:
+    """The first image of each topic of a log."""
     images: dict[str, Any] = dict.fromkeys(topics)
     store = get_typestore(Stores.ROS2_HUMBLE)
     with log.open("rb") as file:
@@ -191,7 +191,7 @@ def first_pictures(log: Path, topics: tuple[str, str]) -> list[Any]:
 
 
 def tracked(first: Any, second: Any) -> Array:
-    """Offsets (N, 2) of features that go from one picture to the other and come back."""
+    """Offsets (N, 2) of features that go from one image to the other and come back."""
     corners: Any = cv2.goodFeaturesToTrack(first, 400, 0.02, 8)
     track: Any = cv2.calcOpticalFlowPyrLK
     moved, there, _ = track(first, second, corners, None, winSize=(21, 21), maxLevel=4)
@@ -201,12 +201,12 @@ def tracked(first: Any, second: Any) -> Array:
 
 
 def test_columns_of_a_real_pair_agree(shared_data: Path) -> None:
-    """What the two cameras of a crooked rig saw lies in the same columns, and lower in the upper panorama."""
+    """What the two cameras of a misaligned rig saw lies in the same columns, and lower in the upper panorama."""
     folder = shared_data / "two_walls_crooked"
     rig = import_kalibr(folder / "camchain.yaml")
     cylinder = fit_cylinder(rig)
     lower, upper = (cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-                    for image, mounted in zip(first_pictures(folder / "log.mcap", rig.topics), (rig.lower, rig.upper),
+                    for image, mounted in zip(first_images(folder / "log.mcap", rig.topics), (rig.lower, rig.upper),
                                               strict=True))
     offset = tracked(lower, upper)
     assert len(offset) > 150

@@ -70,7 +70,7 @@ def test_without_an_imu_the_chain_places_the_cameras() -> None:
     np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, rig.baseline_m], atol=1e-14)
     x_lower = rig.lower.T_cam_rig[:3, 0]
     z_lower = se3.inverse(T_UPPER_LOWER)[:3, 3] / rig.baseline_m
-    u_lower = np.array([-1.0, 0, 0])  # fu < 0: the picture's u runs against the camera's x
+    u_lower = np.array([-1.0, 0, 0])  # fu < 0: the image's u runs against the camera's x
     np.testing.assert_allclose(x_lower, (u_lower - z_lower * (z_lower @ u_lower)) / np.sqrt(1 - (z_lower @ u_lower)**2),
                                atol=1e-3)
     np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 2], z_lower, atol=1e-14)

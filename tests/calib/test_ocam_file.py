@@ -112,7 +112,7 @@ def test_two_files_and_a_transform_are_a_rig(tmp_path: Path, view: str) -> None:
     assert (rig.lower.camera.size, rig.upper.camera.size) == ((640, 480), (641, 481))
     np.testing.assert_allclose(rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig), T_LOWER_UPPER, atol=1e-14)
     np.testing.assert_allclose(rig.upper.viewpoint, (0, 0, float(np.linalg.norm(T_LOWER_UPPER[:3, 3]))), atol=1e-14)
-    # The picture's u is the camera's y in this model, and the rig's x.
+    # The image's u is the camera's y in this model, and the rig's x.
     assert rig.lower.T_cam_rig[1, 0] > 0.99
 
 
@@ -122,7 +122,7 @@ def test_a_baseline_is_straight_up_from_cameras_that_look_up(tmp_path: Path, vie
     path = tmp_path / "c.txt"
     rig = import_ocam(path, path, straight_up(0.2), "mirror" if view == "mirror" else "direct")
     axis = rig.lower.camera.lift(np.array([rig.lower.camera.center]))[0] @ rig.lower.T_cam_rig[:3, :3]
-    # In a mirror the middle of the picture shows the camera below, through a lens the ceiling.
+    # In a mirror the middle of the image shows the camera below, through a lens the ceiling.
     np.testing.assert_allclose(axis, np.array([0, 0, -1 if view == "mirror" else 1]), atol=1e-12)
     for baseline in (0.0, -0.2, float("nan")):
         with pytest.raises(CalibError, match="--baseline"):

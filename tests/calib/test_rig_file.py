@@ -18,9 +18,9 @@ from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 
 def with_masks(rig: Rig) -> Rig:
     width, height = rig.upper.camera.size
-    picture = np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8) * 255
+    image = np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8) * 255
     return replace(rig, lower=replace(rig.lower, mask=Mask((384.1, 383.2), 0.0, 371.3)),
-                   upper=replace(rig.upper, mask=Mask((383.9, 384.0), 61.5, image=picture)))
+                   upper=replace(rig.upper, mask=Mask((383.9, 384.0), 61.5, image=image)))
 
 
 def assert_same(a: MountedCamera, b: MountedCamera) -> None:
@@ -99,7 +99,7 @@ def test_a_rotation_typed_with_few_digits_is_made_one(omni_rig: Rig) -> None:
     ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
     ("inner_px = 0.0", "image = 'nowhere.png'", "lower.mask.image"),
     ("inner_px = 0.0", "image = 'data:image/png;base64,?'", "lower.mask.image: expected base64"),
-    ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected a picture"),
+    ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected a image"),
 ])
 def test_what_is_wrong_is_named(omni_rig: Rig, old: str, new: str, says: str) -> None:
     text = rig_toml(with_masks(omni_rig))
@@ -118,7 +118,7 @@ def test_a_reflection_is_no_transform(ocam_rig: Rig) -> None:
         parse_rig("\n".join(lines))
 
 
-def test_a_mask_picture_must_fit_the_camera(omni_rig: Rig, tmp_path: Path) -> None:
+def test_a_mask_image_must_fit_the_camera(omni_rig: Rig, tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.toml", with_masks(omni_rig))
     cv2.imwrite(str(tmp_path / "rig.upper.png"), np.zeros((4, 5), np.uint8))
     with pytest.raises(CalibError, match=r"upper\.mask\.image: expected \(780, 768\).* found \(5, 4\)"):

@@ -22,8 +22,8 @@ def frame(encoding: str, data: object, **fields: object) -> Frame:
     return Frame(7, 1, "lower", encoding, data, **layout)  # type: ignore[arg-type]
 
 
-def encoded(suffix: str, picture: NDArray[Any] = SMOOTH[..., :3]) -> bytes:
-    return cv2.imencode(suffix, picture)[1].tobytes()
+def encoded(suffix: str, image: NDArray[Any] = SMOOTH[..., :3]) -> bytes:
+    return cv2.imencode(suffix, image)[1].tobytes()
 
 
 def padded_rows(pixels: NDArray[Any], padding: int) -> tuple[bytes, int]:
@@ -100,14 +100,14 @@ def test_the_last_row_needs_no_padding() -> None:
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 @pytest.mark.parametrize("padding", [0, 1, 5000])
-def test_compressed_pictures_and_the_padding_of_cameras(suffix: str, padding: int) -> None:
+def test_compressed_images_and_the_padding_of_cameras(suffix: str, padding: int) -> None:
     data = encoded(suffix)
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     encoding = {".jpg": "jpeg", ".png": "png"}[suffix]
     np.testing.assert_array_equal(gray(Frame(0, 0, "upper", encoding, data + bytes(padding))), expected)
 
 
-def test_an_orientation_in_exif_does_not_turn_the_picture() -> None:
+def test_an_orientation_in_exif_does_not_turn_the_image() -> None:
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     data = encoded(".jpg")
     turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:]
@@ -117,17 +117,17 @@ def test_an_orientation_in_exif_does_not_turn_the_picture() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", "mono8", "mono16", "bgr8", "rgba8", "yuyv", "uyvy", "nv12"])
-def test_the_picture_is_read_only_and_nobody_can_change_it_later(encoding: str) -> None:
+def test_the_image_is_read_only_and_nobody_can_change_it_later(encoding: str) -> None:
     buffer = np.frombuffer(encoded(".jpg") if encoding == "jpeg" else COLOURS.tobytes(), np.uint8).copy()
-    picture = gray(frame(encoding, buffer))
-    before = picture.copy()
+    image = gray(frame(encoding, buffer))
+    before = image.copy()
     buffer[:] = 0
-    assert picture.flags.c_contiguous and not picture.flags.writeable and picture.dtype == np.uint8
-    np.testing.assert_array_equal(picture, before)
+    assert image.flags.c_contiguous and not image.flags.writeable and image.dtype == np.uint8
+    np.testing.assert_array_equal(image, before)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_cut_picture_is_broken_wherever_it_is_cut(suffix: str) -> None:
+def test_a_cut_image_is_broken_wherever_it_is_cut(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
         with pytest.raises(BrokenFrame):
@@ -177,7 +177,7 @@ def test_an_absurd_size_is_refused_before_it_is_decoded(suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_damaged_pictures_decode_or_are_broken_and_nothing_else(suffix: str) -> None:
+def test_damaged_images_decode_or_are_broken_and_nothing_else(suffix: str) -> None:
     chance, whole = random.Random(3), encoded(suffix)
     for _ in range(300):
         data = bytearray(whole)

@@ -83,7 +83,7 @@ def _other_side(side: Rectangle) -> Rectangle:
 
 
 def _with_door(rng: Random, side: Rectangle) -> list[Rectangle]:
-    """The wall without a door's opening: what is left of it, right of it and above; a picture where there is room."""
+    """The wall without a door's opening: what is left of it, right of it and above; a image where there is room."""
     width, height = DOOR_M
     left = rng.uniform(0.3, side.width_m - width - 0.3)
     right = left + width

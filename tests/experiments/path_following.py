@@ -13,7 +13,7 @@ import numpy as np
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from tests.benchmark.accuracy import omnid
-from tests.experiments import figures as pictures
+from tests.experiments import figures as images
 from tests.experiments.views import Experiment
 
 KLT = ("--method", "paper", "--tracker", "klt")
@@ -31,7 +31,7 @@ METHODS: dict[str, tuple[str, ...]] = {
 
 
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
-    """For each method: length and ATE and so on, and the path it found (for the picture)."""
+    """For each method: length and ATE and so on, and the path it found (for the image)."""
     return {name: follow(folder, options) for name, options in METHODS.items()}
 
 
@@ -57,7 +57,7 @@ SHOWN = tuple(METHODS)[1], tuple(METHODS)[3], tuple(METHODS)[-1]
 def draw(folder: Path, experiment: Experiment, path: Path) -> None:
     """The paths of plain KLT, of the paper and of omnid over the true one."""
     found = {name: follow(folder, METHODS[name])["xy"] for name in SHOWN}
-    pictures.paths(found, true_path(folder), path)
+    images.paths(found, true_path(folder), path)
 
 
 def true_path(folder: Path) -> list[list[float]]:

@@ -47,7 +47,7 @@ def write_world(folder: Path, scene: Scene) -> None:
 
 
 def _rectangle(number: int, r: Rectangle) -> str:
-    """A unit square with its picture; POV-Ray counts a picture's rows from below."""
+    """A unit square with its image; POV-Ray counts a image's rows from below."""
     axes = (r.edge_u, -r.edge_v, r.normal, r.origin + r.edge_v)
     matrix = ", ".join(f"{x:.12g}" for axis in axes for x in axis)
     return (f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ pgm "{number}.pgm" gamma 1.0 '
@@ -56,7 +56,7 @@ def _rectangle(number: int, r: Rectangle) -> str:
 
 
 def shoot(world: Path, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
-    """The picture (H, W) float32, 0 to 255, of a camera on a rig that stands at T_world_rig in a written world.
+    """The image (H, W) float32, 0 to 255, of a camera on a rig that stands at T_world_rig in a written world.
 
     Rendered supersample times larger and shrunk: faster than POV-Ray's own anti-aliasing. 0 beyond the mirror's rim.
     """
@@ -65,7 +65,7 @@ def shoot(world: Path, mounted: MountedCamera, T_world_rig: Array, supersample: 
     data = _run(view_text(mounted, T_world_rig), world, [*OPTIONS, *size])
     large = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if large is None:
-        raise PovrayError(f"{world}: POV-Ray gave {len(data)} bytes that are no picture")
+        raise PovrayError(f"{world}: POV-Ray gave {len(data)} bytes that are no image")
     seen = np.where(_inside_rim(mounted, supersample), large, 0).astype(np.float32)
     return np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
@@ -86,7 +86,7 @@ def _run(text: str, world: Path, options: list[str]) -> bytes:
 
 
 def view_text(mounted: MountedCamera, T_world_rig: Array) -> str:
-    """The scene description of one picture: camera and mirror on the axes, the world about them."""
+    """The scene description of one image: camera and mirror on the axes, the world about them."""
     camera = traceable(mounted.camera)
     T_cam_world = mounted.T_cam_rig @ se3.inverse(T_world_rig)
     columns = ", ".join(f"{x:.15g}" for x in np.concatenate([T_cam_world[:3, :3].T.ravel(), T_cam_world[:3, 3]]))
@@ -112,7 +112,7 @@ def _camera(camera: UnifiedCamera) -> str:
     width, height = camera.size
     scale = 1.0 if camera.xi == 1 else float(np.sqrt(1 - camera.xi**2))  # focal length behind the mirror, of fu and fv
     right, down = width * scale / camera.focal[0], height * scale / camera.focal[1]
-    # Where the picture's middle looks, in the same units: the optical centre may lie off it.
+    # Where the image's middle looks, in the same units: the optical centre may lie off it.
     aside = scale * ((width - 1) / 2 - camera.center[0]) / camera.focal[0]
     below = scale * ((height - 1) / 2 - camera.center[1]) / camera.focal[1]
     if camera.xi == 1:
@@ -144,7 +144,7 @@ def _elevation(m: float, xi: float) -> float:
 
 
 def _inside_rim(mounted: MountedCamera, supersample: int) -> NDArray[np.bool_]:
-    """Which samples (H, W) of the enlarged picture lie on the mirror."""
+    """Which samples (H, W) of the enlarged image lie on the mirror."""
     width, height = mounted.camera.size
     u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
     v = (np.arange(height * supersample) + 0.5) / supersample - 0.5

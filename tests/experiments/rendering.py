@@ -1,4 +1,4 @@
-"""Renders a run picture by picture, goes on where it stopped, and packs the pictures as a log with its truth."""
+"""Renders a run image by image, goes on where it stopped, and packs the images as a log with its truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAMERAS = ("lower", "upper")
 def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs: int = 2) -> None:
     """Renders what is missing in folder/frames and writes log.mcap, truth.txt, rig.toml and camchain.yaml beside it.
 
-    Does nothing where the log stands already. A picture that is there is whole: another run of the same command goes
+    Does nothing where the log stands already. A image that is there is whole: another run of the same command goes
     on where this one stopped. The frames are removed once they are packed.
     """
     if (folder / "log.mcap").exists():
@@ -33,9 +33,9 @@ def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs:
     wanted = [(pair, camera) for pair in range(len(run.poses)) for camera in (0, 1)]
     missing = [w for w in wanted if not _path(frames, *w).exists()]
 
-    def draw(picture: tuple[int, int]) -> None:
-        mounted = (run.rig.lower, run.rig.upper)[picture[1]]
-        _save(_path(frames, *picture), shoot(folder / "world", mounted, run.poses[picture[0]], supersample))
+    def draw(image: tuple[int, int]) -> None:
+        mounted = (run.rig.lower, run.rig.upper)[image[1]]
+        _save(_path(frames, *image), shoot(folder / "world", mounted, run.poses[image[0]], supersample))
 
     with ThreadPoolExecutor(jobs) as pool:
         _watch(pool.map(draw, missing), len(missing), folder.name)
@@ -48,17 +48,17 @@ def _path(frames: Path, pair: int, camera: int) -> Path:
     return frames / f"{pair:04d}_{CAMERAS[camera]}.png"
 
 
-def _save(path: Path, picture: Floats) -> None:
+def _save(path: Path, image: Floats) -> None:
     """Sixteen bits, so that shrinking is not rounded away before the sensor's noise; whole or not at all."""
     part = path.with_suffix(".part.png")
-    cv2.imwrite(str(part), np.rint(picture * 257).astype(np.uint16))
+    cv2.imwrite(str(part), np.rint(image * 257).astype(np.uint16))
     part.replace(path)
 
 
 def _load(path: Path) -> Floats:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert picture is not None, f"{path} cannot be read: delete it and render again"
-    return np.asarray(picture / np.float32(257), np.float32)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None, f"{path} cannot be read: delete it and render again"
+    return np.asarray(image / np.float32(257), np.float32)
 
 
 def _watch(done: Iterable[None], total: int, name: str) -> None:
@@ -66,7 +66,7 @@ def _watch(done: Iterable[None], total: int, name: str) -> None:
     started = time.monotonic()
     for count, _ in enumerate(done, 1):
         left_s = (time.monotonic() - started) / count * (total - count)
-        sys.stderr.write(f"\r{name}: {count}/{total} pictures, {left_s:.0f} s left   ")
+        sys.stderr.write(f"\r{name}: {count}/{total} images, {left_s:.0f} s left   ")
     sys.stderr.write("\n" if total else "")
 
 

@@ -1,4 +1,4 @@
-"""Measures what is rendered, log by log, and writes the tables and pictures of all that has been measured."""
+"""Measures what is rendered, log by log, and writes the tables and images of all that has been measured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from tests.experiments import figures as pictures
+from tests.experiments import figures as images
 from tests.experiments import path_following, speed, tables, turn_tracking, wall_matching, whole_building
 from tests.experiments.tables import Seeds, Values
 from tests.experiments.views import ORIGIN, Experiment
@@ -68,10 +68,10 @@ def measured(results: Path, what: str, scene: str) -> Seeds:
 
 
 def draw(logs: Path, results: Path) -> None:
-    """The pictures: of the first seed, where its log is there, or of all seeds together."""
+    """The images: of the first seed, where its log is there, or of all seeds together."""
     if turns := measured(results, "turns", "turns"):
         rows = [row for values in turns.values() for row in values["turns"] if not row["moved"]]
-        pictures.turns(rows, results / "turns.png")
+        images.turns(rows, results / "turns.png")
     for scene, drawing in (("brick", wall_matching.draw), ("two_walls", path_following.draw),
                            ("building", whole_building.draw)):
         folders = sorted(path.parent for path in logs.glob(f"{scene}_s*/log.mcap"))
@@ -122,7 +122,7 @@ of straight ahead; complete is what share of the wall's edge pixels has a right 
 ![Points of a brick wall by three methods](brick.png)
 """
 TURNS = """## Turns (IV.F, fig. 7)
-500 corners followed from one picture to another in which the rig has turned. Right: within 3 px of where the truth has
+500 corners followed from one image to another in which the rig has turned. Right: within 3 px of where the truth has
 them. Claimed: by Lucas and Kanade's status for plain KLT, by the way back for the others. Both searches are built on
 the same KLT. The paper has 36 against 91 features at 18 degrees.
 
@@ -147,7 +147,7 @@ On the panoramas of the turns, one thread.
 REMARKS = """## What stands out
 - Enhanced SAD keeps the paper's promise: on identical bricks it is as right as a semi-global prior, and odometry on
   it is even a little more exact; it takes twice the time. Original SAD is helped here by a check from the upper
-  picture, which the paper does not have: where it has few wrong matches it has hardly any matches.
+  image, which the paper does not have: where it has few wrong matches it has hardly any matches.
 - Plain KLT does better than the paper's: with a pyramid of four levels it keeps a third to a half of the features
   through 18 degrees, so that the searches, which keep nearly all, gain a factor of 1.9 to 2.9 and not 2.5 every
   time. Beyond 70 degrees next to nothing of plain KLT is left.

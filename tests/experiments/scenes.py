@@ -19,7 +19,7 @@ from tests.simulation.textures import PAINTERS
 
 WALL_M = 2.0  # section V.B: from the cameras to the wall
 WALL_SIZE_M = (9.0, CEILING_M)
-TURNS_DEG = tuple(range(0, 181, 9))  # of the second picture of each pair of pictures
+TURNS_DEG = tuple(range(0, 181, 9))  # of the second image of each pair of images
 MOVED_TURNS_DEG = (18, 45, 90, 135, 180)  # the same with a small translation
 MOVED_M = (0.05, 0.03)
 
@@ -28,30 +28,30 @@ MOVED_M = (0.05, 0.03)
 class RigOptions:
     """What may be asked of a rig; None leaves it to the seed."""
 
-    scale: float | None = None  # radius of the horizon in the picture, 1 = 27 % of its width
+    scale: float | None = None  # radius of the horizon in the image, 1 = 27 % of its width
     baseline_m: float | None = None
-    crooked: float | None = None  # how far from straight: 0 not at all, 1 up to 1.2 deg and 4 mm
+    misaligned: float | None = None  # how far from straight: 0 not at all, 1 up to 1.2 deg and 4 mm
     xi: float = 1.0  # 1: parabolic mirrors; below: hyperbolic ones under perspective cameras
 
 
 def seeded_rig(seed: int, size: int, options: RigOptions) -> Rig:
-    """A rig with a mirror scale, a baseline and a crookedness by chance, where the options leave it."""
+    """A rig with a mirror scale, a baseline and a misalignment by chance, where the options leave it."""
     rng = np.random.default_rng([seed, 23])
     scale, baseline, tilt = rng.uniform((0.9, 0.17, 0.3), (1.05, 0.24, 1.2))
     axis, yaw, x, y = rng.uniform(0, 2 * np.pi), *rng.uniform((-1, -3, -3), (1, 3, 3))
-    crooked = 1.0 if options.crooked is None else options.crooked
-    turned = crooked * np.array([tilt * np.cos(axis), tilt * np.sin(axis), yaw])
-    # A hyperbolic mirror of the same picture shows less above the horizon: a smaller rim keeps the rays this side.
+    misaligned = 1.0 if options.misaligned is None else options.misaligned
+    turned = misaligned * np.array([tilt * np.cos(axis), tilt * np.sin(axis), yaw])
+    # A hyperbolic mirror of the same image shows less above the horizon: a smaller rim keeps the rays this side.
     rim = RIM if options.xi == 1 else min(RIM, 0.45)
     return make_rig(size=size, scale=options.scale or scale, baseline_m=options.baseline_m or baseline, rim=rim,
-                    xi=options.xi, crooked_deg=tuple(turned), offset_mm=(crooked * x, crooked * y))
+                    xi=options.xi, misaligned_deg=tuple(turned), offset_mm=(misaligned * x, misaligned * y))
 
 
 def _paper_rig(seed: int, size: int, options: RigOptions) -> Rig:
     """The paper's own, with heights of 1.2 m and 1.4 m, and straight, where the options leave it."""
-    crooked = 0.0 if options.crooked is None else options.crooked
+    misaligned = 0.0 if options.misaligned is None else options.misaligned
     return seeded_rig(seed, size, replace(options, scale=options.scale or 1.0, baseline_m=options.baseline_m or 0.2,
-                                          crooked=crooked))
+                                          misaligned=misaligned))
 
 
 def brick(seed: int, size: int, pairs: int, options: RigOptions) -> Run:

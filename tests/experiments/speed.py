@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.models.camera import Array
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.tracking import Image, Klt, track
+from omnid.core.odometry.tracking import Image, KltSettings, track
 from omnid.core.odometry.yaw_search import correlation_peaks
 from omnid.messages import Panoramas
 from tests.experiments.views import Experiment, look
@@ -60,7 +60,7 @@ def _tracked(before: Panoramas, now: Panoramas) -> object:
     points = corners(before.lower, before.visible, FEATURES)
     turn = correlation_peaks(before.lower.panorama, now.lower.panorama, now.visible, 1)[0]
     shift = np.array([turn * before.lower.width / (2 * np.pi), 0.0])
-    return track(before.lower, now.lower, points, points + shift, Klt())
+    return track(before.lower, now.lower, points, points + shift, KltSettings())
 
 
 class _Sift:

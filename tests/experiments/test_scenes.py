@@ -22,7 +22,7 @@ from tests.simulation.ray_caster import render_grey
 from tests.simulation.rigs import make_rig
 
 needs_povray = pytest.mark.skipif(not available(), reason=f"POV-Ray is not installed: {INSTALL}")
-CROOKED = (1.0, -2.0, 20.0)
+MISALIGNED = (1.0, -2.0, 20.0)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -77,16 +77,16 @@ def test_what_no_mirror_can_do_is_refused() -> None:
 @needs_povray
 @pytest.mark.parametrize(("xi", "rim"), [(1.0, 0.48), (0.9, 0.45), (0.7, 0.42)])
 def test_a_traced_mirror_shows_what_the_camera_model_says(xi: float, rim: float, tmp_path: Path) -> None:
-    """Two renderers that share nothing but the textures, a crooked camera and an optical centre off the middle."""
+    """Two renderers that share nothing but the textures, a misaligned camera and an optical centre off the middle."""
     run = build("control", 3, 192, 1)
-    rig = make_rig(size=192, xi=xi, rim=rim, crooked_deg=CROOKED, centre_px=(2.3, -3.4))
+    rig = make_rig(size=192, xi=xi, rim=rim, misaligned_deg=MISALIGNED, centre_px=(2.3, -3.4))
     write_world(tmp_path, run.scene)
     traced = shoot(tmp_path, rig.upper, run.poses[0], 3)
     model = render_grey(run.scene, rig.upper, run.poses[0], 3)
     both = cv2.erode(((traced > 0) & (model > 0)).astype(np.uint8), np.ones((21, 21), np.uint8)) > 0
     start = np.zeros((192, 192, 2), np.float32)
-    pictures = (traced.astype(np.uint8), model.astype(np.uint8))
-    flow = cv2.calcOpticalFlowFarneback(*pictures, start, 0.5, 3, 21, 3, 7, 1.5, 0)
+    images = (traced.astype(np.uint8), model.astype(np.uint8))
+    flow = cv2.calcOpticalFlowFarneback(*images, start, 0.5, 3, 21, 3, 7, 1.5, 0)
     assert both.mean() > 0.2
     assert np.median(np.abs(flow[both])) < 0.03 and np.abs(flow[both].mean(axis=0)).max() < 0.02
     assert np.corrcoef(traced[both], model[both])[0, 1] > 0.97

@@ -14,7 +14,7 @@ from omnid.config import Config
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.messages import Panoramas
 from omnid.stages.stereo import Stereo
-from tests.experiments import figures as pictures
+from tests.experiments import figures as images
 from tests.experiments.scenes import WALL_M
 from tests.experiments.truth import cast
 from tests.experiments.views import Experiment, Views, look
@@ -78,7 +78,7 @@ def draw(folder: Path, experiment: Experiment, path: Path) -> None:
     """The points of the middle pair by every method."""
     run, views = experiment.run, look(folder)
     pair = len(views.panoramas) // 2
-    pictures.wall({name: _cloud(run, views, method, pair) for name, method in METHODS.items()}, WALL_M, path)
+    images.wall({name: _cloud(run, views, method, pair) for name, method in METHODS.items()}, WALL_M, path)
 
 
 def _cloud(run: Run, views: Views, method: str, pair: int) -> Array:

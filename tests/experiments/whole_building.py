@@ -14,7 +14,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import Trajectory, read_tum
 from tests.benchmark.accuracy import omnid
-from tests.experiments import figures as pictures
+from tests.experiments import figures as images
 from tests.experiments.path_following import PAPER, against_truth
 from tests.experiments.truth import sees, surface_distance_m
 from tests.experiments.views import Experiment
@@ -57,7 +57,7 @@ def draw(folder: Path, experiment: Experiment, path: Path) -> None:
     estimate, points = _follow(folder, ())
     in_world = se3.apply(run.poses[0], points.xyz.astype(float))
     paths = {"truth": run.poses[:, :2, 3], "omnid": (run.poses[0] @ estimate.T)[:, :2, 3]}
-    pictures.floor_plan(run, in_world, paths, path)
+    images.floor_plan(run, in_world, paths, path)
 
 
 def map_errors(run: Run, points: MapPoints) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """The whole of `omnid run` under its unit: guest/daemon.py in one guest, each of its tests told of here by itself.
 
-The pictures are those of the sample log, shown by two loopback cameras; ttyS1 leads to a controller out here.
+The images are those of the sample log, shown by two loopback cameras; ttyS1 leads to a controller out here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from calib.rig_file import rig_toml
-from drivers.cameras.log_camera import Pictures
+from drivers.cameras.log_camera import LogImages
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
 from drivers.motors.simulated.simulated_line import SimulatedLine
@@ -106,14 +106,14 @@ def controller(folder: Path) -> Iterator[Controller]:
 
 
 def rig_of_the_sample() -> bytes:
-    """Its rig with the rims in it, which a daemon would look for in the first pictures."""
+    """Its rig with the rims in it, which a daemon would look for in the first images."""
     reader = LogReader(SAMPLE)
     try:
         rig = attached_rig(reader, SAMPLE)
     finally:
         reader.close()
-    pictures = Pictures.of(SAMPLE)
-    frames: list[Frame] = [frame for both in zip(pictures.lower, pictures.upper, strict=False) for _, frame in both]
+    images = LogImages.of(SAMPLE)
+    frames: list[Frame] = [frame for both in zip(images.lower, images.upper, strict=False) for _, frame in both]
     return rig_toml(with_rims(rig, frames)).encode()
 
 
@@ -143,6 +143,6 @@ def test_what_was_recorded_until_the_kill_is_made_whole(result: Result, tmp_path
     assert mended.returncode == 0, mended.stderr
     assert omnid("log", "info", whole).returncode == 0
     guest = json.loads(result.files["killed.json"])
-    found = Pictures.of(whole)
+    found = LogImages.of(whole)
     for eye in (found.lower, found.upper):
         assert len(eye) > 5 and guest["killed_ns"] - eye[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000

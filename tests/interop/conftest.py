@@ -29,5 +29,5 @@ def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture(scope="session")
 def live(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run of the daemon recorded: pictures, poses, map, states, commands to the wheels."""
+    """What a run of the daemon recorded: images, poses, map, states, commands to the wheels."""
     return recorded_run(scene, tmp_path_factory.mktemp("live"), POSES)

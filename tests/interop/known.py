@@ -84,7 +84,7 @@ def _said(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, str, b
 
 
 def _status(stamp_ns: int) -> tuple[str, str, bytes, dict[str, Any]]:
-    status = codec.Status("omnid: odometry", 1, "über 90 °C", {"landmarks": "3 of 4"})
+    status = codec.DiagnosticStatus("omnid: odometry", 1, "über 90 °C", {"landmarks": "3 of 4"})
     message = {"header": _header(stamp_ns, ""),
                "status": [{"level": 1, "name": "omnid: odometry", "message": "über 90 °C", "hardware_id": "",
                            "values": [{"key": "landmarks", "value": "3 of 4"}]}]}

@@ -62,7 +62,7 @@ def test_poses_and_transforms_are_those_that_were_written(known: Known, parts: P
         close(found["Transform3D:quaternion"][0], edge["transform"]["rotation"])
 
 
-def test_points_and_pictures_are_those_that_were_written(known: Known, parts: Parts) -> None:
+def test_points_and_images_are_those_that_were_written(known: Known, parts: Parts) -> None:
     for found, cloud in zip(parts["/omnid/cloud"], known.expected["/omnid/cloud"], strict=True):
         points = np.column_stack([found["Points3D:positions"], found["Points3D:confidence"]])
         assert points.tolist() == cloud["points"]
@@ -71,7 +71,7 @@ def test_points_and_pictures_are_those_that_were_written(known: Known, parts: Pa
     for found, image in zip(parts[lower], known.expected[lower], strict=True):
         assert found["EncodedImage:blob"] == [image["data"]]
     for found, image in zip(parts[upper], known.expected[upper], strict=True):
-        (shape,) = found["DepthImage:format"]  # so it takes all raw pictures of one channel
+        (shape,) = found["DepthImage:format"]  # so it takes all raw images of one channel
         assert found["DepthImage:buffer"] == [image["data"]] and (shape["width"], shape["height"]) == (32, 24)
 
 

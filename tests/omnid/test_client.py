@@ -21,7 +21,7 @@ from omnid.client import Cloud, Driver, Map, Pose, Report, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import cloud_from, map_from, pose_from, report_from
 from omnid.transport.pose_attachment import Note, note_bytes, note_from_bytes
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
@@ -59,7 +59,9 @@ def test_a_pose_says_where_the_robot_is_and_how_sure_that_is() -> None:
 
 
 def test_reports_and_clouds_come_back_as_they_were_said() -> None:
-    report = report_from(codec.diagnostics_cdr(5, [Status("a", 1, "so so", {"k": "v"}), Status("b", 0, "", {})]))
+    report = report_from(
+        codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"}), DiagnosticStatus("b", 0, "", {})])
+    )
     assert report.stamp_ns == 5 and [status.name for status in report.statuses] == ["a", "b"]
     assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
     points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
@@ -75,7 +77,7 @@ def test_reports_and_clouds_come_back_as_they_were_said() -> None:
 
 @pytest.mark.parametrize(("kind", "topic", "payload", "decode"), [
     (Pose, "odom", odometry(3), lambda data: pose_from(data, b"")),
-    (Report, "status", codec.diagnostics_cdr(5, [Status("a", 1, "so so", {"k": "v"})]), report_from),
+    (Report, "status", codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]), report_from),
     (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), cloud_from),
     (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), map_from),
 ])

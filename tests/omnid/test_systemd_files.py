@@ -16,7 +16,7 @@ from drivers.cameras.v4l2_devices import CaptureDevice, udev_rules
 from omnid.config import RealtimeConfig
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
-UNIT = SYSTEMD / "omnid.runs.systemd"
+UNIT = SYSTEMD / "omnid.service"
 RULES = SYSTEMD / "90-omnid.rules"
 COMMAND = "/opt/omnid/bin/omnid run --config /etc/omnid/omnid.toml"
 WORST_EXPOSURE = 3.0
@@ -29,11 +29,11 @@ with_systemd = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="a
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
     """The unit with its drop-in, of a program that is there."""
-    unit = tmp_path / "omnid.runs.systemd"
+    unit = tmp_path / "omnid.service"
     text = UNIT.read_text()
     assert text.count(f"ExecStart={COMMAND}\n") == 1
     unit.write_text(text.replace("/opt/omnid/bin/omnid", sys.executable))
-    folder = tmp_path / "omnid.runs.systemd.d"
+    folder = tmp_path / "omnid.service.d"
     folder.mkdir()
     shutil.copy(SYSTEMD / "lan.conf", folder)
     return unit
@@ -56,7 +56,7 @@ def test_the_unit_is_taken_without_a_word(installed: Path) -> None:
 
 
 @with_systemd
-@pytest.mark.parametrize("file", ["omnid.runs.systemd", "omnid.runs.systemd.d/lan.conf"])
+@pytest.mark.parametrize("file", ["omnid.service", "omnid.service.d/lan.conf"])
 def test_a_mistake_in_the_unit_would_be_told(installed: Path, file: str) -> None:
     changed = installed.parent / file
     changed.write_text(changed.read_text().replace("IPAddressAllow=", "IPAddressAllowed="))
@@ -66,7 +66,7 @@ def test_a_mistake_in_the_unit_would_be_told(installed: Path, file: str) -> None
 @with_systemd
 def test_the_unit_is_well_locked_up(installed: Path) -> None:
     done = analyze("security", "--offline=true", "--no-pager", installed)
-    found = re.search(r"Overall exposure level for omnid.runs.systemd: (\S+)", done.stdout)
+    found = re.search(r"Overall exposure level for omnid.service: (\S+)", done.stdout)
     assert found, done.stderr
     assert float(found[1]) <= WORST_EXPOSURE, done.stdout
 

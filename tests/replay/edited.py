@@ -16,8 +16,8 @@ PERIOD_NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture as a camera sent it; `pair` counts from 0, `written_ns` is when the recorder got it."""
+class Image:
+    """A image as a camera sent it; `pair` counts from 0, `written_ns` is when the recorder got it."""
 
     camera: str
     pair: int
@@ -25,30 +25,30 @@ class Picture:
     jpeg: bytes
     written_ns: int
 
-    def later(self, pairs: int) -> Picture:
-        """The same picture so many pairs later."""
+    def later(self, pairs: int) -> Image:
+        """The same image so many pairs later."""
         shift_ns = pairs * PERIOD_NS
         return replace(self, pair=self.pair + pairs, stamp_ns=self.stamp_ns + shift_ns,
                        written_ns=self.written_ns + shift_ns)
 
 
-def pictures(log: Path) -> list[Picture]:
-    """The pictures of a log, in the order of their stamps."""
+def images(log: Path) -> list[Image]:
+    """The images of a log, in the order of their stamps."""
     reader = LogReader(log)
-    taken = [Picture(f.camera, f.seq, f.stamp_ns, bytes(f.data), f.stamp_ns) for f in reader.frames()]
+    taken = [Image(f.camera, f.seq, f.stamp_ns, bytes(f.data), f.stamp_ns) for f in reader.frames()]
     reader.close()
     return taken
 
 
-def save(path: Path, taken: Iterable[Picture]) -> Path:
-    """A log of these pictures, in their order; its path."""
+def save(path: Path, taken: Iterable[Image]) -> Path:
+    """A log of these images, in their order; its path."""
     topics = {"lower": LOWER, "upper": UPPER}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.written_ns) for p in taken]
     return write_log(path, entries)
 
 
-def dark(picture: Picture) -> Picture:
+def dark(image: Image) -> Image:
     """What the camera sees when the light is off: noise."""
-    size = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape
-    night = np.random.default_rng(picture.pair).integers(0, 4, size, np.uint8)
-    return replace(picture, jpeg=cv2.imencode(".jpg", night)[1].tobytes())
+    size = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape
+    night = np.random.default_rng(image.pair).integers(0, 4, size, np.uint8)
+    return replace(image, jpeg=cv2.imencode(".jpg", night)[1].tobytes())

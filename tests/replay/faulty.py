@@ -1,6 +1,6 @@
 """`omnid run` on a log whose cameras can be spoilt: lines on the standard input say which and how.
 
-    upper mute      no more pictures          lower garbage   JPEGs of noise        both black   dark ones
+    upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
     lower cut       halves of JPEGs           both ok         as they are
     clock 3600      the time of day is that many seconds ahead
 """
@@ -20,27 +20,27 @@ import cv2
 import numpy as np
 
 from calib.rig_file import read_rig
-from drivers.cameras.log_camera import LogCamera, Pictures
+from drivers.cameras.log_camera import LogCamera, LogImages
 from drivers.frame import Camera, Frame, gray
 from omnid.config import Config
-from omnid.runs.live import Live
+from omnid.runs.live import LiveRun
 from omnid.settings import load
 
 TIME, TIME_NS = time.time, time.time_ns
 
 
 class SpoiltCamera(LogCamera):
-    """A log's camera with something done to its pictures."""
+    """A log's camera with something done to its images."""
 
-    def __init__(self, pictures: Pictures, camera: Camera, epoch_ns: int, faults: dict[str, str]) -> None:
-        super().__init__(pictures, camera, epoch_ns)
+    def __init__(self, images: LogImages, camera: Camera, epoch_ns: int, faults: dict[str, str]) -> None:
+        super().__init__(images, camera, epoch_ns)
         self._camera, self._faults = camera, faults
-        first = gray((pictures.lower if camera == "lower" else pictures.upper)[0][1])
+        first = gray((images.lower if camera == "lower" else images.upper)[0][1])
         self._black = cv2.imencode(".jpg", np.zeros_like(first))[1].tobytes()
         self._rng = random.Random(1)
 
     def frames(self) -> Iterator[Frame]:
-        """The pictures, spoilt."""
+        """The images, spoilt."""
         for frame in super().frames():
             fault = self._faults.get(self._camera, "ok")
             if fault != "mute":
@@ -83,9 +83,9 @@ def main() -> int:
     args = parser.parse_args()
     faults: dict[str, str] = {}
     threading.Thread(target=obey, args=(faults,), daemon=True).start()
-    pictures, epoch_ns = Pictures.of(args.log), time.monotonic_ns()
+    images, epoch_ns = LogImages.of(args.log), time.monotonic_ns()
     config = load(Config, None, [*args.settings, f"motor.port={args.motor}"])
-    live = Live(config, lambda camera: SpoiltCamera(pictures, camera, epoch_ns, faults),
+    live = LiveRun(config, lambda camera: SpoiltCamera(images, camera, epoch_ns, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()
 

@@ -201,7 +201,7 @@ class Daemon:
 
 
 def command_line(scene: Path, port: int, motor: Path | None, *words: object, module: str = "omnid") -> list[str]:
-    """`omnid run` on the pictures of a scene."""
+    """`omnid run` on the images of a scene."""
     run = [] if module != "omnid" else ["run"]
     log = ["--log", scene / "log.mcap", "--rig", scene / "rig.toml"]
     wheels = [] if motor is None else ["--motor", motor]

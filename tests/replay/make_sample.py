@@ -23,7 +23,7 @@ from drivers.logs.mcap_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter
 
 SIDE_PX = 512
-QUALITY = 70  # 198 pictures in less than 7.5 MB
+QUALITY = 70  # 198 images in less than 7.5 MB
 SCHEMA = "sensor_msgs/msg/CompressedImage"
 
 
@@ -44,18 +44,18 @@ def main() -> None:
 
 
 def message(frame: Frame, quality: int) -> bytes:
-    """The frame's picture, shrunk, as CDR."""
+    """The frame's image, shrunk, as CDR."""
     small = cv2.resize(gray(frame), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1])[1]
     store = get_typestore(Stores.ROS2_HUMBLE)
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(frame.stamp_ns, 10**9))
     header = store.types["std_msgs/msg/Header"](stamp, frame.camera)
-    picture = store.types[SCHEMA](header, "jpeg", np.asarray(jpeg).reshape(-1))
-    return bytes(store.serialize_cdr(picture, SCHEMA))
+    image = store.types[SCHEMA](header, "jpeg", np.asarray(jpeg).reshape(-1))
+    return bytes(store.serialize_cdr(image, SCHEMA))
 
 
 def smaller(rig: Rig) -> Rig:
-    """The rig of the smaller pictures."""
+    """The rig of the smaller images."""
     return replace(rig, lower=_smaller(rig.lower), upper=_smaller(rig.upper))
 
 

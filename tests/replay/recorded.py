@@ -8,7 +8,7 @@ from tests.replay.live import Base, Operator, answers, command_line, free_port, 
 
 
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
-    """The recording of so many poses and more, with pictures slow enough that an idle machine drops none."""
+    """The recording of so many poses and more, with images slow enough that an idle machine drops none."""
     port, base, kept = free_port(), Base(folder), folder / "kept"
     more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={kept}", "--set",
             "record.free_mb=0")

@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import Entry, text, write_log
 from tests.replay.command import Command, rows
-from tests.replay.edited import pictures, save
+from tests.replay.edited import images, save
 
 
 @pytest.mark.parametrize("content", [b"", b"omnid\n" * 1000, bytes(range(256)) * 64])
@@ -28,7 +28,7 @@ def test_no_such_log(omnid: Command, tmp_path: Path) -> None:
 
 
 def test_truncated_log_is_used_as_far_as_it_is_whole(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    log, tum = save(tmp_path / "log.mcap", pictures(scene / "log.mcap")), tmp_path / "est.txt"
+    log, tum = save(tmp_path / "log.mcap", images(scene / "log.mcap")), tmp_path / "est.txt"
     whole = log.read_bytes()
     log.write_bytes(whole[: len(whole) * 6 // 10])
     code, out, err = result = omnid.replay(log, "--tum", tum, rig=scene / "rig.toml")
@@ -44,7 +44,7 @@ def test_no_image_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
 
 @pytest.mark.parametrize("camera", ["lower", "upper"])
 def test_one_camera_only(omnid: Command, tmp_path: Path, scene: Path, camera: str) -> None:
-    log = save(tmp_path / "log.mcap", [p for p in pictures(scene / "log.mcap") if p.camera == camera])
+    log = save(tmp_path / "log.mcap", [p for p in images(scene / "log.mcap") if p.camera == camera])
     missing = {"lower": "upper", "upper": "lower"}[camera]
     assert f"no {missing} camera" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
 
@@ -72,8 +72,8 @@ def test_broken_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
 
 
 def test_broken_jpegs_are_counted_and_skipped(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = pictures(scene / "log.mcap")
-    broken = {0: b"", 9: b"no picture at all", 20: taken[20].jpeg[: len(taken[20].jpeg) // 2]}
+    taken = images(scene / "log.mcap")
+    broken = {0: b"", 9: b"no image at all", 20: taken[20].jpeg[: len(taken[20].jpeg) // 2]}
     log = save(tmp_path / "log.mcap", [replace(p, jpeg=broken.get(i, p.jpeg)) for i, p in enumerate(taken)])
     result = omnid.replay(log, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("broken") == 3
@@ -82,14 +82,14 @@ def test_broken_jpegs_are_counted_and_skipped(omnid: Command, tmp_path: Path, sc
 
 
 def test_all_jpegs_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    log = save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in pictures(scene / "log.mcap")])
+    log = save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in images(scene / "log.mcap")])
     result = omnid.replay(log, "--tum", tmp_path / "t", "--map", tmp_path / "m", rig=scene / "rig.toml")
     assert result.code == 1 and result.count("broken") == 2 * PAIRS and result.count("pairs") == 0
     assert "not one pair" in result.err
 
 
 def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = pictures(scene / "log.mcap")
+    taken = images(scene / "log.mcap")
     delays = random.Random(1)
     shuffled = sorted(taken, key=lambda p: p.pair + delays.uniform(0, 5))
     assert [p.stamp_ns for p in shuffled] != sorted(p.stamp_ns for p in shuffled)
@@ -99,8 +99,8 @@ def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene:
     assert (tmp_path / "est.txt").read_bytes() == (tmp_path / "shuffled.txt").read_bytes()
 
 
-def test_late_and_double_pictures_are_counted(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = pictures(scene / "log.mcap")
+def test_late_and_double_images_are_counted(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = images(scene / "log.mcap")
     late, rest = taken[10], taken[:10] + taken[11:]
     log = save(tmp_path / "log.mcap", [*rest[:8], rest[7], *rest[8:40], late, *rest[40:]])
     result = omnid.replay(log, "--set", "log.reorder_frames=8", rig=scene / "rig.toml")
@@ -148,7 +148,7 @@ def test_nothing_that_is_read_is_written_over(omnid: Command, tmp_path: Path, sc
 
 
 def test_a_run_without_a_pair_leaves_what_was_there(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Refused when the first picture comes, or ended without one: yesterday's results stay."""
+    """Refused when the first image comes, or ended without one: yesterday's results stay."""
     rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
     (tmp_path / "other.toml").write_text(rig)
     kept = {option: tmp_path / option for option in ("--tum", "--map", "--plan", "--record")}
@@ -156,7 +156,7 @@ def test_a_run_without_a_pair_leaves_what_was_there(omnid: Command, tmp_path: Pa
         path.write_text("yesterday's work")
     files = [word for option, path in kept.items() for word in (option, path)]
     omnid.refused("replay", scene / "log.mcap", "--quiet", "--rig", tmp_path / "other.toml", *files)
-    save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in pictures(scene / "log.mcap")])
+    save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in images(scene / "log.mcap")])
     omnid.replay(tmp_path / "log.mcap", *files, rig=scene / "rig.toml")
     assert [path.read_text() for path in kept.values()] == ["yesterday's work"] * 4
 
@@ -189,7 +189,7 @@ def test_too_little_to_see(omnid: Command, scene: Path, setting: str) -> None:
                                        setting)
 
 
-def test_disparities_beyond_the_picture(omnid: Command, scene: Path) -> None:
+def test_disparities_beyond_the_image(omnid: Command, scene: Path) -> None:
     result = omnid.replay(scene / "log.mcap", "--set", "stereo.matching.disparities=512", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS
 

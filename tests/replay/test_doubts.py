@@ -11,9 +11,9 @@ import pytest
 from calib.rig_file import read_rig, write_rig
 from omnid.formats.tum import read_tum
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image, write_log
+from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
 from tests.replay.command import Command
-from tests.replay.edited import dark, pictures, save
+from tests.replay.edited import dark, images, save
 
 
 def test_exchanged_cameras_are_noticed(omnid: Command, scene: Path) -> None:
@@ -35,21 +35,21 @@ def test_a_rig_upside_down_knows_its_topics(omnid: Command, tmp_path: Path, scen
 
 @pytest.mark.parametrize(("apart_ns", "said"), [(12_000_000, "ms apart at best"), (3600 * 10**9, "clocks")])
 def test_stamps_apart(omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, said: str) -> None:
-    taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in pictures(scene / "log.mcap")]
+    taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
     assert result.code == 1 and said in result.err and "pair.tolerance_ms" in result.err
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
-def test_most_pictures_without_a_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_most_images_without_a_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
-             for p in pictures(scene / "log.mcap")]
+             for p in images(scene / "log.mcap")]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
 
 
 def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    log = save(tmp_path / "log.mcap", map(dark, pictures(scene / "log.mcap")))
+    log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
 
@@ -57,8 +57,13 @@ def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Pa
 def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
     plain = np.zeros((256, 256, 2), np.uint8)
     topics = {"lower": "/lower/image_raw", "upper": "/upper/image_raw"}
-    log = write_log(tmp_path / "log.mcap", [Entry(topics[p.camera], IMAGE, image(p.stamp_ns, "bayer_rggb8", plain), 1)
-                                            for p in pictures(scene / "log.mcap")])
+    log = write_log(
+        tmp_path / "log.mcap",
+        [
+            Entry(topics[p.camera], IMAGE, image_message(p.stamp_ns, "bayer_rggb8", plain), 1)
+            for p in images(scene / "log.mcap")
+        ],
+    )
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and "'bayer_rggb8'" in result.err and "rgb8" in result.err
 
@@ -66,6 +71,6 @@ def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, sc
 def test_a_rim_that_is_not_found_is_said(omnid: Command, tmp_path: Path, scene: Path) -> None:
     rig = read_rig(scene / "rig.toml")
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, mask=None)))
-    log = save(tmp_path / "log.mcap", map(dark, pictures(scene / "log.mcap")))
+    log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=tmp_path / "rig.toml")
     assert "no rim" in result.err and "[upper.mask]" in result.err and "[lower.mask]" not in result.err

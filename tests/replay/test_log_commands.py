@@ -25,14 +25,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from drivers.cameras.log_camera import LogCamera, Pictures
+from drivers.cameras.log_camera import LogCamera, LogImages
 from omnid.config import Config
 from omnid.runs.record import record
 
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()
 config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
-pictures = Pictures.of(log)
+images = LogImages.of(log)
 start_ns = time.monotonic_ns()
 
 class Camera(LogCamera):
@@ -42,13 +42,13 @@ class Camera(LogCamera):
             os.write(1, line.encode())  # whole, whoever else writes
             yield frame
 
-cameras = {name: Camera(pictures, name, start_ns, pace=3.0) for name in ("lower", "upper")}
+cameras = {name: Camera(images, name, start_ns, pace=3.0) for name in ("lower", "upper")}
 record(cameras, config, rig.read_text(), lambda *_: None)
 """
 
 
 def recording(scene: Path, folder: Path) -> subprocess.Popen[str]:
-    """A program that records the scene at 30 pictures a second of either camera, and prints their stamps."""
+    """A program that records the scene at 30 images a second of either camera, and prints their stamps."""
     command = [sys.executable, "-c", RECORDS, str(scene / "log.mcap"), str(scene / "rig.toml"), str(folder)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 

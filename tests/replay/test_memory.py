@@ -15,10 +15,10 @@ from calib.rig_file import parse_rig
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph
-from omnid.messages import Odometry
-from omnid.runs.pipeline import Ends, wire
+from omnid.messages import OdometryUpdate
+from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.log_pairing import PairSync
@@ -43,7 +43,7 @@ class Watch:
     def __init__(self) -> None:
         self.mib: dict[int, float] = {}
 
-    def process(self, odometry: Odometry) -> None:
+    def process(self, odometry: OdometryUpdate) -> None:
         if odometry.seq % 100 == 99:
             status = Path("/proc/self/status").read_text().split("VmRSS:")[1]
             self.mib[odometry.seq + 1] = int(status.split()[0]) / 1024
@@ -55,10 +55,10 @@ def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
     reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
     config, frames = Config(), list(reader.frames())
     place = geometry(with_rims(parse_rig(reader.attachments()["rig.toml"]), frames), config.panorama)
-    watch, tally = Watch(), Tally()
+    watch, tally = Watch(), RunStatistics()
     poses = {"watch": watch, "tally": tally, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
-    ends = Ends(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
+    ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
     wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
     graph.run()

@@ -17,14 +17,14 @@ from omnid.config import Config
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.replay import Options, Replay
+from omnid.runs.replay import Options, ReplayRun
 from omnid.settings import load, parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import map_from, report_from
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
-from tests.replay.edited import pictures
+from tests.replay.edited import images
 
 METHODS = ([], ["--method", "paper"], ["--method", "paper", "--tracker", "klt"])
 
@@ -121,7 +121,7 @@ def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, 
     """A log that holds its rig needs no --rig: the sample's way."""
     topics = {"lower": LOWER, "upper": UPPER}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-               for p in pictures(scene / "log.mcap")]
+               for p in images(scene / "log.mcap")]
     log = write_log(tmp_path / "log.mcap", entries, [("rig.toml", (scene / "rig.toml").read_bytes())])
     for name, source, rig in (("a", log, None), ("b", scene / "log.mcap", scene / "rig.toml")):
         assert omnid.replay(source, "--tum", tmp_path / name, rig=rig).code == 0
@@ -132,7 +132,7 @@ def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: P
     """Names that do not tell the cameras apart: the options do, and so does a rig that names its topics."""
     topics = {"lower": "/cam0", "upper": "/cam1"}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-               for p in pictures(scene / "log.mcap")]
+               for p in images(scene / "log.mcap")]
     log = write_log(tmp_path / "log.mcap", entries)
     assert "--lower" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
     write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), topics=("/cam0", "/cam1")))
@@ -149,7 +149,7 @@ def test_a_taken_port_silences_the_demo_only(omnid: Command, tmp_path: Path, sce
     words = ("--rig", scene / "rig.toml", "--quiet", "--publish", "--set", listen)
     assert "bus" in omnid.refused("replay", scene / "log.mcap", *words)
     options = Options(tum=tmp_path / "est.txt", publish=True, bus_optional=True, quiet=True)
-    code = Replay(scene / "log.mcap", load(Config, None, [listen]), options).run(scene / "rig.toml", (None, None))
+    code = ReplayRun(scene / "log.mcap", load(Config, None, [listen]), options).run(scene / "rig.toml", (None, None))
     assert code == 0 and len(rows(tmp_path / "est.txt")) == PAIRS
     assert "going on without a bus" in capsys.readouterr().err
 

@@ -72,7 +72,7 @@ def test_all_that_is_said_is_in_it_with_rig_and_settings(
 
 
 def test_its_stamps_agree(messages: list[Message]) -> None:
-    """What omnid says is logged at its own stamp; a pose has that of a picture of the lower camera."""
+    """What omnid says is logged at its own stamp; a pose has that of a image of the lower camera."""
     assert all(message.log_ns == message.stamp_ns for message in messages if message.topic in SAID)
     lower = {message.stamp_ns for message in of(messages, IMAGES[0])}
     poses = [message.stamp_ns for message in of(messages, "/omnid/odom")]
@@ -93,7 +93,7 @@ def test_every_pose_is_told_alike(messages: list[Message]) -> None:
 
 
 def test_a_replay_of_it_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
-    """Its own pictures, rig and attachments are all that the replay is given."""
+    """Its own images, rig and attachments are all that the replay is given."""
     again = tmp_path / "again.mcap"
     assert omnid.replay(recording, "--record", again).code == 0
     code, out, err = omnid("diff", recording, again, *COMPARABLE)

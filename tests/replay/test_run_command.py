@@ -76,10 +76,10 @@ def test_one_camera_gone_and_back(tmp_path: Path, scene: Path) -> None:
         operator.drive()
         wait_until(lambda: base.drives, "motion")
         daemon.tell("upper mute")
-        wait_until(lambda: operator.message("pairing") == "no pictures of the upper camera", "the word which is gone")
+        wait_until(lambda: operator.message("pairing") == "no images of the upper camera", "the word which is gone")
         wait_until(lambda: operator.message("odometry").startswith("no pose for"), "stale odometry")
         wait_until(lambda: not base.drives, "the stop")
-        assert operator.message("upper camera").startswith("no picture for")
+        assert operator.message("upper camera").startswith("no image for")
         assert operator.message("lower camera") == "streaming"
         daemon.tell("upper ok")
         wait_until(lambda: base.drives, "motion without anybody's help")

@@ -13,7 +13,7 @@ from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
-from tests.replay.edited import dark, pictures, save
+from tests.replay.edited import dark, images, save
 
 NIGHT = 20  # pairs, 2 s
 
@@ -41,7 +41,7 @@ def errors_m(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
 
 
 def test_camera_silent_for_a_second(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = [p for p in pictures(scene / "log.mcap") if p.camera == "lower" or not 7 <= p.pair < 17]
+    taken = [p for p in images(scene / "log.mcap") if p.camera == "lower" or not 7 <= p.pair < 17]
     log = save(tmp_path / "log.mcap", taken)
     result = omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
     assert result.count("unpaired_lower") == 10 and result.count("pairs") == PAIRS - 10
@@ -52,7 +52,7 @@ def test_camera_silent_for_a_second(omnid: Command, tmp_path: Path, scene: Path)
 
 
 def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = pictures(scene / "log.mcap")
+    taken = images(scene / "log.mcap")
     day, evening = [p for p in taken if p.pair < 12], [p for p in taken if p.pair == 11]
     night = [dark(p.later(1 + k)) for k in range(NIGHT) for p in evening]
     morning = [p.later(NIGHT) for p in taken if p.pair >= 12]
@@ -70,7 +70,7 @@ def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) ->
 
 
 def test_another_world_after_the_darkness(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
-    before, after = pictures(scene / "log.mcap"), pictures(elsewhere / "log.mcap")
+    before, after = images(scene / "log.mcap"), images(elsewhere / "log.mcap")
     night = [dark(p.later(1 + k)) for k in range(NIGHT) for p in before[:2]]
     log = save(tmp_path / "log.mcap", [*before[:2], *night, *(p.later(1 + NIGHT) for p in after)])
     omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")

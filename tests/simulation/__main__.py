@@ -17,7 +17,7 @@ def main() -> None:
     parser.add_argument("name", choices=sorted(RECIPES))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for log.mcap, camchain.yaml and truth.txt")
-    parser.add_argument("--size", type=int, default=768, help="width and height of the pictures [px]")
+    parser.add_argument("--size", type=int, default=768, help="width and height of the images [px]")
     parser.add_argument("--pairs", type=int, help="number of stereo pairs")
     parser.add_argument("--supersample", type=int, default=3, help="samples per pixel and axis")
     arguments = parser.parse_args()

@@ -23,9 +23,9 @@ MARGIN_SQUARES = 1.0  # white around the squares
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture (H, W) uint8 of a board, the truth about it: corners (N, 2) [px] and T_cam_board (4, 4)."""
+    """A image (H, W) uint8 of a board, the truth about it: corners (N, 2) [px] and T_cam_board (4, 4)."""
 
-    picture: NDArray[np.uint8]
+    image: NDArray[np.uint8]
     corners: Array
     T_cam_board: Array
 
@@ -75,7 +75,7 @@ def board_pose(ray: Array, distance_m: float, tilt_rad: Array, board: Board) -> 
 
 @dataclass(frozen=True)
 class Studio:
-    """A camera with its mask on a rig, and a board; its rays are cast once for all its pictures."""
+    """A camera with its mask on a rig, and a board; its rays are cast once for all its images."""
 
     board: Board
     mounted: MountedCamera
@@ -88,7 +88,7 @@ class Studio:
     def photograph(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
                    contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0,
                    walls: Sequence[Rectangle] | None = None) -> Shot:
-        """The picture taken of the board among noisy walls, or others; shadow: what part of it is darkened to."""
+        """The image taken of the board among noisy walls, or others; shadow: what part of it is darkened to."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
         texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow

@@ -38,7 +38,7 @@ def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, R
 
 
 def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rectangle]:
-    """Pictures at random places of a wall, one per equal stretch so that they do not overlap; named poster<number>."""
+    """Images at random places of a wall, one per equal stretch so that they do not overlap; named poster<number>."""
     stretch, hung = on.width_m / max(count, 1), []
     for i in range(count):
         width = min(rng.uniform(0.25, 0.6), 0.8 * stretch)
@@ -46,7 +46,7 @@ def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rect
         left = i * stretch + rng.uniform(0, stretch - width)
         top = rng.uniform(0.5, CEILING_M - 0.9 - height)
         texture = textures.poster(rng, (round(width * 500), round(height * 500)))
-        hung.append(on.picture(texture, (left, top, width, height), f"poster{first + i}"))
+        hung.append(on.image(texture, (left, top, width, height), f"poster{first + i}"))
     return hung
 
 
@@ -74,7 +74,7 @@ def _enclosed(rng: Random, kinds: tuple[str, ...], low: Point, high: Point) -> l
     return [*walls, *_flat(rng, kinds[4], low, high)]
 
 
-def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = None, pictures: int = 6) -> Scene:
+def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = None, images: int = 6) -> Scene:
     """Two walls 1.5 to 3 m apart along x with end walls, floor, ceiling, posters and a few low boxes.
 
     x runs from -2 to length_m - 2, y = 0 lies between the walls. kinds: textures of the left, right, front and back
@@ -87,7 +87,7 @@ def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = N
         kinds = (*pair, str(rng.choice(["brick", "granite"])), str(rng.choice(["granite", "plaster"])), "tiles")
     left, right = rng.uniform(0.9, 1.6), -rng.uniform(0.8, 1.4)
     space = _enclosed(rng, kinds, (-2.0, right), (length_m - 2.0, left))
-    long, short = max(1, round(pictures * length_m / 8)), min(pictures, 2)
+    long, short = max(1, round(images * length_m / 8)), min(images, 2)
     hung: list[Rectangle] = []
     for side, count in zip(space[:4], (long, long, short, short), strict=True):
         hung += posters(rng, side, count, len(hung))

@@ -22,17 +22,17 @@ from tests.simulation.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
-ARRIVAL_NS = 3_000_000  # a picture reaches the recorder this long after its stamp
+ARRIVAL_NS = 3_000_000  # a image reaches the recorder this long after its stamp
 SKEW_NS = 2_000_000  # the two cameras' stamps differ by at most this
 SCHEMA = "sensor_msgs/msg/CompressedImage"
 Stamps = NDArray[np.int64]  # [ns]
-Pictures = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
-Look = Callable[[int, int], Floats]  # the ideal picture (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper)
+Images = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
+Look = Callable[[int, int], Floats]  # the ideal image (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper)
 
 
 def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
               supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
-    """Casts both cameras' pictures at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder."""
+    """Casts both cameras' images at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder."""
     cameras = (rig.lower, rig.upper)
 
     def look(pair: int, camera: int) -> Floats:
@@ -43,9 +43,9 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
 
 def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor | None = None, seed: int = 0,
              progress: Callable[[int, int], None] | None = None) -> None:
-    """Writes the log of a run at poses T_world_rig (N, 4, 4), and its truth, from ideal pictures that are looked up.
+    """Writes the log of a run at poses T_world_rig (N, 4, 4), and its truth, from ideal images that are looked up.
 
-    rig.toml knows the rims only; where struts or a hub hide something, rig_masked.toml knows those too. Both pictures
+    rig.toml knows the rims only; where struts or a hub hide something, rig_masked.toml knows those too. Both images
     of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor
         lower, upper = (_masked(m, e) for m, e in zip((rig.lower, rig.upper), exposures, strict=True))
         write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
 
-    def pictures() -> Pictures:
+    def images() -> Images:
         for i in range(len(poses)):
             both = [e.jpeg(e.expose(look(i, k), rng)) for k, e in enumerate(exposures)]
             yield i, both[0], both[1]
@@ -70,11 +70,11 @@ def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor
                 progress(i + 1, len(poses))
 
     # Whoever finds log.mcap finds it whole.
-    _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), pictures())
+    _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
     (folder / "log.mcap.part").replace(folder / "log.mcap")
 
 
-def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], pictures: Pictures) -> None:
+def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], images: Images) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     Image, Header = store.types[SCHEMA], store.types["std_msgs/msg/Header"]
     Time = store.types["builtin_interfaces/msg/Time"]
@@ -84,7 +84,7 @@ def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], pictures: P
         definition, _ = store.generate_msgdef(SCHEMA, ros_version=2)
         schema = writer.register_schema(SCHEMA, "ros2msg", definition.encode())
         channels = [writer.register_channel(topic, "cdr", schema) for topic in rig.topics]
-        for i, *jpegs in pictures:
+        for i, *jpegs in images:
             pair = [(int(stamps[k][i]), k) for k in (0, 1)]
             for stamp, k in sorted(pair):
                 header = Header(Time(*divmod(stamp, 10**9)), ("lower", "upper")[k])

@@ -19,7 +19,7 @@ from tests.simulation.surfaces import Rectangle, Scene
 
 Floats = NDArray[np.float32]
 TILE_PX = 32
-REMAP_COLUMNS = 1024  # cv2.remap takes pictures, not lists: samples are folded into rows of this length
+REMAP_COLUMNS = 1024  # cv2.remap takes images, not lists: samples are folded into rows of this length
 RAY_CHUNK = 1 << 18
 MAX_TABLES = 6
 
@@ -28,11 +28,11 @@ MAX_TABLES = 6
 class RayTable:
     """The rays of one camera's visible samples, sorted by tile; N samples, M tiles."""
 
-    shape: tuple[int, int]  # (height, width) of the picture without supersampling
+    shape: tuple[int, int]  # (height, width) of the image without supersampling
     supersample: int
     rays: Floats  # (3, N) unit, camera frame
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
-    index: NDArray[np.int64]  # (N,) into the flattened supersampled picture
+    index: NDArray[np.int64]  # (N,) into the flattened supersampled image
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
     axes: Array  # (M, 3) unit
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
@@ -89,12 +89,12 @@ def _remembered_table(mounted: MountedCamera, supersample: int) -> RayTable:
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
-    """The picture (H, W) uint8 of the camera on a rig that stands at T_world_rig; 0 outside the mask."""
+    """The image (H, W) uint8 of the camera on a rig that stands at T_world_rig; 0 outside the mask."""
     return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
 
 
 def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
-    """The picture (H, W) float32 before any sensor, 0 to 255; 0 outside the mask and where no rectangle is hit."""
+    """The image (H, W) float32 before any sensor, 0 to 255; 0 outside the mask and where no rectangle is hit."""
     table = _remembered_table(mounted, supersample)
     T_world_cam = T_world_rig @ se3.inverse(mounted.T_cam_rig)
     hits = _Hits.nothing(table.rays.shape[1])
@@ -189,5 +189,5 @@ def _bilinear(texture: Floats, u: Floats, v: Floats) -> Floats:
     maps = np.zeros((2, rows * REMAP_COLUMNS), np.float32)
     maps[0, :len(u)], maps[1, :len(u)] = u * width - 0.5, v * height - 0.5
     map_u, map_v = maps.reshape(2, rows, REMAP_COLUMNS)
-    picture = cv2.remap(texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(picture.ravel()[:len(u)], np.float32)
+    image = cv2.remap(texture, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(image.ravel()[:len(u)], np.float32)

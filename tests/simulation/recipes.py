@@ -28,17 +28,17 @@ class Run:
     sensor: Sensor = field(default_factory=Sensor)
 
 
-Recipe = Callable[[int, int, int], Run]  # (seed, picture size, pairs)
+Recipe = Callable[[int, int, int], Run]  # (seed, image size, pairs)
 
 
 def mild_rig(seed: int, size: int) -> Rig:
-    """A rig with a mirror scale, a baseline and a little crookedness of its own per seed."""
+    """A rig with a mirror scale, a baseline and a little misalignment of its own per seed."""
     rng = np.random.default_rng([seed, 7])
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
     turned, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
     x, y = rng.uniform(-4, 4, 2)
     return make_rig(size=size, scale=float(scale), baseline_m=float(baseline), offset_mm=(x, y),
-                    crooked_deg=(turned[0], turned[1], turned[2]), lower_crooked_deg=(lower[0], lower[1], 0.0))
+                    misaligned_deg=(turned[0], turned[1], turned[2]), lower_misaligned_deg=(lower[0], lower[1], 0.0))
 
 
 def two_walls(seed: int, size: int, pairs: int) -> Run:
@@ -47,10 +47,10 @@ def two_walls(seed: int, size: int, pairs: int) -> Run:
     return Run(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
-def crooked(seed: int, size: int, pairs: int) -> Run:
+def misaligned(seed: int, size: int, pairs: int) -> Run:
     """15 cm steps with viewpoints and cameras turned about every axis; the rig frame is neither camera's."""
-    rig = make_rig(size=size, scale=0.95, baseline_m=0.16, crooked_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
-                   lower_crooked_deg=(-0.7, 0.6, 25.0), lower_offset_mm=(30.0, -20.0), centre_px=(1.7, -2.4))
+    rig = make_rig(size=size, scale=0.95, baseline_m=0.16, misaligned_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
+                   lower_misaligned_deg=(-0.7, 0.6, 25.0), lower_offset_mm=(30.0, -20.0), centre_px=(1.7, -2.4))
     poses = paths.spline_path(seed, pairs, 0.15)
     return Run(rig, poses, corridor(seed, max(8.0, 0.15 * pairs + 3.2)))
 
@@ -63,7 +63,7 @@ def turns(seed: int, size: int, pairs: int) -> Run:
 
 
 def struts(seed: int, size: int, pairs: int) -> Run:
-    """two_walls through a mirror on three struts with a hub, an uneven picture and changing light."""
+    """two_walls through a mirror on three struts with a hub, an uneven image and changing light."""
     run = two_walls(seed, size, pairs)
     sensor = Sensor(strut_angles_deg=(35.0, 155.0, 275.0), hub=0.07, vignette=0.3, flicker=0.03)
     return Run(run.rig, run.poses, run.scene, sensor)
@@ -93,8 +93,8 @@ def back(seed: int, size: int, pairs: int) -> Run:
 
 
 def plain(seed: int, size: int, pairs: int) -> Run:
-    """Bare walls and floor, a few pictures and boxes, a tiled ceiling: a pose must be called degraded, not guessed."""
-    scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, pictures=2)
+    """Bare walls and floor, a few images and boxes, a tiled ceiling: a pose must be called degraded, not guessed."""
+    scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, images=2)
     return Run(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.05), scene)
 
 
@@ -104,7 +104,7 @@ def spin(seed: int, size: int, pairs: int) -> Run:
 
 
 RECIPES: dict[str, tuple[Recipe, int]] = {  # and how many pairs it has unless told otherwise
-    "two_walls": (two_walls, 99), "crooked": (crooked, 33), "turns": (turns, 11), "struts": (struts, 99),
+    "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
     "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
     "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
 }

@@ -1,4 +1,4 @@
-"""Rigs of two cameras that look up into mirrors, as crooked as asked."""
+"""Rigs of two cameras that look up into mirrors, as misaligned as asked."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 
-HORIZON = 207.5676 / 768  # radius of the horizon at scale 1, of the picture's width
+HORIZON = 207.5676 / 768  # radius of the horizon at scale 1, of the image's width
 RIM = 373.0 / 768  # radius of the mirror's rim
 TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
-# The picture's centre shows the floor; up in the picture is forward, and the mirror's flip is in fu < 0.
+# The image's centre shows the floor; up in the image is forward, and the mirror's flip is in fu < 0.
 R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
 def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, rim: float = RIM, xi: float = 1.0,
-             crooked_deg: tuple[float, float, float] = (0, 0, 0), offset_mm: tuple[float, float] = (0, 0),
-             lower_crooked_deg: tuple[float, float, float] = (0, 0, 0),
+             misaligned_deg: tuple[float, float, float] = (0, 0, 0), offset_mm: tuple[float, float] = (0, 0),
+             lower_misaligned_deg: tuple[float, float, float] = (0, 0, 0),
              lower_offset_mm: tuple[float, float] = (0, 0),
              distortion: tuple[float, float, float, float] = (0, 0, 0, 0),
              centre_px: tuple[float, float] = (0, 0)) -> Rig:
     """A rig whose frame is the lower viewpoint's, z up, unless lower_* says otherwise.
 
-    crooked_deg: rotation vector, in the rig frame, that turns the upper camera about its viewpoint, which lies
+    misaligned_deg: rotation vector, in the rig frame, that turns the upper camera about its viewpoint, which lies
     offset_mm (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves
-    the optical centre (and the rim) off the picture's centre.
+    the optical centre (and the rim) off the image's centre.
     """
     focal = HORIZON * size * scale * (xi if xi > 0 else 1.0)
     centre = ((size - 1) / 2 + centre_px[0], (size - 1) / 2 + centre_px[1])
     camera = UnifiedCamera(xi, (-focal, focal), centre, (size, size), distortion)
     mask = Mask(centre, 0.0, rim * size)
-    lower = MountedCamera(camera, _T_cam_rig(lower_crooked_deg, (*lower_offset_mm, 0.0)), mask)
-    upper = MountedCamera(camera, _T_cam_rig(crooked_deg, (*offset_mm, 1e3 * baseline_m)), mask)
+    lower = MountedCamera(camera, _T_cam_rig(lower_misaligned_deg, (*lower_offset_mm, 0.0)), mask)
+    upper = MountedCamera(camera, _T_cam_rig(misaligned_deg, (*offset_mm, 1e3 * baseline_m)), mask)
     return Rig(lower, upper, topics=TOPICS)
 
 
-def _T_cam_rig(crooked_deg: tuple[float, float, float], viewpoint_mm: tuple[float, float, float]) -> Array:
-    R = se3.rotation_exp(np.deg2rad(crooked_deg)) @ R_RIG_CAM
+def _T_cam_rig(misaligned_deg: tuple[float, float, float], viewpoint_mm: tuple[float, float, float]) -> Array:
+    R = se3.rotation_exp(np.deg2rad(misaligned_deg)) @ R_RIG_CAM
     return se3.inverse(se3.transform(R, 1e-3 * np.array(viewpoint_mm)))
 
 

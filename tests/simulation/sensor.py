@@ -1,4 +1,4 @@
-"""What a real camera adds to an ideal picture: blur, struts, hub, vignette, changing light, noise, JPEG."""
+"""What a real camera adds to an ideal image: blur, struts, hub, vignette, changing light, noise, JPEG."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EDGE_STEPS = 4  # samples per pixel and axis of a strut's edge
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """All faults of a camera; lengths are fractions of the picture's width, angles in the picture."""
+    """All faults of a camera; lengths are fractions of the image's width, angles in the image."""
 
     noise_sigma: float = 1.5
     blur_px: float = 0.5
@@ -59,11 +59,11 @@ class Exposure:
 
     @staticmethod
     def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Exposure:
-        """The exposure of a camera with that mask and picture size (width, height)."""
+        """The exposure of a camera with that mask and image size (width, height)."""
         return Exposure(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
 
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The picture (H, W) uint8 the sensor gives of an ideal one."""
+        """The image (H, W) uint8 the sensor gives of an ideal one."""
         s = self.sensor
         gain = max(0.0, 1 + s.flicker * float(rng.standard_normal()))
         grey = (ideal * self.falloff * np.float32(gain)) * (1 - self.hidden) + FITTING_GREY * self.hidden
@@ -72,7 +72,7 @@ class Exposure:
         noise = s.noise_sigma * rng.standard_normal(grey.shape, dtype=np.float32)
         return np.clip(np.rint(grey * (1 - s.black_level / 255) + s.black_level + noise), 0, 255).astype(np.uint8)
 
-    def jpeg(self, picture: NDArray[np.uint8]) -> bytes:
-        """The picture as grey JPEG."""
-        _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, self.sensor.jpeg_quality])
+    def jpeg(self, image: NDArray[np.uint8]) -> bytes:
+        """The image as grey JPEG."""
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.sensor.jpeg_quality])
         return data.tobytes()

@@ -18,7 +18,7 @@ LIGHT = np.array([0.35, 0.55, 0.76])  # direction of the light in the world; fac
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A flat picture in the world, seen from both sides.
+    """A flat image in the world, seen from both sides.
 
     origin (3,) [m] is the upper left corner of texture (H, W) uint8, edge_u (3,) runs along its upper border and
     edge_v (3,) along its left one; texture pixel centres lie at (i + 0.5) / W and (j + 0.5) / H of the edges.
@@ -70,7 +70,7 @@ class Rectangle:
             levels.append(half.astype(np.float32))
         return levels
 
-    def picture(self, texture: Texture, place_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
+    def image(self, texture: Texture, place_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
         """A poster hung just in front of this wall; place_m = (left, top, width, height) along the edges."""
         u, v = self.edge_u / self.width_m, self.edge_v / self.height_m
         left, top, width, height = place_m

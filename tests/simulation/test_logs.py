@@ -33,18 +33,18 @@ def messages(path: Path) -> list[tuple[str, int, Any]]:
 
 
 def decoded(message: Any) -> np.ndarray:
-    picture = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
-    assert picture is not None
-    return picture
+    image = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
 
 
-def write(folder: Path, name: str = "crooked", seed: int = 4, pairs: int = 3) -> Path:
+def write(folder: Path, name: str = "misaligned", seed: int = 4, pairs: int = 3) -> Path:
     run = build(name, seed, SIZE, pairs)
     write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=seed)
     return folder
 
 
-def test_same_seed_same_bytes_other_seed_other_pictures(tmp_path: Path) -> None:
+def test_same_seed_same_bytes_other_seed_other_images(tmp_path: Path) -> None:
     one, again, other = (write(tmp_path / n, seed=s) / "log.mcap" for n, s in (("a", 4), ("b", 4), ("c", 5)))
     assert one.read_bytes() == again.read_bytes()
     assert one.read_bytes() != other.read_bytes()
@@ -62,7 +62,7 @@ def test_log_has_both_cameras_and_stamps_of_the_truth(tmp_path: Path) -> None:
 
 
 def test_truth_and_camchain_carry_the_poses_and_the_rig(tmp_path: Path) -> None:
-    run = build("crooked", 4, SIZE, 3)
+    run = build("misaligned", 4, SIZE, 3)
     folder = write(tmp_path)
     rows = np.loadtxt(folder / "truth.txt")
     assert np.allclose(se3.transform(se3.rotation(rows[:, 4:]), rows[:, 1:4]), run.poses, atol=1e-8)
@@ -109,10 +109,10 @@ def test_struts_and_hub_are_dark_and_stay_where_they_are() -> None:
     rig = make_rig(size=SIZE)
     exposure = Exposure.of(Sensor(strut_angles_deg=(0.0,), strut_width=0.05, hub=0.1, noise_sigma=0), rig.lower.visible,
                            (SIZE, SIZE))
-    picture = exposure.expose(np.full((SIZE, SIZE), 200, np.float32), np.random.default_rng(0))
+    image = exposure.expose(np.full((SIZE, SIZE), 200, np.float32), np.random.default_rng(0))
     middle = SIZE // 2
-    assert picture[middle, middle] < 30 and picture[middle, SIZE - 10] < 30
-    assert picture[middle, 10] > 180 and picture[10, middle] > 180
+    assert image[middle, middle] < 30 and image[middle, SIZE - 10] < 30
+    assert image[middle, 10] > 180 and image[10, middle] > 180
 
 
 def test_masked_rig_hides_the_struts_and_the_plain_one_does_not(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_masked_rig_hides_the_struts_and_the_plain_one_does_not(tmp_path: Path) 
     assert not read_rig(tmp_path / "rig_masked.toml").lower.visible.contains(on_hub).any()
 
 
-def test_noise_is_new_in_every_picture_of_a_standing_rig(tmp_path: Path) -> None:
+def test_noise_is_new_in_every_image_of_a_standing_rig(tmp_path: Path) -> None:
     read = messages(write(tmp_path, "still") / "log.mcap")
     lower = [decoded(m).astype(float) for topic, _, m in read if "lower" in topic]
     difference = (lower[1] - lower[0])[SIZE // 3:-SIZE // 3, SIZE // 3:-SIZE // 3]

@@ -16,10 +16,10 @@ SIZE = 192
 SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
 RIGS = {
     "straight": make_rig(size=SIZE),
-    "crooked": make_rig(size=SIZE, scale=0.9, baseline_m=0.24, crooked_deg=(5, -4, 31), offset_mm=(12, -20),
-                        lower_crooked_deg=(-3, 6, -50), lower_offset_mm=(40, 25), centre_px=(2.3, -1.6)),
+    "misaligned": make_rig(size=SIZE, scale=0.9, baseline_m=0.24, misaligned_deg=(5, -4, 31), offset_mm=(12, -20),
+                        lower_misaligned_deg=(-3, 6, -50), lower_offset_mm=(40, 25), centre_px=(2.3, -1.6)),
     "xi 0.8, distorted": make_rig(size=SIZE, xi=0.8, distortion=(-0.03, 0.004, 0.002, -0.003), centre_px=(-1.2, 2.7),
-                                  crooked_deg=(2, 3, 20), lower_crooked_deg=(-1, 2, 70)),
+                                  misaligned_deg=(2, 3, 20), lower_misaligned_deg=(-1, 2, 70)),
 }
 POSE = se3.exp([0.31, -0.22, 1.17, 0.05, -0.04, 0.7])
 
@@ -47,14 +47,14 @@ def project(mounted: MountedCamera, points: np.ndarray) -> np.ndarray:
 
 
 def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
-    """Distance of every visible corner found in the picture from where project() puts it."""
+    """Distance of every visible corner found in the image from where project() puts it."""
     scene = chessboards(POSE)
-    picture = render(scene, mounted, POSE, 3)
+    image = render(scene, mounted, POSE, 3)
     expected = project(mounted, np.concatenate([inner_corners(s) for s in scene.rectangles]))
     expected = expected[mounted.visible.contains(expected, 8)]
     start = np.ascontiguousarray(expected + 0.7, np.float32)
     enough = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
-    found = cv2.cornerSubPix(picture, start, (3, 3), (-1, -1), enough)
+    found = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), enough)
     return np.asarray(np.linalg.norm(found.reshape(-1, 2) - expected, axis=1))
 
 
@@ -75,9 +75,9 @@ def spot(bearing: tuple[float, float, float]) -> tuple[float, float]:
     up = np.cross(side, bearing)
     up *= 0.1 / np.linalg.norm(up)
     sheet = Rectangle(centre - (side + up) / 2, side, up, np.full((8, 8), 255, np.uint8))
-    picture = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4)).astype(float)
-    rows, columns = np.indices(picture.shape)
-    return float((columns * picture).sum() / picture.sum()), float((rows * picture).sum() / picture.sum())
+    image = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4)).astype(float)
+    rows, columns = np.indices(image.shape)
+    return float((columns * image).sum() / image.sum()), float((rows * image).sum() / image.sum())
 
 
 def test_forward_is_up_and_left_is_right_as_in_a_mirror() -> None:
@@ -102,19 +102,19 @@ def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
 def test_outside_the_rim_is_black_and_inside_nothing_is_missing() -> None:
     run = build("two_walls", 3, SIZE)
     mask = run.rig.lower.visible
-    picture = render(run.scene, run.rig.lower, run.poses[0])
-    rows, columns = np.indices(picture.shape)
+    image = render(run.scene, run.rig.lower, run.poses[0])
+    rows, columns = np.indices(image.shape)
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-    inside = mask.contains(pixels, 1.0).reshape(picture.shape)
-    assert (picture[~mask.contains(pixels, -1.0).reshape(picture.shape)] == 0).all()
-    assert (picture[inside] > 0).mean() > 0.999
+    inside = mask.contains(pixels, 1.0).reshape(image.shape)
+    assert (image[~mask.contains(pixels, -1.0).reshape(image.shape)] == 0).all()
+    assert (image[inside] > 0).mean() > 0.999
 
 
 def test_texture_far_away_is_averaged_not_sampled() -> None:
     """A fine chessboard far away is grey; sampled without a pyramid it would be noise that moves."""
     board = (255 * (np.indices((600, 600)).sum(axis=0) % 2)).astype(np.uint8)
     sheet = Rectangle(np.array([3.0, 1, 1]), np.array([0, -2.0, 0]), np.array([0, 0, -2.0]), board)
-    picture = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4))
-    inner = cv2.erode((picture > 0).astype(np.uint8), np.ones((5, 5))) > 0
+    image = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4))
+    inner = cv2.erode((image > 0).astype(np.uint8), np.ones((5, 5))) > 0
     assert inner.sum() > 100
-    assert picture[inner].std() < 3
+    assert image[inner].std() < 3

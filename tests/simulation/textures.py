@@ -59,10 +59,10 @@ def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
     side, joint = max(4, round(px_per_m * rng.uniform(0.25, 0.45))), max(1, round(px_per_m * 0.006))
     rows, columns = np.arange(size[1]) // side, np.arange(size[0]) // side
     level = rng.uniform(120, 160) + 7 * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))
-    picture = level[np.ix_(rows, columns)] + 7 * value_noise(rng, size, px_per_m * 0.3, 0.75)
-    picture[np.arange(size[1]) % side < joint] = 85
-    picture[:, np.arange(size[0]) % side < joint] = 85
-    return _grey(picture)
+    image = level[np.ix_(rows, columns)] + 7 * value_noise(rng, size, px_per_m * 0.3, 0.75)
+    image[np.arange(size[1]) % side < joint] = 85
+    image[:, np.arange(size[0]) % side < joint] = 85
+    return _grey(image)
 
 
 def plain(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -80,7 +80,7 @@ def poster(rng: Random, size: Size) -> Texture:
 
 
 def _page(rng: Random, size: Size) -> Texture:
-    """Lines of writing on white paper; real letters, so that a mirrored picture shows."""
+    """Lines of writing on white paper; real letters, so that a mirrored image shows."""
     page = np.full(size[::-1], rng.uniform(215, 245), np.uint8)
     height = max(10, size[1] // int(rng.integers(8, 16)))
     for bottom in range(2 * height, size[1] - height, height):
@@ -108,10 +108,10 @@ def _blobs(rng: Random, size: Size) -> Texture:
 
 def _photograph(rng: Random, size: Size) -> Texture:
     """Noise of strong contrast with a few round things in front."""
-    picture = _grey(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
+    image = _grey(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
     for _ in range(int(rng.integers(2, 6))):
         centre = tuple(int(x) for x in rng.uniform(0, size))
         axes = (int(rng.uniform(0.05, 0.2) * size[0]), int(rng.uniform(0.05, 0.2) * size[1]))
-        cv2.ellipse(picture, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(10, 245)), -1,
+        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(10, 245)), -1,
                     cv2.LINE_AA)
-    return picture
+    return image

@@ -84,7 +84,7 @@ class Velocity:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class LineStatus:
     """Controller to host: the answer to the command with this seq."""
 
     seq: int
@@ -105,7 +105,7 @@ class WatchdogSet:
     watchdog_ms: int
 
 
-Message = Velocity | Status | SetWatchdog | WatchdogSet
+Message = Velocity | LineStatus | SetWatchdog | WatchdogSet
 
 
 def encode(message: Message) -> bytes:
@@ -139,7 +139,7 @@ def _fields(message: Message) -> tuple[str, list[int]]:
     match message:
         case Velocity(seq, command):
             return "V", [seq, *_motion(command)]
-        case Status(seq, status):
+        case LineStatus(seq, status):
             battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
             return "S", [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
         case SetWatchdog(watchdog_ms):
@@ -182,7 +182,9 @@ def _message(kind: str, numbers: list[int]) -> Message:
     if kind == "V":
         return Velocity(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
     battery_v = math.nan if numbers[4] < 0 else numbers[4] / 1000
-    return Status(seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(numbers[6]), numbers[5], battery_v))
+    return LineStatus(
+        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(numbers[6]), numbers[5], battery_v)
+    )
 
 
 class LineAssembler:
@@ -256,9 +258,9 @@ class LineProtocol:
         message = self._message(frame)
         return message if isinstance(message, WatchdogSet) else None
 
-    def _status(self, frame: bytes, seq: int) -> Status | None:
+    def _status(self, frame: bytes, seq: int) -> LineStatus | None:
         message = self._message(frame)
-        return message if isinstance(message, Status) and message.seq == seq else None
+        return message if isinstance(message, LineStatus) and message.seq == seq else None
 
     def _message(self, frame: bytes) -> Message | None:
         try:

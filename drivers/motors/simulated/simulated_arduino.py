@@ -1,4 +1,4 @@
-"""The twin of an Arduino with ROSArduinoBridge; the source is named in drivers/motors/protocols/ros_arduino_bridge.py."""
+"""Simulated Arduino with ROSArduinoBridge; for the source see drivers/motors/protocols/ros_arduino_bridge.py."""
 
 from __future__ import annotations
 

@@ -9,9 +9,9 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
     LineAssembler,
+    LineStatus,
     ProtocolError,
     SetWatchdog,
-    Status,
     Velocity,
     WatchdogSet,
     decode,
@@ -54,7 +54,7 @@ class SimulatedLine:
         self.base.errors += self._next_seq not in (None, seq)
         self._next_seq = (seq + 1) % SEQ_COUNT
         self.base.commands += 1
-        answer = encode(Status(seq, self._status()))
+        answer = encode(LineStatus(seq, self._status()))
         steers = self._heading_input and not is_stop(command)
         self.base.goal_heading_rad = command.heading_rad + self._zero_rad if steers else None
         self.base.tell(command.velocity_mps, command.yaw_rate_radps)

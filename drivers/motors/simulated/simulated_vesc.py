@@ -1,4 +1,4 @@
-"""The twin of two VESCs, one on the port and one behind it on CAN; the source is named in drivers/motors/protocols/vesc.py."""
+"""Simulated pair of VESCs, one on the port and one behind it on CAN; source in drivers/motors/protocols/vesc.py."""
 
 from __future__ import annotations
 

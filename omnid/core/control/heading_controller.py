@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from omnid.errors import OmnidError
+from omnid.settings import knob
 
 LONGEST_TICK_S = 0.2  # a late tick does not earn a larger jump
 HALF_TURN_RAD = 0.2  # within this of half a turn, noise would flip the side to turn to
@@ -16,11 +17,11 @@ BRAKING_SHARE = 0.8  # of the yaw acceleration is planned for slowing down; the 
 class HeadingLimits:
     """What the base may be asked for, in magnitude, and the gain of the heading."""
 
-    velocity_mps: float = 0.5
-    acceleration_mps2: float = 0.5
-    yaw_rate_radps: float = 1.0
-    yaw_acceleration_radps2: float = 3.0
-    gain_hz: float = 1.5
+    velocity_mps: float = knob(0.5, "highest speed, m/s", low=0.001, high=10)
+    acceleration_mps2: float = knob(0.5, "highest acceleration, m/s^2", low=0.001, high=100)
+    yaw_rate_radps: float = knob(1.0, "highest yaw rate, rad/s", low=0.001, high=20)
+    yaw_acceleration_radps2: float = knob(3.0, "highest yaw acceleration, rad/s^2", low=0.001, high=200)
+    gain_hz: float = knob(1.5, "yaw rate per heading error, 1/s", low=0.001, high=50)
 
     def __post_init__(self) -> None:
         """OmnidError unless each number is finite and above 0."""
@@ -40,7 +41,7 @@ class Setpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class Twist:
     """What the base is told: forward speed and yaw rate, counter-clockwise."""
 
     velocity_mps: float = 0.0
@@ -53,7 +54,7 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class HeadingHold:
+class HeadingController:
     """A proportional heading controller that never leaves its limits, whatever it is given.
 
     Rate and acceleration are bounded; near the goal the rate follows sqrt(2 a e), from which it can still brake.
@@ -61,35 +62,35 @@ class HeadingHold:
 
     limits: HeadingLimits = HeadingLimits()
 
-    def step(self, setpoint: Setpoint, heading_rad: float, dt_s: float, previous: Drive) -> Drive:
+    def step(self, setpoint: Setpoint, heading_rad: float, dt_s: float, previous: Twist) -> Twist:
         """The drive dt_s after `previous`; heading_rad is measured, in odom.
 
         A setpoint or heading that is not finite: stops as fast as the limits allow. A time or a previous drive
         that is not finite: stands still at once, for there is nothing to slow down from.
         """
         if not all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
-            return Drive()
+            return Twist()
         limits = self.limits
         dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S)
         velocity_mps = _clamp(previous.velocity_mps, limits.velocity_mps)
         yaw_rate_radps = _clamp(previous.yaw_rate_radps, limits.yaw_rate_radps)
         wanted = self._wanted(setpoint, heading_rad, yaw_rate_radps)
-        return Drive(
+        return Twist(
             _towards(velocity_mps, wanted.velocity_mps, limits.acceleration_mps2 * dt_s),
             _towards(yaw_rate_radps, wanted.yaw_rate_radps, limits.yaw_acceleration_radps2 * dt_s),
         )
 
-    def _wanted(self, setpoint: Setpoint, heading_rad: float, yaw_rate_radps: float) -> Drive:
+    def _wanted(self, setpoint: Setpoint, heading_rad: float, yaw_rate_radps: float) -> Twist:
         """The drive without acceleration limits; a stop where a number is not finite."""
         goal_rad = 0.0 if setpoint.heading_rad is None else setpoint.heading_rad
         numbers = (setpoint.velocity_mps, setpoint.yaw_rate_radps, goal_rad, heading_rad)
         if not all(map(math.isfinite, numbers)):
-            return Drive()
+            return Twist()
         rate_radps = setpoint.yaw_rate_radps
         if setpoint.heading_rad is not None:
             rate_radps = self._rate(wrap_angle(wrap_angle(goal_rad) - wrap_angle(heading_rad)), yaw_rate_radps)
         limits = self.limits
-        return Drive(_clamp(setpoint.velocity_mps, limits.velocity_mps), _clamp(rate_radps, limits.yaw_rate_radps))
+        return Twist(_clamp(setpoint.velocity_mps, limits.velocity_mps), _clamp(rate_radps, limits.yaw_rate_radps))
 
     def _rate(self, error_rad: float, yaw_rate_radps: float) -> float:
         """The yaw rate for a heading error; near half a turn it goes on the way it turns."""

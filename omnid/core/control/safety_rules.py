@@ -5,20 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from omnid.core.odometry.odometry import LOST
+from omnid.settings import knob
+from omnid.tracking_state import TrackingState
 
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
     """What is too old or too late to drive by, s."""
 
-    pose_s: float = 0.5  # since the capture of the newest pose's pictures
-    command_s: float = 0.5  # since the arrival of the newest command
-    tick_s: float = 0.25  # by which a tick comes later than it should: the host is overloaded
+    pose_s: float = knob(0.5, "the wheels stop when the newest pose's images are older, s", low=0.05, high=10)
+    command_s: float = knob(0.5, "the wheels stop when the newest command came longer ago, s", low=0.05, high=10)
+    tick_s: float = knob(0.25, "the wheels stop when the host lets a tick come so much too late, s", low=0.01, high=10)
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class SafetyInputs:
     """What one tick of the wheels knows; inf is the age of what never came."""
 
     pose_age_s: float
@@ -42,7 +43,7 @@ IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
 
 
-def reason_to_stop(now: Situation, deadlines: Deadlines) -> str:
+def stop_reason(now: SafetyInputs, deadlines: Deadlines) -> str:
     """Why the wheels must stand, in a few words; empty where they may turn.
 
     A number that is NaN is a reason, and so is an age as far below 0 as it may be above: nothing comes from the future.
@@ -54,7 +55,7 @@ def reason_to_stop(now: Situation, deadlines: Deadlines) -> str:
         (now.motor_stopped, STOPPED),
         (not now.late_s <= deadlines.tick_s, OVERLOADED),
         (not abs(now.pose_age_s) <= deadlines.pose_s, POSE_STALE),
-        (now.pose_state == LOST, POSE_LOST),
+        (now.pose_state == TrackingState.LOST, POSE_LOST),
         (now.command_age_s == float("inf"), IDLE),
         (not abs(now.command_age_s) <= deadlines.command_s, COMMAND_STALE),
     )

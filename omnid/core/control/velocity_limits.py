@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Drive
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.errors import OmnidError
+from omnid.settings import knob
 
-STOP = Drive()
+STOP = Twist()
 
 
 @dataclass(frozen=True, slots=True)
-class CommandLimits:
+class VelocityLimits:
     """What the wheels may be told, in magnitude; stops are slowed down within the deceleration as well."""
 
-    velocity_mps: float = 0.6
-    acceleration_mps2: float = 0.6
-    deceleration_mps2: float = 1.5
-    yaw_rate_radps: float = 1.2
-    yaw_acceleration_radps2: float = 4.0
+    velocity_mps: float = knob(0.6, "highest speed, m/s", low=0.001, high=10)
+    acceleration_mps2: float = knob(0.6, "highest acceleration, m/s^2", low=0.001, high=100)
+    deceleration_mps2: float = knob(1.5, "highest deceleration, at stops as well, m/s^2", low=0.001, high=100)
+    yaw_rate_radps: float = knob(1.2, "highest yaw rate, rad/s", low=0.001, high=20)
+    yaw_acceleration_radps2: float = knob(4.0, "highest yaw acceleration, rad/s^2", low=0.001, high=200)
 
     def __post_init__(self) -> None:
         """OmnidError unless each number is finite and above 0."""
@@ -28,7 +29,7 @@ class CommandLimits:
             if not (math.isfinite(value) and value > 0):
                 raise OmnidError(f"command limits: {field.name} is {value}; give a finite number above 0")
 
-    def step(self, wanted: Drive, last: Drive, dt_s: float) -> Drive:
+    def step(self, wanted: Twist, last: Twist, dt_s: float) -> Twist:
         """What is sent dt_s after `last` was; a wanted drive that is not finite is a stop.
 
         A last drive that is not finite counts as standing, one beyond the limits as at them. A time that is not finite
@@ -39,7 +40,7 @@ class CommandLimits:
         top_mps, top_radps = self.velocity_mps, self.yaw_rate_radps
         velocity_mps, yaw_rate_radps = _clamp(last.velocity_mps, top_mps), _clamp(last.yaw_rate_radps, top_radps)
         reach_radps = self.yaw_acceleration_radps2 * dt_s
-        return Drive(
+        return Twist(
             self._velocity(velocity_mps, _clamp(wanted.velocity_mps, top_mps), dt_s),
             yaw_rate_radps + _clamp(_clamp(wanted.yaw_rate_radps, top_radps) - yaw_rate_radps, reach_radps),
         )
@@ -57,7 +58,7 @@ class CommandLimits:
         return math.copysign(1.0, last_mps) * speed_mps
 
 
-def _finite(drive: Drive) -> bool:
+def _finite(drive: Twist) -> bool:
     return math.isfinite(drive.velocity_mps) and math.isfinite(drive.yaw_rate_radps)
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.tracking import Klt, Wrapped, track
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -14,7 +14,7 @@ Flags = NDArray[np.bool_]
 CELL_PX = 48  # side of the cells among which the corners are shared out evenly
 
 
-def corners(lower: Wrapped, usable: Flags, most: int, apart_px: int = 9, weakest: float = 2e-4) -> Array:
+def corners(lower: PaddedPanorama, usable: Flags, most: int, apart_px: int = 9, weakest: float = 2e-4) -> Array:
     """Up to `most` corners (N, 2) = (column, row) of the panorama where usable (H, W), strongest first in each cell.
 
     A corner is a maximum of the smaller eigenvalue (Shi and Tomasi 1994) within apart_px. Cells of CELL_PX take turns,
@@ -50,7 +50,9 @@ def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
     return free.astype(bool)
 
 
-def rows_in_upper(pair: tuple[Wrapped, Wrapped], points: Array, guess: Array, klt: Klt, cross_px: float = 0.7) -> Array:
+def rows_in_upper(
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings, cross_px: float = 0.7
+) -> Array:
     """Rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN where they do not match.
 
     guess (N,) rows. A match must lie in the same column within cross_px, not above the point, and come back.

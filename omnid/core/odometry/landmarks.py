@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, warped_templates
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import Klt, Wrapped, track
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ class Keyframe:
     """A panorama that landmarks are anchored in; T_odom_rect places its rectified frame, covariance (6, 6) in it."""
 
     seq: int
-    lower: Wrapped
+    lower: PaddedPanorama
     T_odom_rect: Array
     covariance: Array
 
@@ -43,7 +43,7 @@ class Tracks:
 class LocalMap:
     """Landmarks (N) with position in odom, covariance, keyframe and pixel there; bounded by the keyframes kept."""
 
-    def __init__(self, model: StereoModel, klt: Klt, max_keyframes: int = 5, max_misses: int = 3) -> None:
+    def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 5, max_misses: int = 3) -> None:
         self._model, self._klt = model, klt
         self._max_keyframes, self._max_misses = max_keyframes, max_misses
         self.clear()
@@ -58,7 +58,7 @@ class LocalMap:
         self.anchor = np.zeros(0, np.intp)  # (N,) seq of the keyframe
         self._seen = np.zeros((0, 2))  # (N, 2) px in the last panorama whose pose was accepted; NaN: not there
         self._misses = np.zeros(0, np.intp)
-        self._last: Wrapped | None = None
+        self._last: PaddedPanorama | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -81,7 +81,7 @@ class LocalMap:
         self._last = keyframe.lower
         self._forget_oldest()
 
-    def track(self, lower: Wrapped, T_odom_rect: Array, most: int | None = None) -> Tracks:
+    def track(self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None) -> Tracks:
         """Looks for the landmarks of the last panorama in a new one, from where a guessed pose predicts them.
 
         most: only about so many, evenly chosen, to compare guesses cheaply.
@@ -104,7 +104,7 @@ class LocalMap:
         index = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
         return index, predicted[index]
 
-    def align(self, lower: Wrapped, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
         """Pixels (M, 2) of landmarks (indices) by warped patches, in a panorama whose pose is known well; which fit."""
         T_rect_odom = se3.inverse(T_odom_rect)
         points = se3.apply(T_rect_odom, self.points[index])
@@ -124,7 +124,7 @@ class LocalMap:
         anchors, counts = np.unique(self.anchor[index], return_counts=True)
         return {int(a): float(n) / len(index) for a, n in zip(anchors, counts, strict=True)}
 
-    def saw(self, lower: Wrapped, index: Indices, pixels: Array) -> None:
+    def saw(self, lower: PaddedPanorama, index: Indices, pixels: Array) -> None:
         """Takes note of the landmarks (indices) seen in a panorama at pixels (M, 2); drops those missed too often."""
         self._last = lower
         self._seen[:] = np.nan

@@ -2,7 +2,7 @@
 
 Plain Lucas-Kanade shifts a window but does not bend it, and errs by tenths of a pixel as soon as the camera has moved
 some decimetres. Here each keyframe patch is warped by the affine map that pose, depth and local slope predict; all
-patches lie side by side in one picture, so that a single call aligns them.
+patches lie side by side in one image, so that a single call aligns them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import Wrapped
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     return np.where(sane[:, None, None], warps, np.eye(2))
 
 
-def align(templates: Image, current: Wrapped, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+def align(templates: Image, current: PaddedPanorama, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Where patches (N, CELL, CELL), centred on predicted (N, 2), really are, and which of them moved little enough."""
     cells = _cut(current, np.rint(predicted))
     centres = _centres(len(predicted))
@@ -79,13 +79,13 @@ def align(templates: Image, current: Wrapped, predicted: Array) -> tuple[Array, 
     return predicted + shift, close
 
 
-def warped_templates(keyframe: Wrapped, pixels: Array, warps: Array, predicted: Array) -> Image:
+def warped_templates(keyframe: PaddedPanorama, pixels: Array, warps: Array, predicted: Array) -> Image:
     """Patches (N, CELL, CELL) uint8 of a keyframe about pixels (N, 2), as seen about predicted (N, 2) after warps."""
     offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
     return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2).astype(np.float32))
 
 
-def _cut(image: Wrapped, centres: Array) -> Image:
+def _cut(image: PaddedPanorama, centres: Array) -> Image:
     """Patches (N, CELL, CELL) about whole pixels (N, 2)."""
     return _sample(image, centres, _cell_offsets()[None])
 
@@ -96,7 +96,7 @@ def _cell_offsets() -> Floats:
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def _sample(image: Wrapped, centres: Array, offsets: Floats) -> Image:
+def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
     """Patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), across the seam if need be."""
     columns = (centres[:, :1] % image.width + image.pad_px).astype(np.float32) + offsets[..., 0]
     rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
@@ -105,7 +105,7 @@ def _sample(image: Wrapped, centres: Array, offsets: Floats) -> Image:
 
 
 def _atlas(patches: Image) -> Image:
-    """Patches laid out in rows of CELLS_A_ROW, one picture."""
+    """Patches laid out in rows of CELLS_A_ROW, one image."""
     rows = -(-len(patches) // CELLS_A_ROW)
     filled = np.zeros((rows * CELLS_A_ROW, CELL_PX, CELL_PX), np.uint8)
     filled[: len(patches)] = patches

@@ -1,4 +1,4 @@
-"""Ego-motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
+"""OdometryEstimate-motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Ge
     """The motion T_curr_ref that most landmarks (N, 3) agree with, and which do (N,).
 
     Three points of those seen in both cameras make a motion; consensus by the views' errors [px]. Dang et al. 2012,
-    section IV.B, with the distance measured in the pictures, where the noise is even. Hypotheses are drawn in batches
+    section IV.B, with the distance measured in the images, where the noise is even. Hypotheses are drawn in batches
     until three of the consensus have almost surely been among them.
     """
     seen = triangulate(views, model.cylinder, model.baseline_m)
@@ -86,7 +86,7 @@ def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class GaussNewtonResult:
     """A motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and each view's squared error in deviations."""
 
     T: Array
@@ -95,7 +95,7 @@ class Estimate:
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 steps: int = 6) -> Estimate:
+                 steps: int = 6) -> GaussNewtonResult:
     """The motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
@@ -110,7 +110,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
         if np.abs(step).max() < 1e-6:
             break
     H, _, squared = _normal_equations(landmarks, clean, T, W, model)
-    return Estimate(T, np.asarray(np.linalg.inv(H), float), squared)
+    return GaussNewtonResult(T, np.asarray(np.linalg.inv(H), float), squared)
 
 
 def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel

@@ -26,7 +26,7 @@ REACH_PX = 4  # at half resolution
 EVIDENCE = 5  # comparisons running
 
 
-class FixedPattern:
+class StaticMask:
     """Learns, at half resolution, where structure stays the same while the robot moves."""
 
     def __init__(self) -> None:

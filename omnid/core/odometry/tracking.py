@@ -8,12 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.settings import knob
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
-class Wrapped:
+class PaddedPanorama:
     """A panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
 
     image: Image  # (H, W + 2 pad) uint8
@@ -31,16 +33,18 @@ class Wrapped:
 
 
 @dataclass(frozen=True, slots=True)
-class Klt:
+class KltSettings:
     """Window [px], pyramid levels above the image, largest forward-backward error [px]."""
 
-    window_px: int = 15
-    levels: int = 3
-    max_error_px: float = 0.5
-    iterations: int = 20
+    window_px: int = knob(15, "side of the tracking window, px", low=5, high=61)
+    levels: int = knob(3, "pyramid levels above the image", low=0, high=6)
+    max_error_px: float = knob(0.5, "largest error of the way back, px", low=0.01, high=10)
+    iterations: int = knob(20, "steps on each level", low=1, high=200)
 
 
-def track(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple[Array, NDArray[np.bool_]]:
+def track(
+    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
+) -> tuple[Array, NDArray[np.bool_]]:
     """Where points (N, 2) of a are in b, from a guess (N, 2), and which of them come back to where they started.
 
     Columns may be given and are returned in [0, width). LK's own status is no evidence: only the way back counts.
@@ -55,8 +59,10 @@ def track(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tupl
     return there, found & returned & close
 
 
-def flow(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple[Array, NDArray[np.bool_]]:
-    """One way of pyramidal Lucas-Kanade from a guess; found (N,) where it converged inside the picture."""
+def flow(
+    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
+) -> tuple[Array, NDArray[np.bool_]]:
+    """One way of pyramidal Lucas-Kanade from a guess; found (N,) where it converged inside the image."""
     start, target = _padded(points, a), _padded(guess, b)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, 0.01)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -68,7 +74,7 @@ def flow(a: Wrapped, b: Wrapped, points: Array, guess: Array, klt: Klt) -> tuple
     return moved, (status.ravel() > 0) & inside & np.isfinite(moved).all(axis=1)
 
 
-def _padded(points: Array, wrapped: Wrapped) -> NDArray[np.float32]:
-    """Points (N, 1, 2) float32 in the padded picture, columns first brought into [0, width)."""
+def _padded(points: Array, wrapped: PaddedPanorama) -> NDArray[np.float32]:
+    """Points (N, 1, 2) float32 in the padded image, columns first brought into [0, width)."""
     columns = points[:, 0] % wrapped.width + wrapped.pad_px
     return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)

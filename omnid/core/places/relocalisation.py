@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import nearby_disparity
 from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.pose_estimate import Fit
+from omnid.core.odometry.pose_estimate import PoseEstimate
 from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
-from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ SIGMA_PX = 0.7  # deviation of SIFT positions and of the disparities beside them
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class KeyframeDescriptor:
     """Recognisable points of a keyframe: SIFT descriptors (N, 128), views (N, 3) px, points (N, 3) m in its frame."""
 
     descriptors: NDArray[np.float32]
@@ -40,15 +40,15 @@ class Relocaliser:
     def __init__(self, model: StereoModel, places: int = 8, apart_m: float = 0.3) -> None:
         self._model = StereoModel(model.cylinder, model.baseline_m, SIGMA_PX)
         self._apart_m = apart_m
-        self._sights: deque[tuple[Sight, Keyframe]] = deque(maxlen=places)
-        self._places: dict[int, Place] = {}
+        self._sights: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=places)
+        self._places: dict[int, KeyframeDescriptor] = {}
 
-    def remember(self, sight: Sight, keyframe: Keyframe) -> None:
+    def remember(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keeps a sight and its pose; one close to the last replaces it. Nothing is computed until it is needed."""
         if self._sights and _distance_m(self._sights[-1][1], keyframe) < self._apart_m:
             self._sights.pop()
-        self._sights.append((sight, keyframe))
-        kept = {sight.seq for sight, _ in self._sights}
+        self._sights.append((frame, keyframe))
+        kept = {frame.seq for frame, _ in self._sights}
         self._places = {seq: place for seq, place in self._places.items() if seq in kept}
 
     def forget(self) -> None:
@@ -56,13 +56,15 @@ class Relocaliser:
         self._sights.clear()
         self._places.clear()
 
-    def locate(self, sight: Sight) -> Fit | None:
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
         """The best supported pose of a sight relative to the keyframes, newest first; None where none fits."""
-        here = _describe(sight, self._model)
-        fits = (self._match(here, *remembered, sight.seq) for remembered in reversed(self._sights))
-        return max((fit for fit in fits if fit), key=lambda fit: fit.agreeing, default=None)
+        here = _describe(frame, self._model)
+        fits = (self._match(here, *remembered, frame.seq) for remembered in reversed(self._sights))
+        return max((fit for fit in fits if fit), key=lambda fit: fit.inliers, default=None)
 
-    def _match(self, here: Place, remembered: Sight, keyframe: Keyframe, seed: int) -> Fit | None:
+    def _match(
+        self, here: KeyframeDescriptor, remembered: StereoFrame, keyframe: Keyframe, seed: int
+    ) -> PoseEstimate | None:
         if remembered.seq not in self._places:
             self._places[remembered.seq] = _describe(remembered, self._model)
         there = self._places[remembered.seq]
@@ -78,25 +80,25 @@ class Relocaliser:
         inliers = int((estimate.squared < 16).sum())
         A = se3.adjoint(estimate.T)
         covariance = estimate.covariance + A @ keyframe.covariance @ A.T
-        return Fit(keyframe.T_odom_rect @ se3.inverse(estimate.T), covariance, len(a), len(a), inliers)
+        return PoseEstimate(keyframe.T_odom_rect @ se3.inverse(estimate.T), covariance, len(a), len(a), inliers)
 
 
 def _distance_m(a: Keyframe, b: Keyframe) -> float:
     return float(np.linalg.norm(a.T_odom_rect[:3, 3] - b.T_odom_rect[:3, 3]))
 
 
-def _describe(sight: Sight, model: StereoModel) -> Place:
+def _describe(frame: StereoFrame, model: StereoModel) -> KeyframeDescriptor:
     """The SIFT features of the lower panorama whose disparity is known."""
-    mask = np.where(sight.usable, 255, 0).astype(np.uint8)
-    picture = np.ascontiguousarray(sight.lower.panorama)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(picture, mask)
+    mask = np.where(frame.usable, 255, 0).astype(np.uint8)
+    image = np.ascontiguousarray(frame.lower.panorama)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(image, mask)
     if descriptors is None:
-        return Place(np.zeros((0, 128), np.float32), np.zeros((0, 3)), np.zeros((0, 3)))
+        return KeyframeDescriptor(np.zeros((0, 128), np.float32), np.zeros((0, 3)), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints])
-    views = np.column_stack([pixels, pixels[:, 1] + nearby_disparity(sight.disparity, pixels)])
+    views = np.column_stack([pixels, pixels[:, 1] + nearby_disparity(frame.disparity, pixels)])
     points = triangulate(views, model.cylinder, model.baseline_m)
     known = np.isfinite(points).all(axis=1)
-    return Place(np.asarray(descriptors, np.float32)[known], views[known], points[known])
+    return KeyframeDescriptor(np.asarray(descriptors, np.float32)[known], views[known], points[known])
 
 
 def _pairs(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib.fit.rig_drift import Drift, find_drift
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.tracking import Klt, Wrapped, track
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -22,12 +22,12 @@ Image = NDArray[np.uint8]
 Verdict = Literal["good", "drifted", "broken", "unknown"]
 
 POINTS = 160
-COARSE = 4  # points are first looked for in pictures so many times smaller,
+COARSE = 4  # points are first looked for in images so many times smaller,
 PATCH_PX = 4  # by patches that reach so far about them there,
 ASIDE_PX = 5  # so far aside (some five degrees of a panorama of 1300 columns), and
 DOWN_PX = 30  # so far down: nearer than a baseline and a half is nothing
 MIN_LIKENESS = 0.8
-KLT = Klt(window_px=15, levels=2, max_error_px=0.3)
+KLT = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 MAX_PAIRS = 64
 # Less is no verdict. Verdicts are by the turn: a rig as good as new, rendered or real, stays below the first.
 MIN_MATCHES = 120
@@ -36,7 +36,7 @@ DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
 SHIFT_PART = 0.2
 SIGMAS = 4.0
 # Of a rig that is wrong by many degrees no more match than by accident. Only points that stand out so far [grey levels]
-# in the coarse picture tell so: what noise makes in the dark matches nowhere either.
+# in the coarse image tell so: what noise makes in the dark matches nowhere either.
 MIN_SHARE, MIN_CLEAR, CLEAR_GREY = 0.08, 400, 6.0
 SECTORS, MIN_IN_SECTOR = 12, 20
 # A camera that is no more what it was bends the columns all around; one wall alone may mislead all its matches.
@@ -91,7 +91,7 @@ class RigCheck:
         self._cylinder = cylinder
         self._found: deque[Matches] = deque(maxlen=min(pairs, MAX_PAIRS))
 
-    def add(self, lower: Wrapped, upper: Wrapped, visible: Flags) -> None:
+    def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> None:
         """Looks at one pair of panoramas; visible (H, W) is where both show the world."""
         self._found.append(match(lower, upper, visible))
 
@@ -107,7 +107,7 @@ def together(found: Iterable[Matches]) -> Matches:
     return Matches(lower, upper, sum(part.tried for part in parts), sum(part.clear for part in parts))
 
 
-def match(lower: Wrapped, upper: Wrapped, visible: Flags) -> Matches:
+def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> Matches:
     """Corners of the lower panorama found in the upper one, wherever they are, to a fraction of a pixel."""
     points = corners(lower, visible, POINTS)
     guess, likely, clear = _coarse(lower, upper, points)
@@ -118,7 +118,7 @@ def match(lower: Wrapped, upper: Wrapped, visible: Flags) -> Matches:
     return Matches(points[good], there[good], len(points), clear)
 
 
-def _coarse(lower: Wrapped, upper: Wrapped, points: Array) -> tuple[Array, Flags, int]:
+def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tuple[Array, Flags, int]:
     """Where points (N, 2) are most likely in the upper panorama, to COARSE pixels, and whether that is like enough.
 
     Also how many of the points stand out clearly.

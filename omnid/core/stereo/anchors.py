@@ -55,16 +55,16 @@ class Candidates:
         return row, np.where(np.isfinite(lowest), second, 0) - np.where(np.isfinite(lowest), lowest, 0)
 
 
-class Settlement:
+class AnchorPropagation:
     """The points of a pair of panoramas (H, W), their disparities (N,), and a grid of anchors among them."""
 
-    def __init__(self, pictures: tuple[Image, Image], pixels: Indices, disparity: Indices) -> None:
-        height, width = pictures[0].shape
+    def __init__(self, images: tuple[Image, Image], pixels: Indices, disparity: Indices) -> None:
+        height, width = images[0].shape
         self.disparity = disparity.copy()
-        self._pictures = pictures
+        self._images = images
         rows, columns = np.divmod(pixels, width)
         self._column, self._row = columns.astype(np.float32), rows.astype(np.float32)
-        across = width // CELL_PX + 3  # with a ring of empty cells about the picture
+        across = width // CELL_PX + 3  # with a ring of empty cells about the image
         self._cell = (rows // CELL_PX + 1) * across + columns // CELL_PX + 1
         self._around = (np.arange(-1, 2)[:, None] * across + np.arange(-1, 2)).reshape(-1)
         self._anchor = np.full((height // CELL_PX + 3) * across, NOBODY)
@@ -145,13 +145,13 @@ class Settlement:
         """The line differences (M,) of points at disparities against anchors."""
         start = np.stack([self._column[point], self._row[point], disparity.astype(np.float32)])
         end = np.stack([self._column[anchor], self._row[anchor], self.disparity[anchor].astype(np.float32)])
-        return line_difference(self._pictures, start, end, samples)
+        return line_difference(self._images, start, end, samples)
 
     def _decide(self, rows: Candidates, best: Indices, decided: Flags) -> None:
         self.disparity[decided] = rows.disparity[best[decided]]
 
 
-def line_difference(pictures: tuple[Image, Image], start: Array, end: Array, samples: int) -> Array:
+def line_difference(images: tuple[Image, Image], start: Array, end: Array, samples: int) -> Array:
     """Mean absolute difference (M,) of grey levels along lines in the lower and in the upper panorama.
 
     start, end: (3, M) column and row in the lower panorama, and disparity: how much lower in the upper one. Sampled at
@@ -162,7 +162,7 @@ def line_difference(pictures: tuple[Image, Image], start: Array, end: Array, sam
     for first in range(0, len(difference), CHUNK):
         part = slice(first, first + CHUNK)
         columns, rows, disparities = start[:, part, None] + along * (end - start)[:, part, None]
-        lower, upper = (cv2.remap(picture, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                        for picture, at in zip(pictures, (rows, rows + disparities), strict=True))
+        lower, upper = (cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                        for image, at in zip(images, (rows, rows + disparities), strict=True))
         difference[part] = cv2.reduce(cv2.absdiff(lower, upper), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0]
     return difference

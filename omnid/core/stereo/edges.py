@@ -19,7 +19,7 @@ def edge_pixels(smoothed: Image, valid: NDArray[np.bool_], threshold: int, limit
 
     Only the change along the column tells a match apart from its neighbours there, so only it counts; of each edge
     its crest alone is kept. threshold in units of the 3x3 Sobel (8 per grey level and pixel). Where more than limit
-    remain, every n-th is taken, evenly over the picture.
+    remain, every n-th is taken, evenly over the image.
     """
     response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=0.5)
     crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > threshold // 2)

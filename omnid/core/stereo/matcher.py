@@ -13,10 +13,11 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.stereo.anchors import Candidates, Settlement
+from omnid.core.stereo.anchors import AnchorPropagation, Candidates
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.core.stereo.sad import NEVER, Costs, Indices, SadVolume, local_minima, subpixel
 from omnid.core.stereo.semiglobal import SemiGlobalPrior
+from omnid.settings import knob
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -24,26 +25,31 @@ Floats = NDArray[np.float32]
 Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
+METHODS = ("sad", "enhanced", "semiglobal")
 REACH_PX = 3  # the prior comes from half the resolution and is rounded
 
 
 @dataclass(frozen=True, slots=True)
-class Matching:
+class MatchingSettings:
     """How to match: the way of choosing, the SAD's window and threshold, and which edges."""
 
-    method: str = "semiglobal"
-    window_px: int = 9
-    disparities: int = 128
-    max_difference: float = 12.0  # mean grey level difference in the window that is still a match
-    rival: float = 2.0  # a candidate's SAD is at most this times the best one's,
-    rival_difference: float = 4.0  # plus so many grey levels
-    edge_threshold: int = 40
-    max_points: int = 30_000
-    sigma_px: float = 0.8
-    max_candidates: int = 8
+    method: str = knob("semiglobal", "how one of several candidates is chosen", choices=METHODS)
+    window_px: int = knob(9, "side of the matching window, px; odd", low=3, high=15)
+    disparities: int = knob(128, "largest disparity searched, px, however near the points wanted", low=8, high=512)
+    max_difference: float = knob(
+        12.0, "mean difference of grey levels in the window that is still a match", low=0, high=255
+    )
+    rival: float = knob(2.0, "enhanced: a candidate's SAD is at most this times the best one's,", low=1, high=10)
+    rival_difference: float = knob(
+        4.0, "plus so many grey levels; what has one candidate only is an anchor", low=0, high=255
+    )
+    edge_threshold: int = knob(40, "Sobel response that makes an edge, 8 per grey level and pixel", low=0, high=1020)
+    max_points: int = knob(30_000, "edge pixels matched in a pair", low=100, high=1_000_000)
+    sigma_px: float = knob(0.8, "deviation of the Gaussian before the edges, px", low=0, high=10)
+    max_candidates: int = knob(8, "candidates compared for one pixel", low=2, high=64)
 
 
-class Search(Protocol):
+class CandidateSearch(Protocol):
     """A way of choosing among candidates."""
 
     def search(self, lower: Image, upper: Image, pixels: Indices) -> Matches:
@@ -54,9 +60,9 @@ class Search(Protocol):
 class Matcher:
     """Finds edges of the lower panorama in the upper one; keeps its buffers between pairs."""
 
-    def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
+    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._matching = matching
-        self._search: Search = SEARCHES[matching.method](shape, matching)
+        self._search: CandidateSearch = SEARCHES[matching.method](shape, matching)
 
     def match(self, lower: Image, upper: Image, valid: Flags) -> Matches:
         """The matched pixels of panoramas (H, W) uint8 whose seam the caller has padded, where valid (H, W)."""
@@ -68,7 +74,7 @@ class Matcher:
 class SemiGlobalSearch:
     """SAD within REACH_PX of a semi-global prior."""
 
-    def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
+    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._prior = SemiGlobalPrior(matching.disparities)
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
         self._most = matching.max_difference * matching.window_px**2
@@ -92,7 +98,7 @@ class SemiGlobalSearch:
 class ColumnSearch:
     """The original: the lowest SAD along the whole column, with the left-right check (Dang et al. 2012, eq. (1))."""
 
-    def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
+    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
         self._most = matching.max_difference * matching.window_px**2
 
@@ -109,7 +115,7 @@ class ColumnSearch:
 class EnhancedSearch:
     """SAD along the whole column; points with several candidates are settled by anchors (section III.B)."""
 
-    def __init__(self, shape: tuple[int, int], matching: Matching) -> None:
+    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._matching = matching
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
 
@@ -124,7 +130,7 @@ class EnhancedSearch:
         count = np.count_nonzero(minima, axis=0)
         kept, several = (count == 1) & _at(minima, disparity), count > 1
         kept[kept] = self._liked(pixels[kept], disparity[kept], best=True)
-        settlement = Settlement((lower, upper), pixels, disparity)
+        settlement = AnchorPropagation((lower, upper), pixels, disparity)
         clear = settlement.settle(kept, self._candidates(costs, minima, count))
         disparity = settlement.disparity
         for which, best in ((clear, False), (several & ~clear & _at(minima, disparity), True)):
@@ -158,10 +164,9 @@ class EnhancedSearch:
         return Candidates(point, disparity, difference.astype(np.float32))
 
 
-SEARCHES: dict[str, Callable[[tuple[int, int], Matching], Search]] = {
+SEARCHES: dict[str, Callable[[tuple[int, int], MatchingSettings], CandidateSearch]] = {
     "semiglobal": SemiGlobalSearch, "enhanced": EnhancedSearch, "sad": ColumnSearch,
 }
-METHODS = tuple(SEARCHES)
 
 
 def _at(values: NDArray[Scalar], disparity: Indices) -> NDArray[Scalar]:

@@ -10,7 +10,7 @@ Image = NDArray[np.uint8]
 Costs = NDArray[np.uint16]
 Indices = NDArray[np.intp]
 
-NEVER = np.uint16(65535)  # the cost of a match outside the picture
+NEVER = np.uint16(65535)  # the cost of a match outside the image
 
 
 class SadVolume:

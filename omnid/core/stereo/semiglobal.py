@@ -21,7 +21,7 @@ SUBPIXEL = 16  # StereoSGBM counts in sixteenths
 
 
 class SemiGlobalPrior:
-    """Disparities of the lower panorama from half-size pictures; keeps OpenCV's buffers."""
+    """Disparities of the lower panorama from half-size images; keeps OpenCV's buffers."""
 
     def __init__(self, disparities: int) -> None:
         self._rows = 16 * max(1, -(-disparities // 32))  # half the disparities; StereoSGBM wants a multiple of 16

@@ -1,4 +1,4 @@
-"""Boards in rendered mirror pictures: found in noise, shadow and haze, to a fraction of a pixel, and never invented."""
+"""Boards in rendered mirror images: found in noise, shadow and haze, to a fraction of a pixel, and never invented."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_boards_are_found_all_around(sensor: Sensor, contrast: tuple[float, floa
                                      limit_px: float) -> None:
     for seed, T in enumerate(poses(3)):
         shot = STUDIO.photograph(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
-        view = find_board(shot.picture, BOARD, "x").view
+        view = find_board(shot.image, BOARD, "x").view
         assert view is not None and view.confidence > 0.7, seed
         off = errors_px(view.pixels, shot.corners)
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
@@ -59,7 +59,7 @@ def test_squares_of_six_pixels_are_enough() -> None:
     shot = STUDIO.photograph(T)
     sides = np.linalg.norm(np.diff(shot.corners.reshape(5, 6, 2), axis=1), axis=2)
     assert 4 < np.median(sides) < 8
-    view = find_board(shot.picture, BOARD).view
+    view = find_board(shot.image, BOARD).view
     assert view is not None
     assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.3
 
@@ -69,7 +69,7 @@ def test_a_board_through_a_fisheye_lens_is_found() -> None:
     mask = Mask(camera.center, 0.0, 232.0)
     T = around(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
     shot = Studio.of(BOARD, camera, mask).photograph(T)
-    view = find_board(shot.picture, BOARD).view
+    view = find_board(shot.image, BOARD).view
     assert view is not None
     assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.2
 
@@ -77,23 +77,23 @@ def test_a_board_through_a_fisheye_lens_is_found() -> None:
 def test_the_order_is_a_grid_that_turns_clockwise_and_starts_at_a_dark_square() -> None:
     for seed, T in enumerate(poses(3, seed=4)):
         shot = STUDIO.photograph(T, seed=seed)
-        view = find_board(shot.picture, BOARD).view
+        view = find_board(shot.image, BOARD).view
         assert view is not None
         grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
         along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
         first, second = (grid[:2, i:i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
-        assert shot.picture[first[1], first[0]] < shot.picture[second[1], second[0]]
-        flipped = find_board(np.ascontiguousarray(shot.picture[:, ::-1]), BOARD).view
-        assert flipped is not None  # whichever way the optics flip the picture
+        assert shot.image[first[1], first[0]] < shot.image[second[1], second[0]]
+        flipped = find_board(np.ascontiguousarray(shot.image[:, ::-1]), BOARD).view
+        assert flipped is not None  # whichever way the optics flip the image
 
 
 def test_a_hidden_corner_is_left_out_and_the_rest_is_kept() -> None:
     shot = STUDIO.photograph(poses(1)[0])
-    picture = shot.picture.copy()
+    image = shot.image.copy()
     u, v = shot.corners[14].round().astype(int)
-    cv2.circle(picture, (int(u), int(v)), 4, 128, -1)
-    view = find_board(picture, BOARD).view
+    cv2.circle(image, (int(u), int(v)), 4, 128, -1)
+    view = find_board(image, BOARD).view
     assert view is not None
     off = errors_px(view.pixels, shot.corners)
     assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
@@ -103,7 +103,7 @@ def test_a_hidden_corner_is_left_out_and_the_rest_is_kept() -> None:
 @pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
 def test_another_count_is_not_found_and_the_right_one_is_told(asked: tuple[int, int]) -> None:
     shot = STUDIO.photograph(poses(1, seed=2)[0])
-    search = find_board(shot.picture, Board(*asked, 0.03))
+    search = find_board(shot.image, Board(*asked, 0.03))
     assert search.view is None
     assert sorted(search.seen) == [5, 6]
 
@@ -115,10 +115,10 @@ def test_no_board_is_found_where_there_is_none() -> None:
     stripes = np.where(np.arange(300) // 10 % 2, 40, 200).astype(np.uint8)
     dots = np.where(np.hypot(*(np.indices((300, 300)) % 30 - 15)) < 9, 30, 220).astype(np.uint8)
     brickwork = np.where((np.indices((300, 300))[1] + 10 * (np.indices((300, 300))[0] // 12 % 2)) % 20 < 2, 30, 200)
-    pictures: list[NDArray[np.uint8]] = [noise, np.tile(stripes, (300, 1)), dots, brickwork.astype(np.uint8),
+    images: list[NDArray[np.uint8]] = [noise, np.tile(stripes, (300, 1)), dots, brickwork.astype(np.uint8),
                                          np.zeros((50, 40), np.uint8)]
-    for number, picture in enumerate(pictures):
-        search = find_board(picture, Board(4, 3, 0.03))
+    for number, image in enumerate(images):
+        search = find_board(image, Board(4, 3, 0.03))
         assert search.view is None, number
 
 
@@ -139,10 +139,10 @@ def test_a_board_ends_where_it_must_and_a_chequered_floor_goes_on(columns: int, 
 
 
 @pytest.mark.slow
-def test_all_ten_real_pictures(shared_data: Path) -> None:
+def test_all_ten_real_images(shared_data: Path) -> None:
     for number in range(10):
-        picture = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
-        view = find_board(picture.astype(np.uint8), Board(6, 7, 0.03)).view
+        image = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
+        view = find_board(image.astype(np.uint8), Board(6, 7, 0.03)).view
         assert view is not None and np.isfinite(view.pixels).all() and view.confidence > 0.95, number
 
 

@@ -81,7 +81,7 @@ def test_poses_are_the_boards_and_a_mirror_and_a_lens_are_told_by_the_view_asked
     np.testing.assert_allclose(found.fit.T_cam_board, poses, atol=1e-4)
     lens = calibrate(views, BOARD, SIZE, "omni", "direct")
     assert isinstance(lens.camera, UnifiedCamera) and lens.camera.focal[0] > 0
-    assert lens.fit.mean_px == pytest.approx(found.fit.mean_px, abs=1e-4)  # so the pictures do not tell
+    assert lens.fit.mean_px == pytest.approx(found.fit.mean_px, abs=1e-4)  # so the images do not tell
 
 
 def test_the_linear_solution_alone_is_close() -> None:
@@ -152,12 +152,12 @@ def test_views_on_one_side_give_a_warning() -> None:
 
 
 def rendered() -> tuple[Calibration, Calibration]:
-    """The ocam and the omni camera out of rendered pictures."""
+    """The ocam and the omni camera out of rendered images."""
     from calib.boards.board_finder import find_board
 
     studio = Studio.of(BOARD, OMNI, MASK)
     poses = around(OMNI, BOARD, MASK, 8, seed=3, distance_m=(0.12, 0.28))
-    images = {str(k): studio.photograph(T, seed=k, sensor=Sensor(noise_sigma=1.0)).picture for k, T in enumerate(poses)}
+    images = {str(k): studio.photograph(T, seed=k, sensor=Sensor(noise_sigma=1.0)).image for k, T in enumerate(poses)}
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 8
     both = [sharpened(calibrate([view for view in views if view], BOARD, SIZE, model), images, model, "mirror")

@@ -1,4 +1,4 @@
-"""Ten real pictures of a mirror camera, and what OCamCalib made of them: corners, polynomial, centre, errors."""
+"""Ten real images of a mirror camera, and what OCamCalib made of them: corners, polynomial, centre, errors."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SIZE = (1024, 768)
 Images = dict[str, NDArray[np.uint8]]
 
 
-def pictures(shared_data: Path) -> Images:
+def read_images(shared_data: Path) -> Images:
     paths = sorted((shared_data / "vmr_board").glob("*.jpg"))
     return {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint8) for path in paths}
 
 
 def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[BoardView], Array]:
-    """OCamCalib's numbers, its corners as views, and its errors by picture; its board runs along rows first."""
+    """OCamCalib's numbers, its corners as views, and its errors by image; its board runs along rows first."""
     told = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
     views = [BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
              for entry in told["images"]]
@@ -47,7 +47,7 @@ def lifted_apart_deg(ocam: Calibration, omni: Calibration) -> Array:
 
 @pytest.mark.slow
 def test_all_boards_are_found_and_both_models_fit_and_agree(shared_data: Path) -> None:
-    images = pictures(shared_data)
+    images = read_images(shared_data)
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 10
     ocam, omni = (sharpened(calibrate([view for view in views if view], BOARD, SIZE, model), images, model, "mirror")
@@ -76,7 +76,7 @@ def test_the_toolboxs_own_corners_give_its_camera_with_less_error(shared_data: P
 
 def test_our_corners_are_where_the_toolbox_has_them(shared_data: Path) -> None:
     _, views, _ = reference(shared_data, "ocam_subpix")
-    images = pictures(shared_data)
+    images = read_images(shared_data)
     for told in views[:3]:
         found = find_board(images[told.name], BOARD).view
         assert found is not None

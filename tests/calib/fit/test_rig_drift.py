@@ -74,8 +74,8 @@ def test_a_rim_that_has_moved_is_told(moved: tuple[float, float], radius: float,
     v, u = np.indices((260, 260))
     center = (130.0 + moved[0], 128.0 + moved[1])
     grey = np.random.default_rng(0).integers(120, 200, (260, 260))
-    picture = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
-    shift = rim_shift(picture, Mask((130.0, 128.0), 0.0, 100.0))
+    image = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
+    shift = rim_shift(image, Mask((130.0, 128.0), 0.0, 100.0))
     assert shift is not None and shift.fits == fits
     assert shift.moved_px == pytest.approx(moved, abs=0.5) and shift.wider_px == pytest.approx(radius - 100, abs=2.5)
-    assert rim_shift(picture, None) is None and rim_shift(np.zeros_like(picture), Mask((130.0, 128.0), 0, 100)) is None
+    assert rim_shift(image, None) is None and rim_shift(np.zeros_like(image), Mask((130.0, 128.0), 0, 100)) is None

@@ -1,4 +1,4 @@
-"""The mirror's rim: drawn ones to a fraction of a pixel, real ones, and None for pictures that have none."""
+"""The mirror's rim: drawn ones to a fraction of a pixel, real ones, and None for images that have none."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ R = np.hypot(U - CENTER[0], V - CENTER[1])
 
 
 def world(seed: int = 0) -> NDArray[np.float64]:
-    """A picture with light and dark patches."""
+    """A image with light and dark patches."""
     coarse = np.random.default_rng(seed).uniform(40, 230, (24, 24))
     return np.asarray(cv2.resize(coarse, (768, 768), interpolation=cv2.INTER_LINEAR))
 
@@ -44,22 +44,22 @@ def test_a_drawn_rim_is_found_from_any_fair_guess(guess: tuple[float, float]) ->
 
 
 def test_a_hub_is_found_and_a_glint_on_it_does_no_harm() -> None:
-    picture = drawn(inner=60.0)
-    assert_ring(find_rim(picture, (384.0, 384.0)), inner=60.0)
-    cv2.circle(picture, (391, 378), 20, 130, -1)
-    assert_ring(find_rim(picture, (384.0, 384.0)), inner=60.0)
+    image = drawn(inner=60.0)
+    assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
+    cv2.circle(image, (391, 378), 20, 130, -1)
+    assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
 
 
-def test_a_rim_that_the_picture_cuts_off_above_and_below_is_found() -> None:
+def test_a_rim_that_the_image_cuts_off_above_and_below_is_found() -> None:
     mask = find_rim(drawn(outer=365.0)[90:-80], (384.0, 300.0))
     assert mask is not None
     assert (*mask.center, mask.outer_px) == pytest.approx((CENTER[0], CENTER[1] - 90, 363.5), abs=0.6)
 
 
 def test_a_dark_object_over_a_third_of_the_rim_does_no_harm() -> None:
-    picture = drawn()
-    picture[np.abs(np.arctan2(V - CENTER[1], U - CENTER[0])) < np.pi / 3.2] = 9
-    assert_ring(find_rim(picture, (384.0, 384.0)))
+    image = drawn()
+    image[np.abs(np.arctan2(V - CENTER[1], U - CENTER[0])) < np.pi / 3.2] = 9
+    assert_ring(find_rim(image, (384.0, 384.0)))
 
 
 def squares() -> NDArray[np.float64]:
@@ -81,8 +81,8 @@ NOTHING = {
 
 @pytest.mark.parametrize("name", NOTHING)
 def test_none_rather_than_nonsense(name: str) -> None:
-    picture = np.clip(NOTHING[name], 0, 255).astype(np.uint8)
-    assert find_rim(picture, (picture.shape[1] / 2, picture.shape[0] / 2)) is None
+    image = np.clip(NOTHING[name], 0, 255).astype(np.uint8)
+    assert find_rim(image, (image.shape[1] / 2, image.shape[0] / 2)) is None
 
 
 def test_the_inside_of_a_mirror_alone_has_no_rim() -> None:
@@ -90,10 +90,10 @@ def test_the_inside_of_a_mirror_alone_has_no_rim() -> None:
 
 
 def test_real_mirrors(shared_data: Path) -> None:
-    """Ten pictures of one mirror whose rim the picture cuts off above and below, with the lens in its middle."""
-    pictures: list[Any] = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    """Ten images of one mirror whose rim the image cuts off above and below, with the lens in its middle."""
+    images: list[Any] = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
                            for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
-    found = [find_rim(picture, (512.0, 384.0)) for picture in pictures]
+    found = [find_rim(image, (512.0, 384.0)) for image in images]
     masks = [mask for mask in found if mask is not None]
     assert len(masks) >= 8
     rings = np.array([(*mask.center, mask.inner_px, mask.outer_px) for mask in masks])

@@ -129,10 +129,10 @@ def test_ocam_refuses_what_is_no_camera(change: dict[str, object]) -> None:
         OcamCamera(**{**values, **change})  # type: ignore[arg-type]
 
 
-def test_a_mask_is_a_ring_without_what_its_picture_blanks_out() -> None:
-    picture = np.full((40, 60), 255, np.uint8)
-    picture[:, 40] = 0
-    mask = Mask((30.0, 20.0), 3.0, 15.0, picture)
+def test_a_mask_is_a_ring_without_what_its_image_blanks_out() -> None:
+    image = np.full((40, 60), 255, np.uint8)
+    image[:, 40] = 0
+    mask = Mask((30.0, 20.0), 3.0, 15.0, image)
     pixels = np.array([[30, 20], [34, 20], [30, 34], [30, 36], [40, 20], [np.nan, 1]], float)
     assert mask.contains(pixels).tolist() == [False, True, True, False, False, False]
     assert mask.contains(pixels, 2.0).tolist() == [False] * 6

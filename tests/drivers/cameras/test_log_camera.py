@@ -9,28 +9,28 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import LATEST_NS, LogCamera, Pictures
+from drivers.cameras.log_camera import LATEST_NS, LogCamera, LogImages
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.mcap_reader import LogReader
 from tests.conftest import PAIRS
-from tests.replay.edited import Picture, pictures, save
+from tests.replay.edited import Image, images, save
 
 FAST = 50.0
 PATIENCE_S = 20.0
 
 
 @pytest.fixture(scope="module")
-def recorded(scene: Path) -> Pictures:
-    return Pictures.of(scene / "log.mcap")
+def recorded(scene: Path) -> LogImages:
+    return LogImages.of(scene / "log.mcap")
 
 
-def stamps(recorded: Pictures, camera: Camera, count: int) -> list[int]:
+def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
     """The schedule of a camera at pace 1, without waiting for it."""
     return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, 0)._schedule(), count)]
 
 
-def test_the_pictures_are_those_of_the_log(scene: Path, recorded: Pictures) -> None:
+def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> None:
     epoch_ns = time.monotonic_ns()
     seen: list[Frame] = list(LogCamera(recorded, "upper", epoch_ns, pace=FAST, once=True).frames())
     reader = LogReader(scene / "log.mcap")
@@ -44,17 +44,17 @@ def test_the_pictures_are_those_of_the_log(scene: Path, recorded: Pictures) -> N
 
 
 def reader_first(scene: Path) -> int:
-    return pictures(scene / "log.mcap")[0].stamp_ns
+    return images(scene / "log.mcap")[0].stamp_ns
 
 
-def test_no_frame_comes_before_its_stamp(recorded: Pictures) -> None:
+def test_no_frame_comes_before_its_stamp(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
     for frame in islice(camera.frames(), 2 * PAIRS + 5):
         assert frame.stamp_ns <= time.monotonic_ns() and frame.camera == "lower"
     assert camera.state.status == "streaming" and camera.state.frames + camera.state.drops >= 2 * PAIRS + 5
 
 
-def test_forwards_and_backwards_in_even_steps(recorded: Pictures) -> None:
+def test_forwards_and_backwards_in_even_steps(recorded: LogImages) -> None:
     passes = 6
     lower, upper = (stamps(recorded, name, passes * PAIRS) for name in ("lower", "upper"))  # type: ignore[arg-type]
     steps_ns = [b - a for a, b in pairwise(lower)]
@@ -63,16 +63,16 @@ def test_forwards_and_backwards_in_even_steps(recorded: Pictures) -> None:
     assert max(apart_ns) < 5e6, "both cameras turn at once"
 
 
-def test_cameras_stay_in_step_though_one_has_lost_pictures(tmp_path: Path, scene: Path) -> None:
-    taken = [p for p in pictures(scene / "log.mcap") if not (p.camera == "upper" and p.pair in (3, 4, 5, 6, 7))]
-    holed = Pictures.of(save(tmp_path / "holed.mcap", taken))
+def test_cameras_stay_in_step_though_one_has_lost_images(tmp_path: Path, scene: Path) -> None:
+    taken = [p for p in images(scene / "log.mcap") if not (p.camera == "upper" and p.pair in (3, 4, 5, 6, 7))]
+    holed = LogImages.of(save(tmp_path / "holed.mcap", taken))
     lower, upper = stamps(holed, "lower", 20 * PAIRS), stamps(holed, "upper", 20 * (PAIRS - 5))
     assert abs(lower[-1] - upper[-1]) < 5e6
     nearest_ns = [min(abs(at_ns - other_ns) for other_ns in lower) for at_ns in upper[:300]]
     assert max(nearest_ns) < 5e6
 
 
-def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: Pictures) -> None:
+def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
     frames = camera.frames()
     first = next(frames)
@@ -82,13 +82,13 @@ def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: Pictures) -
     assert camera.state.drops == later.seq - first.seq - 1 > 0
 
 
-def test_what_was_due_before_the_camera_was_made_is_not_a_drop(recorded: Pictures) -> None:
+def test_what_was_due_before_the_camera_was_made_is_not_a_drop(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns() - 10**9, pace=FAST)
     first = next(camera.frames())
     assert first.seq > 10 and camera.state.drops == 0
 
 
-def test_close_ends_a_wait(recorded: Pictures) -> None:
+def test_close_ends_a_wait(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns() + 10**12)
     seen: list[Frame] = []
     thread = threading.Thread(target=lambda: seen.extend(camera.frames()))
@@ -100,15 +100,15 @@ def test_close_ends_a_wait(recorded: Pictures) -> None:
 
 
 @pytest.mark.parametrize("pace", [0.0, -1.0, float("nan"), float("inf"), 1e-300])
-def test_a_pace_that_is_none_is_refused(recorded: Pictures, pace: float) -> None:
+def test_a_pace_that_is_none_is_refused(recorded: LogImages, pace: float) -> None:
     with pytest.raises(DriverError, match="pace"):
         LogCamera(recorded, "lower", 0, pace=pace)
 
 
 def test_logs_that_show_nothing_are_refused(tmp_path: Path, scene: Path) -> None:
-    taken: list[Picture] = pictures(scene / "log.mcap")
+    taken: list[Image] = images(scene / "log.mcap")
     few = [p for p in taken if p.camera == "lower" or p.pair == 0]
-    with pytest.raises(DriverError, match="24 pictures of the lower and 1 of the upper"):
-        Pictures.of(save(tmp_path / "few.mcap", few))
+    with pytest.raises(DriverError, match="24 images of the lower and 1 of the upper"):
+        LogImages.of(save(tmp_path / "few.mcap", few))
     with pytest.raises(DriverError):
-        Pictures.of(tmp_path / "none.mcap")
+        LogImages.of(tmp_path / "none.mcap")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.v4l2_buffers import WARNING, CameraState, Ledger
+from drivers.cameras.v4l2_buffers import WARNING, BufferAccounting, CameraState
 
 PERIOD_NS = 33_333_000
 START_NS = 5_000 * 10**9
@@ -17,11 +17,13 @@ class Books:
 
     def __init__(self) -> None:
         self.state, self.said = CameraState(), list[tuple[int, str]]()
-        self.ledger = Ledger("lower camera", self.state, lambda severity, text: self.said.append((severity, text)))
+        self.ledger = BufferAccounting(
+            "lower camera", self.state, lambda severity, text: self.said.append((severity, text))
+        )
 
     def admit(self, sequence: int, *, stamp_ns: int, arrival_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC,
               size: int = 100) -> int | None:  # fmt: skip
-        buffer = v4l2.Buffer(sequence=sequence % 2**32, flags=flags, bytesused=size)
+        buffer = v4l2.V4l2Buffer(sequence=sequence % 2**32, flags=flags, bytesused=size)
         buffer.timestamp.tv_sec, rest_ns = divmod(stamp_ns, 10**9)
         buffer.timestamp.tv_usec = rest_ns // 1000
         return self.ledger.admit(buffer, arrival_ns, 100)
@@ -38,7 +40,7 @@ def books() -> Books:
     return Books()
 
 
-def test_whole_pictures_keep_the_kernels_stamp(books: Books) -> None:
+def test_whole_images_keep_the_kernels_stamp(books: Books) -> None:
     assert books.regular(0, 1, 2) == [START_NS, START_NS + PERIOD_NS, START_NS + 2 * PERIOD_NS]
     assert books.state == CameraState() and books.said == []
 

@@ -13,11 +13,11 @@ from drivers.cameras import v4l2_ioctl
 SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
     "Capability": (104, 104), "FormatDescription": (64, 64), "FrameSize": (44, 44), "FrameInterval": (52, 52),
     "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204), "BufferRequest": (20, 20),
-    "Buffer": (88, 68), "QueryControl": (68, 68), "QueryMenu": (44, 44), "Control": (8, 8),
+    "V4l2Buffer": (88, 68), "QueryControl": (68, 68), "QueryMenu": (44, 44), "V4l2Control": (8, 8),
 }  # fmt: skip
 OFFSETS = {
-    ("Buffer", "flags"): (12, 12), ("Buffer", "timestamp"): (24, 20), ("Buffer", "sequence"): (56, 44),
-    ("Buffer", "m"): (64, 52), ("Buffer", "length"): (72, 56), ("Format", "fmt"): (8, 4),
+    ("V4l2Buffer", "flags"): (12, 12), ("V4l2Buffer", "timestamp"): (24, 20), ("V4l2Buffer", "sequence"): (56, 44),
+    ("V4l2Buffer", "m"): (64, 52), ("V4l2Buffer", "length"): (72, 56), ("Format", "fmt"): (8, 4),
     ("StreamParameters", "capability"): (4, 4), ("StreamParameters", "timeperframe"): (12, 12),
     ("FrameInterval", "interval"): (20, 20),
 }  # fmt: skip

@@ -13,7 +13,7 @@ from drivers.cameras.v4l2_controls import (
     EXPOSURE_MAY_SLOW,
     GAIN,
     POWER_LINE_FREQUENCY,
-    Control,
+    CameraControl,
     planned,
 )
 from drivers.cameras.v4l2_modes import Mode, Sizes, choose
@@ -30,13 +30,13 @@ MENU = {0: "Disabled", 1: "50 Hz", 2: "60 Hz"}
 OFFERED = {
     control.id: control
     for control in (
-        Control(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={1: "Manual Mode", 3: "Aperture Priority Mode"}),
-        Control(EXPOSURE, "exposure_time_absolute", 1, 3, 2047),
-        Control(EXPOSURE_MAY_SLOW, "exposure_dynamic_framerate", 2, 0, 1),
-        Control(GAIN, "gain", 1, 0, 100, 5),
-        Control(AUTO_GAIN, "gain_automatic", 2, 0, 1),
-        Control(POWER_LINE_FREQUENCY, "power_line_frequency", 3, 0, 2, menu=MENU),
-        Control(0x980901, "contrast", 1, -64, 64),
+        CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={1: "Manual Mode", 3: "Aperture Priority Mode"}),
+        CameraControl(EXPOSURE, "exposure_time_absolute", 1, 3, 2047),
+        CameraControl(EXPOSURE_MAY_SLOW, "exposure_dynamic_framerate", 2, 0, 1),
+        CameraControl(GAIN, "gain", 1, 0, 100, 5),
+        CameraControl(AUTO_GAIN, "gain_automatic", 2, 0, 1),
+        CameraControl(POWER_LINE_FREQUENCY, "power_line_frequency", 3, 0, 2, menu=MENU),
+        CameraControl(0x980901, "contrast", 1, -64, 64),
     )
 }
 
@@ -95,7 +95,9 @@ def test_a_fixed_value_has_its_automatic_switched_off_before() -> None:
 
 def test_automatic_exposure_is_the_one_the_camera_has_and_must_not_slow_it() -> None:
     assert plan(auto_exposure="on") == [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]
-    full = {AUTO_EXPOSURE: Control(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})}
+    full = {
+        AUTO_EXPOSURE: CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})
+    }
     assert planned(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
 
 

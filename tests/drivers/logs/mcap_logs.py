@@ -41,7 +41,9 @@ def compressed(stamp_ns: int, data: bytes, format_: str = "jpeg", little_endian:
     return bytes(STORE.serialize_cdr(message, COMPRESSED, little_endian=little_endian))
 
 
-def image(stamp_ns: int, encoding: str, pixels: NDArray[Any], bigendian: int = 0, little_endian: bool = True) -> bytes:
+def image_message(
+    stamp_ns: int, encoding: str, pixels: NDArray[Any], bigendian: int = 0, little_endian: bool = True
+) -> bytes:
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(pixels.shape[0], -1)
     message = TYPES[IMAGE](
         header(stamp_ns), pixels.shape[0], pixels.shape[1], encoding, bigendian, rows.shape[1], rows.ravel()
@@ -53,14 +55,14 @@ def text(words: str) -> bytes:
     return bytes(STORE.serialize_cdr(TYPES["std_msgs/msg/String"](words), "std_msgs/msg/String"))
 
 
-def picture(topic: str, stamp_ns: int, value: int = 0) -> Entry:
+def image(topic: str, stamp_ns: int, value: int = 0) -> Entry:
     return Entry(topic, COMPRESSED, compressed(stamp_ns, jpeg(value)), stamp_ns)
 
 
 def pairs(count: int, lower: str = LOWER, upper: str = UPPER) -> list[Entry]:
-    """The pictures of count pairs, 0.1 s apart, the upper camera 1 ms later."""
+    """The images of count pairs, 0.1 s apart, the upper camera 1 ms later."""
     stamps = [START_NS + index * 10**8 for index in range(count)]
-    return [picture(t, s + d, s // 10**8) for s in stamps for t, d in ((lower, 0), (upper, 10**6))]
+    return [image(t, s + d, s // 10**8) for s in stamps for t, d in ((lower, 0), (upper, 10**6))]
 
 
 def write_log(

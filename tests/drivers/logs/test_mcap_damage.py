@@ -20,7 +20,18 @@ from drivers.errors import BrokenFrame, DriverError
 from drivers.logs.mcap_reader import LogReader
 from drivers.logs.mcap_records import MAGIC
 from drivers.logs.ros_image import parse_image
-from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, UPPER, Entry, image, pairs, picture, write_log
+from tests.drivers.logs.mcap_logs import (
+    BARE,
+    COMPRESSED,
+    IMAGE,
+    LOWER,
+    UPPER,
+    Entry,
+    image,
+    image_message,
+    pairs,
+    write_log,
+)
 
 LAYOUTS: list[dict[str, Any]] = [
     {"compression": CompressionType.LZ4, "chunk_size": 700},
@@ -236,9 +247,11 @@ def test_a_kept_frame_keeps_no_chunk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [COMPRESSED, IMAGE])
-def test_damaged_messages_are_pictures_or_broken_and_nothing_else(kind: str) -> None:
+def test_damaged_messages_are_images_or_broken_and_nothing_else(kind: str) -> None:
     chance = random.Random(8)
-    whole = picture(LOWER, 10**18).data if kind == COMPRESSED else image(10**18, "mono8", np.zeros((4, 5), np.uint8))
+    whole = (
+        image(LOWER, 10**18).data if kind == COMPRESSED else image_message(10**18, "mono8", np.zeros((4, 5), np.uint8))
+    )
     for size in range(len(whole)):
         with pytest.raises(BrokenFrame):
             parse_image(kind, memoryview(whole[:size]))

@@ -29,9 +29,9 @@ from tests.drivers.logs.mcap_logs import (
     Entry,
     compressed,
     image,
+    image_message,
     jpeg,
     pairs,
-    picture,
     text,
     write_log,
 )
@@ -104,12 +104,12 @@ def test_every_layout_of_the_file_gives_the_same_frames(
     ],
 )
 @pytest.mark.parametrize("little_endian", [True, False])
-def test_raw_pictures(
+def test_raw_images(
     tmp_path: Path, encoding: str, to_gray: Callable[[NDArray[Any]], NDArray[Any]], little_endian: bool
 ) -> None:
     pixels = np.random.default_rng(2).integers(0, 256, (9, 14, 4), np.uint8)
     channels = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3}.get(encoding, 4)
-    data = image(START_NS, encoding, pixels[..., :channels], little_endian=little_endian)
+    data = image_message(START_NS, encoding, pixels[..., :channels], little_endian=little_endian)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/cam/top", "/cam/bottom")]))
     assert [frame.camera for frame in frames] == ["lower", "upper"]
     for frame in frames:
@@ -119,7 +119,7 @@ def test_raw_pictures(
 @pytest.mark.parametrize(("order", "bigendian"), [("<u2", 0), (">u2", 1)])
 def test_sixteen_bits_in_both_byte_orders(tmp_path: Path, order: str, bigendian: int) -> None:
     values = np.random.default_rng(2).integers(0, 2**16, (9, 14), np.uint16)
-    data = image(START_NS, "mono16", values.astype(order), bigendian)
+    data = image_message(START_NS, "mono16", values.astype(order), bigendian)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/a/lower", "/a/upper")]))
     np.testing.assert_array_equal(gray(frames[0]), values >> 8)
 
@@ -181,14 +181,14 @@ def test_a_frame_that_comes_after_its_window_is_dropped_and_counted(tmp_path: Pa
 
 def test_a_second_frame_with_the_same_stamp_is_dropped_and_counted(tmp_path: Path) -> None:
     entries = pairs(5)
-    copy = picture(LOWER, entries[4].log_time_ns, 200)
+    copy = image(LOWER, entries[4].log_time_ns, 200)
     frames, reader = read(write_log(tmp_path / "log.mcap", [*entries[:5], copy, *entries[5:], entries[9]]))
     assert places(frames) == in_order(5)
     assert reader.counts["duplicate"] == 2 and bytes(frames[4].data) != jpeg(200)
 
 
 def test_both_cameras_may_have_the_same_stamp(tmp_path: Path) -> None:
-    entries = [picture(topic, START_NS + n) for n in range(3) for topic in (UPPER, LOWER)]
+    entries = [image(topic, START_NS + n) for n in range(3) for topic in (UPPER, LOWER)]
     frames, _ = read(write_log(tmp_path / "log.mcap", entries))
     assert [(f.camera, f.seq) for f in frames] == [(c, n) for n in range(3) for c in ("lower", "upper")]
 
@@ -201,7 +201,7 @@ def test_an_unset_stamp_is_replaced_by_the_time_of_logging(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("damage", [b"", b"\0\1", b"\0\7\0\0" + bytes(40), b"\0\1\0\0" + b"\xff" * 40])
-def test_a_message_that_is_no_picture_is_skipped_and_counted(tmp_path: Path, damage: bytes) -> None:
+def test_a_message_that_is_no_image_is_skipped_and_counted(tmp_path: Path, damage: bytes) -> None:
     entries = pairs(4)
     entries.insert(3, Entry(LOWER, COMPRESSED, damage, START_NS))
     frames, reader = read(write_log(tmp_path / "log.mcap", entries))

@@ -24,7 +24,7 @@ from drivers.logs.mcap_messages import DataSection
 from drivers.logs.mcap_records import LogFile
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import NOTICE, WARNING, RotatingLog
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, picture
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, image
 
 ROOT = Path(__file__).parents[3]
 RIG = {"rig.toml": b"version = 1"}
@@ -300,7 +300,7 @@ def test_what_survives_is_counted_at_every_moment(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path, chunk_bytes=3000) as log:
         for n in range(100):
-            log.write(*picture(LOWER, START_NS + n * TICK_NS))
+            log.write(*image(LOWER, START_NS + n * TICK_NS))
             kept = len(list(DataSection(LogFile(path), Catalog()).messages()))
             assert log.kept == kept and log.messages == n + 1
         assert n - log.kept < 15 and log.size_bytes == path.stat().st_size

@@ -47,7 +47,7 @@ def test_one_given_name_leaves_the_other_to_its_own(tmp_path: Path) -> None:
 IMAGES = {"/a/lower/image_raw": IMAGE, "/a/upper/image_raw": IMAGE}
 
 
-def test_compressed_pictures_are_preferred_and_depth_is_no_picture() -> None:
+def test_compressed_images_are_preferred_and_depth_is_no_image() -> None:
     both = IMAGES | {name + "/compressed": COMPRESSED for name in IMAGES}
     both |= {name + "/compressedDepth": COMPRESSED for name in IMAGES}
     assert choose_topics("log", both, {"lower": None, "upper": None}) == {

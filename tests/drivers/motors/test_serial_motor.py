@@ -19,8 +19,8 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import Script, T
 from drivers.motors.protocols.line_protocol import (
     LineProtocol,
+    LineStatus,
     SetWatchdog,
-    Status,
     Velocity,
     WatchdogSet,
     decode,
@@ -108,7 +108,7 @@ def test_watchdog_stops_the_wheels_and_says_so() -> None:
     state.base.advance(1.0)
     assert state.base.watchdog_expired and state.base.velocity_mps == 0.0 and state.base.expiries == 1
     answers = [state.handle(encode(Velocity(20 + i, stop_command(0)))) for i in range(2)]
-    expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, Status)]
+    expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, LineStatus)]
     assert expired == [True, False]
 
 
@@ -133,7 +133,7 @@ def test_heading_counts_from_where_the_host_connected() -> None:
     drive(state, 4.0, VelocityCommand(0, 0.0, 1.0, 0.1))
     state.handle(encode(SetWatchdog(500)))
     answer = decode(state.handle(encode(Velocity(0, stop_command(0)))) or b"")
-    assert isinstance(answer, Status) and answer.status.heading_rad == 0.0
+    assert isinstance(answer, LineStatus) and answer.status.heading_rad == 0.0
     assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
 
 
@@ -248,7 +248,9 @@ class Noisy(SimulatedLine):
     def handle(self, line: bytes) -> bytes | None:
         """The twin's answer behind noise, a broken line and an old status."""
         answer = super().handle(line) or b""
-        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + encode(Status(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0))) + answer
+        return (
+            b"\xff\x00$S,1" + b"$S,9,9*0000\n" + encode(LineStatus(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0))) + answer
+        )
 
 
 def test_noise_before_the_answer_is_skipped_and_counted() -> None:

@@ -35,7 +35,7 @@ LOWER, UPPER = "/dev/omnid/lower", "/dev/omnid/upper"
 BIND = Path("/sys/bus/platform/drivers/vivid")
 DROPS, DISCONNECT, FLAG_ERROR, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F042, 0xF0F046  # vivid's own controls
 GAIN = 0x980913
-# the start of the exposure as stamp: the end of the frame lies in the future; no text within the picture
+# the start of the exposure as stamp: the end of the frame lies in the future; no text within the image
 STILL = ("timestamp_source=1", "osd_text_mode=2")
 
 
@@ -47,7 +47,7 @@ def control(device: str, control_id: int, value: int | None = None) -> int:
     """Sets or presses a control behind the driver's back, or reads it."""
     fd = os.open(device, os.O_RDWR)
     try:
-        entry = v4l2.Control(control_id, value or 0)
+        entry = v4l2.V4l2Control(control_id, value or 0)
         v4l2.call(fd, v4l2.G_CTRL if value is None else v4l2.S_CTRL, entry)
         return int(entry.value)
     finally:
@@ -112,21 +112,21 @@ class Watched:
 
 
 class Writer:
-    """Shows a picture on a loopback camera over and over, as a webcam would."""
+    """Shows a image on a loopback camera over and over, as a webcam would."""
 
-    def __init__(self, device: str, picture: bytes, pixel_format: str = "GREY") -> None:
+    def __init__(self, device: str, image: bytes, pixel_format: str = "GREY") -> None:
         self._loopback = Loopback(device, pixel_format, SIZE)
-        self._picture, self._halt = picture, threading.Event()
+        self._image, self._halt = image, threading.Event()
         self.pausing = False
         self._thread = threading.Thread(target=self._write, daemon=True)
 
     def _write(self) -> None:
         while not self._halt.wait(1 / RATE_HZ):
             if not self.pausing:
-                self._loopback.write(self._picture)
+                self._loopback.write(self._image)
 
     def __enter__(self) -> Writer:
-        self._loopback.write(self._picture)
+        self._loopback.write(self._image)
         self._thread.start()
         return self
 
@@ -178,8 +178,8 @@ def no_file_stays_open() -> Iterator[None]:
 
 
 def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
-    picture = bytes(SIZE[0] * SIZE[1])
-    with Writer(DEVICES[0], picture), Writer(DEVICES[1], picture):
+    image = bytes(SIZE[0] * SIZE[1])
+    with Writer(DEVICES[0], image), Writer(DEVICES[1], image):
         real = [Watched(LOWER), Watched(UPPER)]
         looped = [Watched(device, controls=()) for device in DEVICES]
         with real[0], real[1], looped[0], looped[1]:
@@ -272,14 +272,14 @@ def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
 
 
 def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
-    device, picture = DEVICES[0], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, picture) as writer:
+    device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, image) as writer:
         watched = Watched(device, controls=(), timeout_s=1.0)
         with watched:
             watched.more(5)
             writer.pausing = True
             until(lambda: watched.state.status == "lost")
-            assert "no good picture for 1 s" in watched.state.problem
+            assert "no good image for 1 s" in watched.state.problem
             until(lambda: watched.state.reopens >= 2)
             writer.pausing = False
             watched.more(5)
@@ -288,13 +288,13 @@ def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
 
 
 def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
-    device, picture = DEVICES[1], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, picture):
+    device, image = DEVICES[1], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, image):
         watched = Watched(device, controls=(), timeout_s=1.0)
         watched.thread.start()
         watched.more(5)
     until(lambda: "no capture device" in watched.state.problem)
-    with Writer(device, picture):
+    with Writer(device, image):
         watched.more(5)
         watched.__exit__()
     watched.require_order()
@@ -302,28 +302,28 @@ def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
 
 
 def test_motion_jpeg_arrives_whole(loopback: None) -> None:
-    picture = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
-    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+    image = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
     with Writer(DEVICES[0], jpeg, "MJPG"), Watched(DEVICES[0], controls=(), pixel_format="auto") as watched:
         watched.more(5)
     assert watched.last and watched.last.encoding == "jpeg"
-    assert np.abs(gray(watched.last).astype(int) - picture).max() < 12
+    assert np.abs(gray(watched.last).astype(int) - image).max() < 12
 
 
 def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
-    pictures = {}
+    images = {}
     for name in ("GREY", "YUYV", "UYVY", "NV12"):
         with Watched(pixel_format=name) as watched:
             watched.more(2)
         assert watched.last and watched.state.mode.startswith(name)
-        pictures[name] = gray(watched.last)
-        assert pictures[name].shape == SIZE[::-1] and np.ptp(pictures[name]) > 100
+        images[name] = gray(watched.last)
+        assert images[name].shape == SIZE[::-1] and np.ptp(images[name]) > 100
     for name in ("UYVY", "NV12"):
-        np.testing.assert_allclose(pictures[name].astype(int), pictures["YUYV"], atol=3)
-    assert np.corrcoef(pictures["GREY"].ravel(), pictures["YUYV"].ravel())[0, 1] > 0.95
+        np.testing.assert_allclose(images[name].astype(int), images["YUYV"], atol=3)
+    assert np.corrcoef(images["GREY"].ravel(), images["YUYV"].ravel())[0, 1] > 0.95
 
 
-def test_controls_are_in_force_before_the_first_picture(vivid: None) -> None:
+def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
     assert control(LOWER, GAIN) != 33
     with Watched(gain=33, controls=(*STILL, "brightness=40", "hue=-7")):
         listed = run("v4l2-ctl", "-d", LOWER, "-C", "gain,gain_automatic,brightness,hue")
@@ -365,8 +365,8 @@ def test_an_output_is_no_camera(loopback: None) -> None:
 
 
 def test_close_ends_a_wait_and_may_come_at_any_time(vivid: None, loopback: None) -> None:
-    device, picture = DEVICES[0], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, picture) as writer, Watched(device, controls=(), timeout_s=60.0) as watched:
+    device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
+    with Writer(device, image) as writer, Watched(device, controls=(), timeout_s=60.0) as watched:
         watched.more(1)
         writer.pausing = True
         time.sleep(0.5)

@@ -1,6 +1,6 @@
 """Run by pytest in the guest, as root: `omnid run` under its unit, two loopback cameras, a motor at ttyS1.
 
-The tests build on each other. The cameras show the sample log: each picture again and again until the daemon has told
+The tests build on each other. The cameras show the sample log: each image again and again until the daemon has told
 a pose of it, then the next, so that an emulated machine may take its time. All deadlines are long for the same reason.
 """
 
@@ -21,7 +21,7 @@ import serial  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.cameras.log_camera import Pictures
+from drivers.cameras.log_camera import LogImages
 from tests.hardware.guest.loopback import load_loopback
 from tests.hardware.guest.unit import DROP_INS, SYSTEMD, restarted, run, said, show, until
 from tests.hardware.guest.world import SAMPLE, Operator, World
@@ -183,7 +183,7 @@ def test_one_camera_gone_stops_the_wheels_until_it_is_back(world: World, operato
     world.close("lower")
     until(lambda: wheels.told_mps == 0.0)
     until(lambda: operator.message("lower camera").startswith("camera /dev/omnid/lower"))
-    until(lambda: operator.message("pairing") == "no pictures of the lower camera")
+    until(lambda: operator.message("pairing") == "no images of the lower camera")
     assert wheels.ask()["fastest_mps"] == 0.0
     world.open("lower")
     operator.more(3)
@@ -246,8 +246,8 @@ def test_what_is_recorded_from_the_cameras_alone_is_a_log(operator: Operator, tm
         "--config", "/etc/omnid/omnid.toml")
     log, = (tmp_path / "boards").glob("*.mcap")
     assert "rig.toml" in run("/opt/omnid/bin/omnid", "log", "info", str(log))
-    pictures = Pictures.of(log)
-    for eye in (pictures.lower, pictures.upper):
+    images = LogImages.of(log)
+    for eye in (images.lower, images.upper):
         stamps_ns = [frame.stamp_ns for _, frame in eye]
         assert len(stamps_ns) > 10 and stamps_ns == sorted(set(stamps_ns))
         assert {frame.encoding for _, frame in eye} == {"jpeg"}

@@ -1,4 +1,4 @@
-"""Pictures of our own as the pictures of a camera, by v4l2loopback; for scripts in a guest."""
+"""Images of our own as the images of a camera, by v4l2loopback; for scripts in a guest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def load_loopback() -> None:
 
 
 class Loopback:
-    """The inner end of a loopback camera, which is a camera from the first picture until it is closed."""
+    """The inner end of a loopback camera, which is a camera from the first image until it is closed."""
 
     def __init__(self, device: str, pixel_format: str, size_px: tuple[int, int]) -> None:
         self._fd = os.open(device, os.O_RDWR)
@@ -29,10 +29,10 @@ class Loopback:
         v4l2.call(self._fd, v4l2.S_FMT, asked)
         v4l2.call(self._fd, v4l2.STREAMON, v4l2.Number(OUTPUT))  # else its writer is never seen to go
 
-    def write(self, picture: bytes) -> None:
-        """Shows the picture; the kernel stamps it now."""
-        os.write(self._fd, picture)
+    def write(self, image: bytes) -> None:
+        """Shows the image; the kernel stamps it now."""
+        os.write(self._fd, image)
 
     def close(self) -> None:
-        """Pulls the plug, as far as a reader can tell: pictures stop."""
+        """Pulls the plug, as far as a reader can tell: images stop."""
         os.close(self._fd)

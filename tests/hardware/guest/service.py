@@ -49,7 +49,7 @@ def unit() -> Iterator[None]:
     run("chmod", "-R", "a+rX", "/opt/omnid")
     Path("/etc/omnid").mkdir()
     run("chmod", "a+rwX", *OPEN)
-    shutil.copy(SYSTEMD / "omnid.runs.systemd", DROP_INS.parent)
+    shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
     DROP_INS.mkdir()
     (DROP_INS / "daemon.conf").write_text(DAEMON)
     run("systemctl", "daemon-reload")
@@ -59,13 +59,13 @@ def unit() -> Iterator[None]:
 
 def test_it_is_ready_when_it_says_so() -> None:
     run("systemctl", "start", "omnid")  # waits for READY=1
-    assert show("ActiveState") == "active" and show("StatusText").startswith("waiting for pictures")
+    assert show("ActiveState") == "active" and show("StatusText").startswith("waiting for images")
 
 
 def test_its_threads_have_names_and_only_two_have_priority() -> None:
     threads = {name: tuple(found) for name, found in reported()["threads"].items()}
     assert threads["motor"] == (FIFO, 20) and threads["lower"] == (FIFO, 10)
-    assert {"picture", "bus", "watchdog"} <= threads.keys()
+    assert {"image", "bus", "watchdog"} <= threads.keys()
     assert {found for name, found in threads.items() if name not in ("motor", "lower")} == {(OTHER, 0)}
 
 
@@ -97,9 +97,9 @@ def test_a_hung_stage_is_told_of_and_the_daemon_restarted() -> None:
     Path("/run/omnid/hang").touch()
     restarted(pid)
     lines = said()
-    assert any(priority == 3 and text.startswith("stage 'picture' is hung") for priority, text in lines)
+    assert any(priority == 3 and text.startswith("stage 'image' is hung") for priority, text in lines)
     assert any("in where_it_hangs" in text for _, text in lines)
-    assert any(text == "omnid.runs.systemd: Failed with result 'watchdog'." for _, text in lines)
+    assert any(text == "omnid.service: Failed with result 'watchdog'." for _, text in lines)
 
 
 def test_a_daemon_that_is_killed_comes_back() -> None:

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 
 from omnid.config import RealtimeConfig
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.logging_setup import WARNING, say
 from omnid.engine.realtime import ThreadStart, prepare, priorities
-from omnid.runs.systemd import Service, Status, show_stacks_at_the_end
+from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
 from omnid.transport.bus import Bus, BusConfig
 
 HANG = Path("/run/omnid/hang")
@@ -41,7 +41,7 @@ def numbers() -> Iterator[int]:
         yield 0
 
 
-class Picture:
+class Image:
     """A stage that uses OpenCV, until it hangs."""
 
     def process(self, number: int) -> int:
@@ -127,12 +127,12 @@ class Reporter:
 def main() -> None:
     """Runs until SIGTERM."""
     show_stacks_at_the_end()
-    config, tally, bus = RealtimeConfig(), Tally(), Bus(BusConfig())
+    config, tally, bus = RealtimeConfig(), RunStatistics(), Bus(BusConfig())
     graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))
-    graph.sink("bus", Speaker(bus), graph.stage("picture", Picture(), graph.source("lower", numbers)))
+    graph.sink("bus", Speaker(bus), graph.stage("image", Image(), graph.source("lower", numbers)))
     graph.ticker("motor", 0.05, lambda: None)
     graph.ticker("report", 0.1, Reporter())
-    service = Service(graph.telemetry, Status(tally, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
+    service = Service(graph.telemetry, StatusLine(tally, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
     graph.ticker("watchdog", service.period_s, service)
     signal.signal(signal.SIGTERM, lambda *_: graph.stop())
     for line in prepare(config, 1):

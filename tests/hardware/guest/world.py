@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from drivers.cameras.log_camera import Pictures
+from drivers.cameras.log_camera import LogImages
 from drivers.frame import Camera
 from omnid.client import Pose, Report, Robot
 from omnid.transport.decode import pose_from, report_from
@@ -17,12 +17,12 @@ from tests.hardware.guest.unit import until
 
 SAMPLE = Path("/opt/omnid/omnid/sample")
 SIZE = 512, 512
-AGAIN_S = 0.5  # a camera shows a picture that often
+AGAIN_S = 0.5  # a camera shows a image that often
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
 
 
 class Shown(NamedTuple):
-    """A picture of the lower camera and when it was written."""
+    """A image of the lower camera and when it was written."""
 
     at_ns: int  # CLOCK_MONOTONIC
     number: int  # in the log
@@ -32,8 +32,8 @@ class World:
     """What is before the cameras: the log, forwards and backwards, one step after each pose that was told of it."""
 
     def __init__(self) -> None:
-        pictures = Pictures.of(SAMPLE / "log.mcap")
-        self._data = [[bytes(timed[1].data) for timed in eye] for eye in (pictures.lower, pictures.upper)]
+        images = LogImages.of(SAMPLE / "log.mcap")
+        self._data = [[bytes(timed[1].data) for timed in eye] for eye in (images.lower, images.upper)]
         self._last = min(map(len, self._data)) - 1
         self._step, self._moved = 0, threading.Event()
         self._eyes: dict[Camera, Loopback] = {}
@@ -44,7 +44,7 @@ class World:
         threading.Thread(target=self._show_on, daemon=True).start()
 
     def open(self, camera: Camera) -> None:
-        """The camera shows pictures."""
+        """The camera shows images."""
         with self._lock:
             self._eyes[camera] = Loopback(DEVICES[CAMERAS.index(camera)], "MJPG", SIZE)
 
@@ -54,11 +54,11 @@ class World:
             self._eyes.pop(camera).close()
 
     def index(self, at_ns: int) -> int:
-        """Which picture was shown at that time."""
+        """Which image was shown at that time."""
         return self.shown[max(0, bisect.bisect([entry.at_ns for entry in self.shown], at_ns) - 1)].number
 
     def heed(self, at_ns: int) -> None:
-        """There is a pose of the pictures of that time: if they are those that are shown, on to the next."""
+        """There is a pose of the images of that time: if they are those that are shown, on to the next."""
         if self.shown and self.index(at_ns) == self._index:
             self._step += 1
             self._moved.set()
@@ -103,7 +103,7 @@ class Operator:
         self._robot.close()
 
     def index(self, pose: Pose) -> int:
-        """The picture it is a pose of."""
+        """The image it is a pose of."""
         return self._world.index(pose.stamp_ns - self._offset_ns)
 
     def message(self, part: str) -> str:

@@ -1,4 +1,4 @@
-"""`omnid calibrate camera`: from rendered pictures to camera.toml, report and mask; bad input is one clear line."""
+"""`omnid calibrate camera`: from rendered images to camera.toml, report and mask; bad input is one clear line."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ MASK = Mask(CAMERA.center, 30.0, 172.0)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight pictures of a board, all around."""
-    made = tmp_path_factory.mktemp("pictures")
+    """Eight images of a board, all around."""
+    made = tmp_path_factory.mktemp("images")
     studio = Studio.of(BOARD, CAMERA, MASK)
     for seed, T in enumerate(around(CAMERA, BOARD, MASK, 8, distance_m=(0.14, 0.25))):
-        cv2.imwrite(str(made / f"p{seed}.png"), studio.photograph(T, seed=seed).picture)
+        cv2.imwrite(str(made / f"p{seed}.png"), studio.photograph(T, seed=seed).image)
     return made
 
 
@@ -38,7 +38,7 @@ def run(*words: object, corners: str = "6x5") -> int:
     return main(["calibrate", "camera", *map(str, words), "--corners", corners, "--square-mm", "30", "--quiet"])
 
 
-def test_pictures_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path,
+def test_images_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path,
                                                     capsys: pytest.CaptureFixture[str]) -> None:
     out, report, mask = (tmp_path / name for name in ("camera.toml", "report.html", "mask.png"))
     assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
@@ -55,7 +55,7 @@ def test_pictures_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_patterns_and_the_omni_model_with_a_picture_that_has_no_board(folder: Path, tmp_path: Path,
+def test_patterns_and_the_omni_model_with_a_image_that_has_no_board(folder: Path, tmp_path: Path,
                                                                       capsys: pytest.CaptureFixture[str]) -> None:
     for path in folder.iterdir():
         shutil.copy(path, tmp_path)
@@ -67,13 +67,13 @@ def test_patterns_and_the_omni_model_with_a_picture_that_has_no_board(folder: Pa
 
 
 def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
-    """The pictures of a folder as PNG messages on every topic."""
+    """The images of a folder as PNG messages on every topic."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds = store.types
     with LogWriter(path) as writer:
-        for number, picture in enumerate(sorted(folder.iterdir())):
+        for number, image in enumerate(sorted(folder.iterdir())):
             header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](number + 1, 0), "camera")
-            data = np.frombuffer(picture.read_bytes(), np.uint8)
+            data = np.frombuffer(image.read_bytes(), np.uint8)
             message = kinds["sensor_msgs/msg/CompressedImage"](header, "png", data)
             cdr = store.serialize_cdr(message, "sensor_msgs/msg/CompressedImage")
             for topic in topics:
@@ -97,7 +97,7 @@ def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
     blank, other, text = tmp_path / "blank.png", tmp_path / "other.png", tmp_path / "notes.png"
     cv2.imwrite(str(blank), np.full((362, 360), 90, np.uint8))
     cv2.imwrite(str(other), np.full((300, 360), 90, np.uint8))
-    text.write_text("no picture")
+    text.write_text("no image")
     (tmp_path / "empty").mkdir(exist_ok=True)
     kinds: dict[str, list[object]] = {"blank": [blank], "three": [*three], "sizes": [*three, other], "text": [text],
                                       "empty": [tmp_path / "empty"], "none": [tmp_path / "none.png"],
@@ -106,11 +106,11 @@ def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
 
 
 @pytest.mark.parametrize(("kind", "says"), [
-    ("blank", "no board of 6x5 inner corners in any of 1 pictures; count the inner corners"),
-    ("three", "needs 4 views of the board at least, found 3; take more pictures"),
+    ("blank", "no board of 6x5 inner corners in any of 1 images; count the inner corners"),
+    ("three", "needs 4 views of the board at least, found 3; take more images"),
     ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
-    ("text", "notes.png: expected a picture"),
-    ("empty", "no picture"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
+    ("text", "notes.png: expected a image"),
+    ("empty", "no image"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
                                                capsys: pytest.CaptureFixture[str]) -> None:

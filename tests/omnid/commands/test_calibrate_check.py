@@ -12,7 +12,7 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.log_rig_check import Looked, look, open_log, read_pairs_of
+from omnid.calibration.log_rig_check import RigCheckResult, look, open_log, read_pairs_of
 from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
@@ -27,7 +27,7 @@ def pairs(scene: Path) -> list[FramePair]:
     return read_pairs_of(open_log(scene / "log.mcap", (None, None), rig), rig)
 
 
-def looked(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> Looked:
+def looked(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
     return look(pairs, misturned(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
 
 
@@ -117,12 +117,12 @@ def test_bad_input_is_one_line(scene: Path, words: list[str], says: str, capsys:
     assert says in line
 
 
-def test_pictures_of_another_size_are_one_line(scene: Path, tmp_path: Path,
+def test_images_of_another_size_are_one_line(scene: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     text = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
     (tmp_path / "rig.toml").write_text(text)
     assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 2
-    assert "pictures are 256x256 px, the rig's are 300x256" in capsys.readouterr().err
+    assert "images are 256x256 px, the rig's are 300x256" in capsys.readouterr().err
 
 
 def test_a_dark_log_tells_nothing(scene: Path, pairs: list[FramePair]) -> None:

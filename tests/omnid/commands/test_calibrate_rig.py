@@ -1,4 +1,4 @@
-"""`omnid calibrate rig`: from rendered pairs of pictures to rig.toml and report; bad input is one clear line."""
+"""`omnid calibrate rig`: from rendered pairs of images to rig.toml and report; bad input is one clear line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PAIRS = 7
 
 
 def rig_of(size: int) -> Rig:
-    """A rig whose upper camera is turned about every axis, with pictures of size x size."""
+    """A rig whose upper camera is turned about every axis, with images of size x size."""
     scale, mounted = size / 768, []
     for xi, focal, center, T in ((0.93, (-205.0, 206.2), (384.2, 380.9), np.eye(4)),
                                  (0.97, (-208.0, 207.2), (381.2, 385.9), T_UPPER_LOWER)):
@@ -44,12 +44,12 @@ LOWER, UPPER = TRUTH.lower.camera, TRUTH.upper.camera
 
 
 def photographed(rig: Rig, folder: Path, count: int) -> Path:
-    """Pairs of pictures of a board, all around, and the cameras' files."""
+    """Pairs of images of a board, all around, and the cameras' files."""
     studios = {"lower": Studio(BOARD, rig.lower), "upper": Studio(BOARD, rig.upper)}
     for seed, T in enumerate(around_both(rig, BOARD, count, distance_m=(0.2, 0.42))):
         for name, studio in studios.items():
             shot = studio.photograph(T, seed=seed, sensor=Sensor(noise_sigma=1.0))
-            cv2.imwrite(str(folder / f"{name}_{seed:02d}.png"), shot.picture)
+            cv2.imwrite(str(folder / f"{name}_{seed:02d}.png"), shot.image)
     for name, mounted in (("lower", rig.lower), ("upper", rig.upper)):
         (folder / f"{name}.toml").write_text(camera_toml(CameraFile(mounted.camera, mounted.mask)))
     return folder
@@ -57,7 +57,7 @@ def photographed(rig: Rig, folder: Path, count: int) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven pairs of small pictures."""
+    """Seven pairs of small images."""
     return photographed(TRUTH, tmp_path_factory.mktemp("pairs"), PAIRS)
 
 
@@ -94,7 +94,7 @@ def turn_off_deg(rig: Rig) -> float:
 
 
 @pytest.mark.slow
-def test_pictures_alone_give_cameras_and_rig_as_they_are(many: Path, tmp_path: Path,
+def test_images_alone_give_cameras_and_rig_as_they_are(many: Path, tmp_path: Path,
                                                          capsys: pytest.CaptureFixture[str]) -> None:
     out, report = tmp_path / "rig.toml", tmp_path / "report.html"
     assert run(many, "-o", out, "--model", "omni", "--report", report, "--expected-baseline-mm", "180") == 0
@@ -125,7 +125,7 @@ def test_the_polynomial_model_gives_the_same_rig(many: Path, tmp_path: Path) -> 
 
 @pytest.fixture
 def alone(folder: Path, tmp_path: Path) -> Path:
-    """The pairs, of which the lower camera saw one alone, as its picture has no partner, and the upper another."""
+    """The pairs, of which the lower camera saw one alone, as its image has no partner, and the upper another."""
     for path in folder.glob("*.png"):
         shutil.copy(path, tmp_path)
     (tmp_path / "upper_05.png").unlink()
@@ -154,7 +154,7 @@ def test_given_cameras_are_taken_as_they_are_and_what_one_saw_alone_is_named(
 
 
 def log_of(folder: Path, path: Path) -> None:
-    """The pairs as PNG messages, the upper camera 2 ms late, with a lone picture between."""
+    """The pairs as PNG messages, the upper camera 2 ms late, with a lone image between."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds, schema = store.types, "sensor_msgs/msg/CompressedImage"
     with LogWriter(path) as writer:
@@ -187,7 +187,7 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
         case "sizes":
             cv2.imwrite(str(made / "upper_09.png"), blank[:300])
         case "text":
-            (made / "lower_09.png").write_text("no picture")
+            (made / "lower_09.png").write_text("no image")
         case "one side":
             for path in made.glob("upper_*"):
                 path.unlink()
@@ -209,11 +209,11 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
 
 @pytest.mark.parametrize(("kind", "says"), [
     ("three", "needs 4 views of the board at least, found 3"),
-    ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 pictures"),
-    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected a picture"),
-    ("one side", "no pictures upper_*"), ("unpaired", "no two pictures of one instant: 3 of the lower camera, 3 of"),
+    ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
+    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected a image"),
+    ("one side", "no images upper_*"), ("unpaired", "no two images of one instant: 3 of the lower camera, 3 of"),
     ("missing", "found nothing"), ("one camera", "expected both --lower-camera and --upper-camera"),
-    ("size of camera", "--lower-camera: it is of 640x480 px, the lower pictures are 480x480"),
+    ("size of camera", "--lower-camera: it is of 640x480 px, the lower images are 480x480"),
     ("topic", "only a log has topics"),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,

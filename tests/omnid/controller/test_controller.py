@@ -15,20 +15,20 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.serial_motor import Late, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
-from omnid.controller.controller import Arrived, Heading, Helm, HelmSettings
-from omnid.controller.statistics import Logbook
+from omnid.controller.controller import Controller, ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control import safety_rules as fail_safe
 from omnid.core.control.heading_controller import LONGEST_TICK_S, HeadingLimits, Setpoint
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import CommandLimits
+from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.telemetry import StageStats
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000
 PATIENCE_S = 20.0
-LIMITS = CommandLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
+LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
                        yaw_acceleration_radps2=4.0)
-SETTINGS = HelmSettings(PERIOD_S, Deadlines(), HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0), LIMITS)
+SETTINGS = ControllerSettings(PERIOD_S, Deadlines(), HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0), LIMITS)
 AHEAD = Setpoint(0.3, None, 0.0)
 
 
@@ -59,8 +59,8 @@ class Bench:
         self.now_ns = 10**12
         self.wheels = Wheels()
         self.said: list[str] = []
-        self.helm = Helm(self.wheels, SETTINGS, self.said.append, clock_ns=lambda: self.now_ns)
-        self.logbook = Logbook(StageStats("motor"))
+        self.helm = Controller(self.wheels, SETTINGS, self.said.append, clock_ns=lambda: self.now_ns)
+        self.logbook = ControllerStatistics(StageStats("motor"))
 
     @property
     def last(self) -> VelocityCommand:
@@ -68,11 +68,11 @@ class Bench:
 
     def see(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
             age_s: float = 0.0) -> None:
-        self.helm.see(Heading(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
+        self.helm.see(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
 
     def ask(self, setpoint: Setpoint = AHEAD) -> None:
         self.now_ns += 1
-        self.helm.command(Arrived(self.now_ns, setpoint))
+        self.helm.command(TimedSetpoint(self.now_ns, setpoint))
 
     def stop(self) -> None:
         self.helm.stop(self.now_ns)
@@ -220,7 +220,7 @@ def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_v
     for _ in range(10):
         driving.see()
         driving.tick()
-    driving.helm.command(Arrived(arrival_ns, AHEAD))
+    driving.helm.command(TimedSetpoint(arrival_ns, AHEAD))
     driving.tick()
     assert is_stop(driving.last)
 
@@ -369,23 +369,23 @@ def test_while_it_slows_down_a_controller_that_steers_keeps_its_heading(bench: B
 
 
 @contextlib.contextmanager
-def real_helm(twin: SimulatedMotor) -> Iterator[Helm]:
+def real_helm(twin: SimulatedMotor) -> Iterator[Controller]:
     driver = SerialMotor(twin.port, timeout_s=2.0, watchdog_ms=10_000)
-    helm = Helm(driver, HelmSettings(0.02, Deadlines(5.0, 5.0, 5.0), limits=LIMITS))
+    helm = Controller(driver, ControllerSettings(0.02, Deadlines(5.0, 5.0, 5.0), limits=LIMITS))
     try:
         yield helm
     finally:
         driver.close()
 
 
-def run_until(helm: Helm, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
+def run_until(helm: Controller, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
     """Ticks with the twin's own heading as the pose, in odom 0.7 rad further."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
         assert time.monotonic() < deadline_s, "it did not happen"
         state = twin.state
-        helm.see(Heading(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
-        helm.command(Arrived(time.monotonic_ns(), setpoint))
+        helm.see(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
+        helm.command(TimedSetpoint(time.monotonic_ns(), setpoint))
         helm()
         time.sleep(0.02)
 

@@ -22,16 +22,16 @@ from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.config import MotorConfig, RealtimeConfig
-from omnid.controller.controller import HelmSettings
-from omnid.controller.link import HelmLink, heading_of
-from omnid.controller.messages import Orders
+from omnid.controller.controller import ControllerSettings
+from omnid.controller.link import ControllerLink, heading_of
+from omnid.controller.messages import ControllerStart
 from omnid.core.control import safety_rules as fail_safe
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import CommandLimits
+from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from tests.replay.live import ROOT, Base, wait_until
 
 DEADLINES = Deadlines(pose_s=5.0, command_s=5.0, tick_s=5.0)  # a busy machine is late with everything
@@ -39,17 +39,19 @@ AHEAD = Setpoint(0.4, None, 0.0)
 DECELERATION_MPS2 = 0.8
 
 
-def orders(port: object) -> Orders:
-    limits = CommandLimits(deceleration_mps2=DECELERATION_MPS2)
+def orders(port: object) -> ControllerStart:
+    limits = VelocityLimits(deceleration_mps2=DECELERATION_MPS2)
     motor = MotorConfig(port=str(port), rate_hz=10.0, watchdog_ms=5000)
-    return Orders(motor, HelmSettings(0.1, DEADLINES, limits=limits), RealtimeConfig(lock_memory=False))
+    return ControllerStart(motor, ControllerSettings(0.1, DEADLINES, limits=limits), RealtimeConfig(lock_memory=False))
 
 
-def odometry(heading_rad: float = 0.0, rate_radps: float = 0.0) -> Odometry:
+def odometry(heading_rad: float = 0.0, rate_radps: float = 0.0) -> OdometryUpdate:
     T = se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [0.0, 0.0, 0.0])
     velocity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate_radps])
     nothing_seen: Any = None
-    return Odometry(0, time.monotonic_ns(), T, np.eye(6), velocity, np.eye(6), "tracking", 0, 99, 99, nothing_seen)
+    return OdometryUpdate(
+        0, time.monotonic_ns(), T, np.eye(6), velocity, np.eye(6), "tracking", 0, 99, 99, nothing_seen
+    )
 
 
 class Robot:
@@ -61,7 +63,7 @@ class Robot:
         self.said: list[str] = []
         self.error: OmnidError | None = None
         self.stats = StageStats("motor")
-        self.link = HelmLink(orders(base.port), np.eye(4), self.stats, self.said.append)
+        self.link = ControllerLink(orders(base.port), np.eye(4), self.stats, self.said.append)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
@@ -175,8 +177,8 @@ def _says_pose(robot: Robot) -> bool:
 
 OWNER = """
 import sys, time
-from tests.omnid.controller.test_link import AHEAD, HelmLink, StageStats, np, odometry, orders
-link = HelmLink(orders(sys.argv[1]), np.eye(4), StageStats("motor"), print)
+from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, np, odometry, orders
+link = ControllerLink(orders(sys.argv[1]), np.eye(4), StageStats("motor"), print)
 while True:
     link.process(odometry())
     link.command(AHEAD, time.monotonic_ns())
@@ -218,7 +220,7 @@ def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch:
 
 def test_a_port_that_is_not_there_gives_the_drivers_own_line() -> None:
     with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
-        HelmLink(orders("/dev/nothing"), np.eye(4), StageStats("motor"), print)
+        ControllerLink(orders("/dev/nothing"), np.eye(4), StageStats("motor"), print)
 
 
 @pytest.mark.parametrize("odd", [{"heading_rad": math.nan}, {"rate_radps": math.nan}])

@@ -9,6 +9,6 @@ from tests.simulation import corridor, make_rig
 
 
 @pytest.fixture(scope="session")
-def eyes() -> Eyes:
+def cameras() -> Eyes:
     """A straight rig, whose rectified frame is its own, in a corridor."""
     return Eyes.of(make_rig(size=256), corridor(1))

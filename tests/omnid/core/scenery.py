@@ -1,4 +1,4 @@
-"""Small pictures for the tests of the core: random panoramas, and what a rendered rig sees of a corridor."""
+"""Small images for the tests of the core: random panoramas, and what a rendered rig sees of a corridor."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from calib import se3
 from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
 from calib.rig import Rig
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.stereo_frame import Sight
-from omnid.core.odometry.tracking import Wrapped
-from omnid.core.stereo.matcher import Matcher, Matching
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from tests.simulation import Exposure, Scene, Sensor, render_grey
 
 Array = NDArray[np.float64]
@@ -32,9 +32,9 @@ def texture(seed: int, shape: tuple[int, int] = (120, 480), sigma_px: float = 2.
     return np.asarray(np.clip(128 + 45 * around / around.std(), 0, 255), np.uint8)
 
 
-def wrapped(panorama: Image) -> Wrapped:
+def wrapped(panorama: Image) -> PaddedPanorama:
     """The panorama with PAD_PX columns repeated on either side."""
-    return Wrapped(np.hstack([panorama[:, -PAD_PX:], panorama, panorama[:, :PAD_PX]]), PAD_PX)
+    return PaddedPanorama(np.hstack([panorama[:, -PAD_PX:], panorama, panorama[:, :PAD_PX]]), PAD_PX)
 
 
 def turned(panorama: Image, columns: float) -> Image:
@@ -46,7 +46,7 @@ def turned(panorama: Image, columns: float) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """A rig in a scene, and all that turns its pictures into sights; the rig stands at T_world_rig."""
+    """A rig in a scene, and all that turns its images into sights; the rig stands at T_world_rig."""
 
     rig: Rig
     scene: Scene
@@ -65,36 +65,38 @@ class Eyes:
         seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
         sensors = [Exposure.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
         return Eyes(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
-                    Matcher(seen.shape, Matching(disparities=32)))
+                    Matcher(seen.shape, MatchingSettings(disparities=32)))
 
     @property
     def model(self) -> StereoModel:
         """The stereo model of the panoramas."""
         return StereoModel(self.cylinder, self.rig.baseline_m)
 
-    def sight(self, seq: int, T_world_rig: Array) -> Sight:
+    def frame(self, seq: int, T_world_rig: Array) -> StereoFrame:
         """What is seen from a pose."""
         rng = np.random.default_rng([seq, 99])
         mounted = (self.rig.lower, self.rig.upper)
-        pictures = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
+        images = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
                     for e, m in zip(self.exposures, mounted, strict=True)]
-        return self._sight(seq, pictures[0], pictures[1])
+        return self._sight(seq, images[0], images[1])
 
-    def darkness(self, seq: int) -> Sight:
+    def darkness(self, seq: int) -> StereoFrame:
         """What is seen with the light off."""
         black = np.zeros(self.rig.lower.camera.size[::-1], np.uint8)
         return self._sight(seq, black, black)
 
-    def _sight(self, seq: int, lower: Image, upper: Image) -> Sight:
-        panoramas = [np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), np.uint8)
-                     for picture, maps in zip((lower, upper), self.maps, strict=True)]
+    def _sight(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
+        panoramas = [np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
+                     for image, maps in zip((lower, upper), self.maps, strict=True)]
         padded = np.zeros(panoramas[0].shape, bool)
         padded[:, PAD_PX:-PAD_PX] = self.usable
         pixels, found = self.matcher.match(panoramas[0], panoramas[1], padded)
         disparity = np.full(padded.shape, np.nan, np.float32)
         disparity.reshape(-1)[pixels] = found
         inner = np.ascontiguousarray(disparity[:, PAD_PX:-PAD_PX])
-        return Sight(seq, Wrapped(panoramas[0], PAD_PX), Wrapped(panoramas[1], PAD_PX), inner, self.usable)
+        return StereoFrame(
+            seq, PaddedPanorama(panoramas[0], PAD_PX), PaddedPanorama(panoramas[1], PAD_PX), inner, self.usable
+        )
 
 
 def motion_errors(estimated: Array, truth: Array) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from calib.rig_file import read_rig
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
-from omnid.diagnostics.rig_monitor import MIN_PLACES, PAIRS, RigWatch
+from omnid.diagnostics.rig_monitor import MIN_PLACES, PAIRS, RigMonitor
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
@@ -45,10 +45,10 @@ class Kept(list[Panoramas]):
         self.append(panoramas)
 
 
-def watched(folder: Path, rig: Rig) -> tuple[RigWatch, Kept]:
+def watched(folder: Path, rig: Rig) -> tuple[RigMonitor, Kept]:
     """A whole run over a log, as the daemon does it."""
     place, config, graph = geometry(rig, PanoramaConfig()), PanoramaConfig(), Graph(threaded=False)
-    watch, kept = RigWatch(place.cylinder, PERIOD_NS / SECONDS), Kept()
+    watch, kept = RigMonitor(place.cylinder, PERIOD_NS / SECONDS), Kept()
     pairs = graph.stage("pair", PairSync(rig, PairConfig()), graph.source("log", LogReader(folder / "log.mcap").frames))
     panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
     graph.sink("rig", watch, panoramas, policy=NEWEST, depth=1)
@@ -58,19 +58,19 @@ def watched(folder: Path, rig: Rig) -> tuple[RigWatch, Kept]:
 
 
 @pytest.fixture(scope="module")
-def true(rooms: Path) -> tuple[RigWatch, Kept]:
+def true(rooms: Path) -> tuple[RigMonitor, Kept]:
     return watched(rooms, read_rig(rooms / "rig.toml"))
 
 
-def fed(true: tuple[RigWatch, Kept], panoramas: Sequence[Panoramas], every_s: float = LOOK_S) -> RigWatch:
+def fed(true: tuple[RigMonitor, Kept], panoramas: Sequence[Panoramas], every_s: float = LOOK_S) -> RigMonitor:
     """A new watch after those panoramas, LOOK_S apart."""
-    watch = RigWatch(true[0]._cylinder, every_s)
+    watch = RigMonitor(true[0]._cylinder, every_s)
     for number, one in enumerate(panoramas):
         watch.process(replace(one, seq=number, stamp_ns=round(number * LOOK_S * SECONDS)))
     return watch
 
 
-def test_a_true_rig_is_good(true: tuple[RigWatch, Kept]) -> None:
+def test_a_true_rig_is_good(true: tuple[RigMonitor, Kept]) -> None:
     status = true[0].status()
     assert (status.name, status.level, status.message) == ("omnid: rig", 0, "good")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
@@ -93,27 +93,27 @@ def test_three_degrees_are_an_error(rooms: Path) -> None:
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
-def test_who_stands_still_is_told_nothing(true: tuple[RigWatch, Kept]) -> None:
+def test_who_stands_still_is_told_nothing(true: tuple[RigMonitor, Kept]) -> None:
     status = fed(true, true[1][:1] * 100).status()
     assert (status.level, status.values) == (0, {"views": f"1 new of {PAIRS}"})
     assert status.message.startswith("not looked yet")
 
 
-def test_few_places_seen_again_and_again_are_no_verdict(true: tuple[RigWatch, Kept]) -> None:
+def test_few_places_seen_again_and_again_are_no_verdict(true: tuple[RigMonitor, Kept]) -> None:
     places = true[1][::3]
     assert fed(true, places[:MIN_PLACES - 1] * 8).finding is None
     found = fed(true, places[:MIN_PLACES] * 6).finding
     assert found is not None and found.verdict == "good" and found.tried <= MIN_PLACES * POINTS
 
 
-def test_it_looks_no_more_often_than_it_is_told_to(true: tuple[RigWatch, Kept]) -> None:
+def test_it_looks_no_more_often_than_it_is_told_to(true: tuple[RigMonitor, Kept]) -> None:
     assert fed(true, true[1], every_s=LOOK_S + 1).status().values["views"] == f"{len(true[1]) // 2} new of {PAIRS}"
     back = fed(true, true[1][:4])
     back.process(replace(true[1][9], stamp_ns=1))  # a clock that was set back does not silence it
     assert back.status().values["views"] == f"5 new of {PAIRS}"
 
 
-def test_a_rig_that_was_knocked_on_the_way_is_noticed(rooms: Path, true: tuple[RigWatch, Kept]) -> None:
+def test_a_rig_that_was_knocked_on_the_way_is_noticed(rooms: Path, true: tuple[RigMonitor, Kept]) -> None:
     _, after = watched(rooms, misturned(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
     watch = fed(true, [*true[1], *after, *after])  # on the same round, where every place has been seen
     assert watch.finding is not None and watch.status().level == 1
@@ -121,7 +121,7 @@ def test_a_rig_that_was_knocked_on_the_way_is_noticed(rooms: Path, true: tuple[R
 
 
 @pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
-def test_the_dark_is_no_alarm(true: tuple[RigWatch, Kept], gain: float, noise: float) -> None:
+def test_the_dark_is_no_alarm(true: tuple[RigMonitor, Kept], gain: float, noise: float) -> None:
     """Lights go out on the way: noise makes points that match nowhere."""
     rng = np.random.default_rng(4)
 
@@ -134,7 +134,7 @@ def test_the_dark_is_no_alarm(true: tuple[RigWatch, Kept], gain: float, noise: f
     assert status.level == 0, status
 
 
-def test_a_covered_camera_is_an_error(true: tuple[RigWatch, Kept]) -> None:
+def test_a_covered_camera_is_an_error(true: tuple[RigMonitor, Kept]) -> None:
     covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
     status = fed(true, covered).status()
     assert status.level == 2 and "covered" in status.message

@@ -16,17 +16,17 @@ from drivers.cameras.v4l2_buffers import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from omnid.config import PairConfig
-from omnid.controller.controller import Arrived, Helm, HelmSettings
+from omnid.controller.controller import Controller, ControllerSettings, TimedSetpoint
 from omnid.controller.link import heading_of
-from omnid.controller.statistics import Logbook
+from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.latency import Latency
-from omnid.diagnostics.run_statistics import Tally
-from omnid.diagnostics.status import SILENT_S, StatusReport, StatusTick, Watched
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.status import SILENT_S, StatusReport, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from omnid.stages.live_pairing import LivePair
-from omnid.transport.codec import ERROR, OK, STALE, WARN, Status, diagnostics_cdr
+from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import Commands
 from tests.simulation import build
 
@@ -51,19 +51,29 @@ class Daemon:
     """The parts that are asked."""
 
     def __init__(self, rig: Rig) -> None:
-        self.telemetry, self.tally, self.latency = Telemetry(), Tally(), Latency()
+        self.telemetry, self.tally, self.latency = Telemetry(), RunStatistics(), Latency()
         self.stages = [self.telemetry.add(StageStats(name)) for name in ("stereo", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = LivePair(rig, PairConfig())
         self.wheels = Wheels()
-        self.helm = Helm(self.wheels, HelmSettings(0.05))
-        self.logbook = Logbook(self.stages[1])
-        self.commands = Commands(lambda setpoint, arrival_ns: self.helm.command(Arrived(arrival_ns, setpoint)),
+        self.helm = Controller(self.wheels, ControllerSettings(0.05))
+        self.logbook = ControllerStatistics(self.stages[1])
+        self.commands = Commands(lambda setpoint, arrival_ns: self.helm.command(TimedSetpoint(arrival_ns, setpoint)),
                                  lambda: self.helm.stop(time.monotonic_ns()), 0.5)
-        self.report = StatusReport(Watched(self.telemetry, self.cameras, self.pair, self.tally, self.latency.to_pose,
-                                           self.logbook, self.commands, frozenset({"motor"})))
+        self.report = StatusReport(
+            StatusSources(
+                self.telemetry,
+                self.cameras,
+                self.pair,
+                self.tally,
+                self.latency.to_pose,
+                self.logbook,
+                self.commands,
+                frozenset({"motor"}),
+            )
+        )
 
-    def asked(self) -> dict[str, Status]:
+    def asked(self) -> dict[str, DiagnosticStatus]:
         """All that is said, by name, after it has proved fit for the wire."""
         statuses = self.report()
         diagnostics_cdr(time.time_ns(), statuses)
@@ -77,7 +87,7 @@ class Daemon:
 
     def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
         depth: Any = None
-        odometry = Odometry(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
+        odometry = OdometryUpdate(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
                             np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
         self.tally.process(odometry)
         self.latency.process(odometry)
@@ -100,7 +110,7 @@ def daemon(rig: Rig) -> Daemon:
 def test_a_daemon_that_has_seen_nothing(daemon: Daemon) -> None:
     said = daemon.asked()
     assert (said["odometry"].level, said["odometry"].message) == (STALE, "no pose yet")
-    assert said["pairing"].message == "no pictures of the lower and the upper camera"
+    assert said["pairing"].message == "no images of the lower and the upper camera"
     assert said["wheels"].message == "no command" and said["wheels"].level == OK
     assert said["stage stereo"].values["dropped"] == "0" and said["stage motor"].values["missed"] == "0"
 
@@ -133,8 +143,8 @@ def test_a_camera_that_says_nothing_is_named(daemon: Daemon) -> None:
     daemon.shoot("lower")
     daemon.shoot("upper", age_s=SILENT_S + 2)
     said = daemon.asked()
-    assert (said["pairing"].level, said["pairing"].message) == (WARN, "no pictures of the upper camera")
-    assert said["upper camera"].level == ERROR and said["upper camera"].message.startswith("no picture for 3.0")
+    assert (said["pairing"].level, said["pairing"].message) == (WARN, "no images of the upper camera")
+    assert said["upper camera"].level == ERROR and said["upper camera"].message.startswith("no image for 3.0")
     assert said["lower camera"].level == OK
 
 
@@ -145,12 +155,12 @@ def test_a_lost_camera_tells_why(daemon: Daemon) -> None:
     assert (said.level, said.message) == (ERROR, "it was unplugged")
 
 
-def test_pictures_that_never_meet_and_pictures_that_are_none(daemon: Daemon) -> None:
+def test_images_that_never_meet_and_images_that_are_none(daemon: Daemon) -> None:
     daemon.asked()
     daemon.shoot("lower")
     daemon.shoot("upper", age_s=0.3)
     assert "pair.tolerance_ms" in daemon.asked()["pairing"].message
-    daemon.shoot("lower", "upper", data=b"no picture")
+    daemon.shoot("lower", "upper", data=b"no image")
     said = daemon.asked()["pairing"]
     assert said.level == WARN and "cannot be decoded" in said.message and said.values["broken"] == "2"
 
@@ -163,7 +173,7 @@ def test_a_stage_tells_what_a_message_takes_and_what_of_it_is_its_own(daemon: Da
 
 def test_wheels(daemon: Daemon) -> None:
     daemon.pose()
-    daemon.helm.command(Arrived(time.monotonic_ns(), Setpoint(0.2, None)))
+    daemon.helm.command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
     daemon.tick()
     said = daemon.asked()["wheels"]
     assert (said.level, said.message) == (OK, "driving") and said.values["sent"] == "1"
@@ -208,6 +218,6 @@ def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
 
 
 def test_the_tick_hands_the_report_to_everybody(daemon: Daemon) -> None:
-    heard: list[list[Status]] = []
+    heard: list[list[DiagnosticStatus]] = []
     StatusTick(daemon.report, heard.append, heard.append)()
     assert len(heard) == 2 and heard[0] is heard[1] and heard[0][0].name == "omnid: odometry"

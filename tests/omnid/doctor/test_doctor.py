@@ -23,7 +23,7 @@ from drivers.cameras.v4l2_settings import V4l2Settings
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.doctor import machine
-from omnid.doctor.cameras import Stream, buses, cameras
+from omnid.doctor.cameras import CameraStream, buses, cameras
 from omnid.doctor.devices import access, holders, memberships
 from omnid.doctor.finding import Finding, verdict
 from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
@@ -127,23 +127,43 @@ def test_a_camera_that_somebody_else_has_open(robot: Robot) -> None:
 @pytest.mark.parametrize(
     ("streams", "level", "words"),
     [
-        ([Stream("lower", "YUYV", 147.5, "1", 480), Stream("upper", "YUYV", 147.5, "1", 480)], "ok", "295 of 384"),
-        ([Stream("lower", "YUYV", 195, "1", 480), Stream("upper", "YUYV", 195, "1", 480)], "wrong", "390 Mbit/s over"),
-        ([Stream("lower", "YUYV", 590, "1", 480), Stream("upper", "GREY", 9, "1", 480)], "wrong", "would send 590"),
-        ([Stream("lower", "MJPG", 0, "1", 480), Stream("upper", "MJPG", 0, "1", 480)], "warning", "share a USB 2 bus"),
-        ([Stream("lower", "YUYV", 590, "2", 5000), Stream("upper", "YUYV", 590, "2", 5000)], "ok", "5000 Mbit/s"),
-        ([Stream("lower", "GREY", 900, "", 0), Stream("upper", "GREY", 900, "", 0)], "ok", "not on USB"),
-        ([Stream("lower", "MJPG", 0, "1", 480)], "ok", "480 Mbit/s"),
+        (
+            [CameraStream("lower", "YUYV", 147.5, "1", 480), CameraStream("upper", "YUYV", 147.5, "1", 480)],
+            "ok",
+            "295 of 384",
+        ),
+        (
+            [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "1", 480)],
+            "wrong",
+            "390 Mbit/s over",
+        ),
+        (
+            [CameraStream("lower", "YUYV", 590, "1", 480), CameraStream("upper", "GREY", 9, "1", 480)],
+            "wrong",
+            "would send 590",
+        ),
+        (
+            [CameraStream("lower", "MJPG", 0, "1", 480), CameraStream("upper", "MJPG", 0, "1", 480)],
+            "warning",
+            "share a USB 2 bus",
+        ),
+        (
+            [CameraStream("lower", "YUYV", 590, "2", 5000), CameraStream("upper", "YUYV", 590, "2", 5000)],
+            "ok",
+            "5000 Mbit/s",
+        ),
+        ([CameraStream("lower", "GREY", 900, "", 0), CameraStream("upper", "GREY", 900, "", 0)], "ok", "not on USB"),
+        ([CameraStream("lower", "MJPG", 0, "1", 480)], "ok", "480 Mbit/s"),
     ],
 )
-def test_the_room_on_usb(streams: list[Stream], level: str, words: str) -> None:
+def test_the_room_on_usb(streams: list[CameraStream], level: str, words: str) -> None:
     (found,) = buses(streams)
     assert found.level == level and words in found.found
     assert (found.level == "ok") == (not found.mend)
 
 
 def test_each_bus_has_its_own_room() -> None:
-    streams = [Stream("lower", "YUYV", 195, "1", 480), Stream("upper", "YUYV", 195, "3", 480)]
+    streams = [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "3", 480)]
     found = [(finding.level, finding.subject) for finding in buses(streams)]
     assert found == [("ok", "usb bus 1"), ("ok", "usb bus 3")]
 
@@ -289,7 +309,7 @@ def test_room_for_recordings() -> None:
 def test_a_folder_that_the_service_may_not_write_to(tmp_path: Path) -> None:
     *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
     assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.mend
-    unit = (ROOT / "systemd" / "omnid.runs.systemd").read_text()
+    unit = (ROOT / "systemd" / "omnid.service").read_text()
     assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
 
 

@@ -150,7 +150,9 @@ def test_nobody_who_reads_is_no_error() -> None:
 def test_what_libraries_log_has_its_priority(pipe: tuple[int, int]) -> None:
     found = os.fstat(pipe[1])
     environment = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
-    script = ("import logging; import omnid.engine.logging_setup; log = logging.getLogger('library'); log.info('by the way')\n"
-              "log.warning('careful, %d', 7); log.critical('broken')")
+    script = (
+        "import logging, omnid.engine.logging_setup; log = logging.getLogger('library'); log.info('by the way')\n"
+        "log.warning('careful, %d', 7); log.critical('broken')"
+    )
     assert said(environment, pipe[1], script) == 0
     assert os.read(pipe[0], 1000) == b"<4>library: careful, 7\n<3>library: broken\n"

@@ -97,7 +97,7 @@ def test_path_is_seen_on_a_dark_map() -> None:
 
 
 @pytest.mark.parametrize("path", [NO_PATH, np.zeros((1, 2)), np.full((3, 2), np.nan), OVERFLOWING])
-def test_next_to_nothing_is_still_a_picture(path: NDArray[np.float64]) -> None:
+def test_next_to_nothing_is_still_a_image(path: NDArray[np.float64]) -> None:
     image = plan_view(EMPTY, path)
     assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
     assert (image[MARGIN_PX - 20 :] < 100).any()  # axes
@@ -120,6 +120,6 @@ def test_a_few_far_points_do_not_shrink_the_room() -> None:
     assert inked(littered) == pytest.approx(inked(clean), abs=0.02)
 
 
-def test_same_input_gives_the_same_picture() -> None:
+def test_same_input_gives_the_same_image() -> None:
     cloud, path = points(box(1, 2)), np.array([[0.0, 0.0], [1.0, 1.0]])
     assert np.array_equal(plan_view(cloud, path), plan_view(cloud, path))

@@ -18,11 +18,11 @@ from rosbags.highlevel import AnyReader
 
 from calib import se3
 from omnid.formats.tum import read_tum
-from omnid.monitor.robot_state import Heard, Letter, Mailbox
+from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen, line, table
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import Note, note_bytes
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
@@ -46,7 +46,9 @@ def odometry_at(number: int) -> bytes:
 def say(bus: Bus, number: int) -> None:
     bus.publish("odom", odometry_at(number), note_bytes(Note(number, "tracking", 0, 50, 60, time.time_ns())))
     bus.publish("/tf", codec.transform_cdr(10**18, []))
-    bus.publish("status", codec.diagnostics_cdr(10**18, [Status("omnid: wheels", 1, "no command", {"sent": "4"})]))
+    bus.publish(
+        "status", codec.diagnostics_cdr(10**18, [DiagnosticStatus("omnid: wheels", 1, "no command", {"sent": "4"})])
+    )
 
 
 def say_until_it_ends(bus: Bus, process: subprocess.Popen[str]) -> tuple[str, str]:
@@ -116,11 +118,11 @@ def test_wrong_words_are_refused(words: tuple[str, ...], told: str, capsys: pyte
     assert told in Command(capsys).refused("listen", *words)
 
 
-def heard(*numbers: int) -> Heard:
-    found = Heard()
+def heard(*numbers: int) -> RobotState:
+    found = RobotState()
     for number in numbers:
         note = note_bytes(Note(number, "tracking", 0, 50, 60, time.time_ns()))
-        found.take(Letter(time.time_ns(), "odom", odometry_at(number), note))
+        found.take(ReceivedMessage(time.time_ns(), "odom", odometry_at(number), note))
     return found
 
 
@@ -128,7 +130,7 @@ def test_what_was_left_out_is_counted_and_a_new_start_is_none() -> None:
     assert heard(1, 2, 5, 6).missed == 2
     assert heard(5, 6, 1, 2).missed == 0
     broken = heard(1)
-    assert broken.take(Letter(1, "odom", b"nonsense", b"")) is None and broken.broken == 1
+    assert broken.take(ReceivedMessage(1, "odom", b"nonsense", b"")) is None and broken.broken == 1
 
 
 class Terminal(io.StringIO):
@@ -138,18 +140,23 @@ class Terminal(io.StringIO):
 
 def test_a_terminal_gets_a_table_that_nobody_can_talk_through() -> None:
     found = heard(1, 2)
-    evil = [Status("omnid: wheels", 2, "\x1b[2J\nhello", {"sent": "4"}), Status("omnid: bus", 0, "", {})]
-    found.take(Letter(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
+    evil = [
+        DiagnosticStatus("omnid: wheels", 2, "\x1b[2J\nhello", {"sent": "4"}),
+        DiagnosticStatus("omnid: bus", 0, "", {}),
+    ]
+    found.take(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
     terminal = Terminal()
     Screen("omnid", terminal).show(found)
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
     assert len(shown.splitlines()) == 4 and "1 sigma 1.0 mm" in shown
-    assert line("omnid", Heard()) == "omnid: no pose yet" and list(table("omnid", Heard(), 0)) == ["omnid: no pose yet"]
+    assert line("omnid", RobotState()) == "omnid: no pose yet" and list(table("omnid", RobotState(), 0)) == [
+        "omnid: no pose yet"
+    ]
 
 
 def test_a_mailbox_forgets_the_oldest() -> None:
-    box = Mailbox()
+    box = Inbox()
     for number in range(2010):
         box.take(str(number), b"", b"")
     first = box.next(0.0)

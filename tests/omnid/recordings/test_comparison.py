@@ -57,7 +57,7 @@ class Recording:
 
     def state(self, index: int, state: str, resets: int = 0) -> None:
         """A change of the state."""
-        said = codec.Status("omnid: odometry", 0, state, {"state": state, "resets": str(resets)})
+        said = codec.DiagnosticStatus("omnid: odometry", 0, state, {"state": state, "resets": str(resets)})
         self.add("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns(index), [said]), index)
 
     def drive(self, index: int, velocity_mps: float) -> None:

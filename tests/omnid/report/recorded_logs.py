@@ -11,7 +11,7 @@ import numpy as np
 from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 
 START_NS = 1_700_000_000 * 10**9
 PERIOD_NS = 100_000_000
@@ -37,7 +37,7 @@ def odom(pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", 
     return at(pose), topic, codec.ODOMETRY_SCHEMA, payload
 
 
-def status(pose: float, *statuses: Status) -> Entry:
+def status(pose: float, *statuses: DiagnosticStatus) -> Entry:
     """What the parts said at the time of a pose."""
     return at(pose), "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(at(pose), statuses)
 
@@ -45,7 +45,7 @@ def status(pose: float, *statuses: Status) -> Entry:
 def state(pose: float, name: str, resets: int = 0, landmarks: str = "80 of 100") -> Entry:
     """The report of a new state, as the recorder writes it right after the first pose in it."""
     level = ("tracking", "degraded", "lost").index(name)
-    return status(pose, Status("omnid: odometry", level, name,
+    return status(pose, DiagnosticStatus("omnid: odometry", level, name,
                                {"state": name, "resets": str(resets), "landmarks": landmarks}))
 
 

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from omnid.report.downsampling import BINS, Corner, PathTrace, Thinned
+from omnid.report.downsampling import BINS, Corner, Downsampled, PathTrace
 
 
 def test_few_values_stay_as_they_are() -> None:
-    series = Thinned()
+    series = Downsampled()
     points = [(0.1 * k, math.sin(k)) for k in range(BINS)]
     for t_s, value in reversed(points):
         series.add(t_s, value)
@@ -21,7 +21,7 @@ def test_few_values_stay_as_they_are() -> None:
 
 
 def test_spikes_survive_any_length() -> None:
-    series, rng = Thinned(), np.random.default_rng(1)
+    series, rng = Downsampled(), np.random.default_rng(1)
     values = rng.normal(0, 0.01, 100_000)
     values[33_333], values[77_777] = 5.0, -3.0
     for k, value in enumerate(values):
@@ -33,7 +33,7 @@ def test_spikes_survive_any_length() -> None:
 
 
 def test_nonsense_is_left_out() -> None:
-    series = Thinned()
+    series = Downsampled()
     for value in (math.nan, math.inf, -math.inf, 1e300):
         series.add(0.0, value)
     series.add(math.nan, 1.0)
@@ -42,7 +42,7 @@ def test_nonsense_is_left_out() -> None:
 
 
 def test_scattered_times_end_in_bounds() -> None:
-    series = Thinned()
+    series = Downsampled()
     for t_s in np.random.default_rng(2).uniform(-1e9, 1e9, 3000):
         series.add(float(t_s), 1.0)
     assert len(series.points()) <= 2 * BINS

@@ -8,7 +8,7 @@ from omnid.report.events import ERROR, MOST_OF_ONE, MOST_SOURCES, WARNING, Event
 def test_a_counter_that_keeps_rising_is_one_event() -> None:
     events = Events()
     for t_s in (1.0, 2.0, 3.0, 9.0):
-        events.add(Event(t_s, t_s, WARNING, "camera", "pictures dropped", 2))
+        events.add(Event(t_s, t_s, WARNING, "camera", "images dropped", 2))
     assert [(e.start_s, e.end_s, e.count) for e in events.in_order()] == [(1.0, 3.0, 6), (9.0, 9.0, 2)]
 
 

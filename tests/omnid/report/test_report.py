@@ -20,10 +20,10 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import evaluate
 from omnid.report.report import report_html
-from omnid.report.report_data import Recording, read_recording
+from omnid.report.report_data import ReportData, read_recording
 from omnid.report.truth_comparison import compare
 from omnid.runs.log_rig import attached_rig
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
@@ -73,7 +73,7 @@ def html_of(path: Path, truth: Trajectory | None = None) -> str:
     return report_html(path, read_recording(path, keep_poses=truth is not None), truth)
 
 
-def told(recording: Recording) -> list[tuple[str, str]]:
+def told(recording: ReportData) -> list[tuple[str, str]]:
     return [(event.source, event.text) for event in recording.events.in_order()]
 
 
@@ -111,38 +111,63 @@ def test_states_are_those_of_the_poses(tmp_path: Path) -> None:
 
 def test_gaps_resets_and_lost_cameras_are_told(tmp_path: Path) -> None:
     camera = "omnid: upper camera"
-    entries = [*run(100, missing=range(30, 50)), state(60, "tracking", resets=1),
-               status(61, Status(camera, 0, "streaming", {"drops": "3"}), Status("omnid: wheels", 0, "driving", {})),
-               status(71, Status(camera, 2, "lost since 1.0 s", {"drops": "3"}),
-                      Status("omnid: wheels", 1, "the pose is lost", {"stopped, the pose is lost": "1"})),
-               status(81, Status(camera, 2, "lost since 2.0 s", {"drops": "8"}),
-                      Status("omnid: wheels", 0, "driving", {"stopped, the pose is lost": "1"}))]
+    entries = [
+        *run(100, missing=range(30, 50)),
+        state(60, "tracking", resets=1),
+        status(
+            61,
+            DiagnosticStatus(camera, 0, "streaming", {"drops": "3"}),
+            DiagnosticStatus("omnid: wheels", 0, "driving", {}),
+        ),
+        status(
+            71,
+            DiagnosticStatus(camera, 2, "lost since 1.0 s", {"drops": "3"}),
+            DiagnosticStatus("omnid: wheels", 1, "the pose is lost", {"stopped, the pose is lost": "1"}),
+        ),
+        status(
+            81,
+            DiagnosticStatus(camera, 2, "lost since 2.0 s", {"drops": "8"}),
+            DiagnosticStatus("omnid: wheels", 0, "driving", {"stopped, the pose is lost": "1"}),
+        ),
+    ]
     recording = read_recording(save(tmp_path / "log.mcap", entries))
     assert told(recording) == [
         ("poses", "none for 2.10 s"), ("state", "odometry began anew, with an unknown gap"),
         ("upper camera", "lost since 1.0 s"), ("wheels", "the pose is lost"), ("wheels", "stopped, the pose is lost"),
-        ("upper camera", "pictures dropped"), ("wheels", "driving")]
+        ("upper camera", "images dropped"), ("wheels", "driving")]
     assert recording.statuses.resets == 1
     page = Page(report_html(tmp_path / "log.mcap", recording))
-    assert "pictures dropped (5)" in page.text and "upper camera" in page.text
+    assert "images dropped (5)" in page.text and "upper camera" in page.text
 
 
 def test_reports_that_come_before_the_first_pose_and_too_late(tmp_path: Path) -> None:
-    entries = [status(-20, Status("omnid: odometry", 3, "no pose yet", {}), Status("omnid: pairing", 1, "none", {})),
-               odom(0), state(0, "tracking"), odom(5), state(5, "lost"),
-               state(4, "tracking"), odom(6)]  # a report from before the loss, written after it
+    entries = [
+        status(
+            -20,
+            DiagnosticStatus("omnid: odometry", 3, "no pose yet", {}),
+            DiagnosticStatus("omnid: pairing", 1, "none", {}),
+        ),
+        odom(0),
+        state(0, "tracking"),
+        odom(5),
+        state(5, "lost"),
+        state(4, "tracking"),
+        odom(6),
+    ]  # a report from before the loss, written after it
     recording = read_recording(save(tmp_path / "log.mcap", entries))
     assert recording.poses.states == {0: 1, 2: 2}
     assert told(recording)[0] == ("pairing", "none") and recording.events.in_order()[0].start_s == -2.0
 
 
 def test_stages_and_latencies_are_shown(tmp_path: Path) -> None:
-    def second(k: int) -> tuple[Status, ...]:
+    def second(k: int) -> tuple[DiagnosticStatus, ...]:
         odometry = {"landmarks": f"{200 + k} of 300", "capture_to_pose_p50_ms": "81.25", "rate_hz": "9.5",
                     "capture_to_pose_p99_ms": "163.00"}
         stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_p99_ms": "44.0",
                   "work_max_ms": "52.1"}
-        return Status("omnid: odometry", 0, "tracking", odometry), Status("omnid: stage stereo", 0, "", stereo)
+        return DiagnosticStatus("omnid: odometry", 0, "tracking", odometry), DiagnosticStatus(
+            "omnid: stage stereo", 0, "", stereo
+        )
 
     entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
@@ -156,7 +181,7 @@ def test_what_a_foreign_log_does_not_hold_is_named(tmp_path: Path) -> None:
     entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
     for words in ("Run of wheels", "does not tell the state", "nobody set them", "no numbers of landmarks",
-                  "No reports of the daemon", "holds no pictures", "no rig.toml is attached", "holds no map",
+                  "No reports of the daemon", "holds no images", "no rig.toml is attached", "holds no map",
                   "holds no commands"):
         assert words in text, words
 
@@ -188,7 +213,7 @@ def attached_rig_of_sample() -> Rig:
     return rig
 
 
-def test_pictures_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = SAMPLE / "log.mcap"
     assert main(["report", str(log), "-o", str(tmp_path / "out.html")]) == 2
     said = capsys.readouterr().err
@@ -196,8 +221,8 @@ def test_pictures_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.Captu
     assert not (tmp_path / "out.html").exists()
 
 
-def test_panorama_of_a_log_with_pictures(tmp_path: Path) -> None:
-    """The sample's first pictures with poses beside them."""
+def test_panorama_of_a_log_with_images(tmp_path: Path) -> None:
+    """The sample's first images with poses beside them."""
     entries = run(20)
     with (SAMPLE / "log.mcap").open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
@@ -222,8 +247,12 @@ def test_which_odometry(tmp_path: Path) -> None:
 def test_a_hostile_log_is_text_and_no_more(tmp_path: Path) -> None:
     stage = {"processed": EVIL, "dropped": EVIL, "work_p50_ms": EVIL}
     odometry = {"state": EVIL, "resets": EVIL, "landmarks": EVIL, "capture_to_pose_p50_ms": EVIL}
-    parts = (Status(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}), Status(f"omnid: stage {EVIL}", 1, EVIL, stage),
-             Status("omnid: summary", 0, EVIL, {EVIL: EVIL}), Status("omnid: odometry", 0, EVIL, odometry))
+    parts = (
+        DiagnosticStatus(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}),
+        DiagnosticStatus(f"omnid: stage {EVIL}", 1, EVIL, stage),
+        DiagnosticStatus("omnid: summary", 0, EVIL, {EVIL: EVIL}),
+        DiagnosticStatus("omnid: odometry", 0, EVIL, odometry),
+    )
     settings = f'robot = "{EVIL.replace(chr(34), "")}"\n["<b>"]\nx = 1\n'
     entries = [*(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
                (at(2), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(2, *parts)[3]),
@@ -247,7 +276,7 @@ def test_a_flood_of_everything_stays_small(tmp_path: Path) -> None:
         entries.append(state(k, rng.choice(("tracking", "degraded", "lost")), resets=k))
         if k % 30 == 0:
             values = {f"stopped, {rng.randrange(10**6)}" * 20: str(k) for _ in range(70)}
-            entries.append(status(k, *(Status(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
+            entries.append(status(k, *(DiagnosticStatus(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
                                        for n in range(k, k + 9))))
     entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
     recording = read_recording(save(tmp_path / "log.mcap", entries))

@@ -16,10 +16,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, Status, hung, notify, show_stacks_at_the_end, watchdog_s
+from omnid.runs.systemd import Service, StatusLine, hung, notify, show_stacks_at_the_end, watchdog_s
 
 ROOT = Path(__file__).parents[3]
 LONG_S = 20.0  # a wait that only a broken service exhausts
@@ -156,7 +156,7 @@ class Tap:
 @pytest.fixture
 def running() -> Iterator[SimpleNamespace]:
     """A graph at work: tap, valve, sink."""
-    graph, tap, valve, sunk = Graph(policy=NEWEST), Tap(), Valve(), Tally()
+    graph, tap, valve, sunk = Graph(policy=NEWEST), Tap(), Valve(), RunStatistics()
     sink = SimpleNamespace(process=lambda number: None)
     graph.sink("sink", sink, graph.stage("valve", valve, graph.source("tap", tap.numbers, wake=tap.close)))
     thread = threading.Thread(target=graph.run)
@@ -190,7 +190,7 @@ def test_a_hung_stage_is_not_fed_for_and_named_once(
     assert "stage 'valve' has gone on" in capsys.readouterr().err
 
 
-def test_without_pictures_the_daemon_is_alive(manager: Manager, running: SimpleNamespace) -> None:
+def test_without_images_the_daemon_is_alive(manager: Manager, running: SimpleNamespace) -> None:
     running.valve.open.set()
     running.tap.left = 3
     wait_until(lambda: running.graph.telemetry.stages[2].processed)
@@ -254,15 +254,15 @@ def test_a_run_tells_systemd_from_its_first_tick_to_its_end(manager: Manager) ->
 
 
 def test_the_status_counts_messages_and_deadlines_apart() -> None:
-    telemetry, tally = Telemetry(), Tally()
+    telemetry, tally = Telemetry(), RunStatistics()
     for name, dropped in (("pair", 3), ("stereo", 4), ("motor", 5)):
         telemetry.add(StageStats(name, dropped=dropped))
-    status = Status(tally, telemetry, ("motor",))
-    assert status() == "waiting for pictures, 0.0 poses/s, 7 messages dropped, 5 deadlines missed"
+    status = StatusLine(tally, telemetry, ("motor",))
+    assert status() == "waiting for images, 0.0 poses/s, 7 messages dropped, 5 deadlines missed"
     tally.newest = SimpleNamespace(state="tracking")  # type: ignore[assignment]
     tally.poses = 10**6
     assert status().startswith("tracking, ")
-    assert status().startswith("waiting for pictures, 0.0 poses/s")
+    assert status().startswith("waiting for images, 0.0 poses/s")
 
 
 def test_where_stderr_is_no_file_there_is_nothing_to_show(capsys: pytest.CaptureFixture[str]) -> None:

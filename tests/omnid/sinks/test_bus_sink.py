@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from omnid.client import Robot
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.odometry.tracking import Wrapped
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.errors import OmnidError
-from omnid.messages import Odometry
+from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
@@ -26,14 +26,14 @@ from omnid.transport.features_attachment import MOST, features_bytes, features_f
 from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 
 OFFSET_NS = 10**18
-PICTURE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)
+IMAGE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)
 
 
-def odometry(seq: int) -> Odometry:
+def odometry(seq: int) -> OdometryUpdate:
     T = se3.transform(np.eye(3), [1.0, 0.0, 0.0])
-    depth = cast("Any", SimpleNamespace(panoramas=SimpleNamespace(lower=Wrapped(PICTURE, 16))))
+    depth = cast("Any", SimpleNamespace(panoramas=SimpleNamespace(lower=PaddedPanorama(IMAGE, 16))))
     features = Features(np.array([[3.4, 5.0], [7.0, 8.6]]), np.array([[1.0, 2.0]]))
-    return Odometry(seq, 10**9 * seq, T, np.eye(6), np.zeros(6), np.eye(6), "degraded", 3, 5, 9, depth, features)
+    return OdometryUpdate(seq, 10**9 * seq, T, np.eye(6), np.zeros(6), np.eye(6), "degraded", 3, 5, 9, depth, features)
 
 
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
@@ -70,7 +70,7 @@ def test_panoramas_are_sent_as_often_as_wanted() -> None:
     assert pixels == {"agreeing": [[3, 5], [7, 9]], "rejected": [[1, 2]], "new": []}
     assert [message.header.stamp.sec for message in messages] == [10**9, 10**9 + 2, 10**9 + 4, 10**9 + 6]
     shown = cv2.imdecode(messages[0].data, cv2.IMREAD_GRAYSCALE)
-    assert shown.shape == (64, 128) and np.abs(shown.astype(int) - PICTURE[:, 16:-16]).max() < 20
+    assert shown.shape == (64, 128) and np.abs(shown.astype(int) - IMAGE[:, 16:-16]).max() < 20
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"agreeing":3,"rejected":[],"new":[]}',

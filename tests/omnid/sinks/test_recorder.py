@@ -1,4 +1,4 @@
-"""Recordings of live pictures and poses: what other programs read, what a kill costs, what a slow disk costs."""
+"""Recordings of live images and poses: what other programs read, what a kill costs, what a slow disk costs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from omnid.config import Config
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
-from omnid.messages import MapUpdate, Odometry
+from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Clouds, Encoder, status_report
 from omnid.sinks.frame_recorder import FrameRecorder
-from omnid.transport.codec import ERROR, OK, Status
+from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
 from tests.drivers.logs.mcap_logs import STORE, jpeg
 
@@ -56,7 +56,7 @@ def recorded(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
-def test_pictures_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, encoding: str) -> None:
+def test_images_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, encoding: str) -> None:
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
@@ -72,7 +72,7 @@ def test_pictures_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, e
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
-def test_picture_messages_are_those_of_ros(encoding: str) -> None:
+def test_image_messages_are_those_of_ros(encoding: str) -> None:
     each = frame(7, "upper", encoding)
     schema, payload = image_cdr(each, START_NS + 5)
     message: Any = STORE.deserialize_cdr(payload, schema)
@@ -96,8 +96,8 @@ def test_packed_rows_get_their_step() -> None:
         image_cdr(packed, -1)
 
 
-def odometry(seq: int, state: str = "tracking") -> Odometry:
-    return Odometry(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
+def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
+    return OdometryUpdate(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
                     None)  # type: ignore[arg-type]  # nobody asks for the depth
 
 
@@ -109,7 +109,7 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
         recorder.process(VelocityCommand(5 * 10**9 + n, 0.1, math.nan, 0.2))
-    recorder.add(status_report(START_NS, [Status("omnid: test", 0, "fine", {})]), START_NS)
+    recorder.add(status_report(START_NS, [DiagnosticStatus("omnid: test", 0, "fine", {})]), START_NS)
     recorder.process(MapUpdate(0, 5 * 10**9, points, np.zeros((0, 2))))
     recorder.finish()
     (path,) = recorded(tmp_path / "log")
@@ -127,10 +127,10 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
 
 
 def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -> None:
-    """A pose tells its state at the time of its pictures, when reports of later times have been made already."""
+    """A pose tells its state at the time of its images, when reports of later times have been made already."""
     encode = Encoder(np.eye(4), Clouds(9), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=encode, offset_ns=OFFSET_NS)
-    report = status_report(START_NS + 2, [Status("omnid: test", 0, "fine", {})])
+    report = status_report(START_NS + 2, [DiagnosticStatus("omnid: test", 0, "fine", {})])
     recorder.process(frame(-1, "lower"))
     recorder.add(report, START_NS + 2)
     for n, state in enumerate(("tracking", "lost", "tracking", "lost")):
@@ -175,7 +175,7 @@ def test_no_message_ends_the_run(tmp_path: Path) -> None:
 
 
 class Given:
-    """A source with pictures at hand."""
+    """A source with images at hand."""
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = frames

@@ -45,7 +45,7 @@ def unpaired(pair: LivePair) -> tuple[int, int]:
     return pair.counts["unpaired_lower"], pair.counts["unpaired_upper"]
 
 
-def test_a_pair_has_the_lower_stamp_and_both_pictures(pair: LivePair) -> None:
+def test_a_pair_has_the_lower_stamp_and_both_images(pair: LivePair) -> None:
     dark = cv2.imencode(".jpg", np.zeros((SIZE, SIZE), np.uint8))[1].tobytes()
     for index, order in enumerate((("lower", "upper"), ("upper", "lower"))):
         (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG)
@@ -105,7 +105,7 @@ def test_nothing_of_nothing_is_kept_without_a_bound(pair: LivePair) -> None:
     assert unpaired(pair) == (500, 500)
 
 
-def test_broken_pictures_cost_their_pair_only(pair: LivePair) -> None:
+def test_broken_images_cost_their_pair_only(pair: LivePair) -> None:
     frames = [frame for index in range(6) for frame in
               (shot("lower", index, data=JPEG[:100] if index % 2 else JPEG), shot("upper", index))]
     assert [p.seq for p in made(pair, *frames)] == [0, 1, 2]
@@ -113,7 +113,7 @@ def test_broken_pictures_cost_their_pair_only(pair: LivePair) -> None:
 
 
 def test_only_what_finds_a_partner_is_decoded(pair: LivePair) -> None:
-    made(pair, *(shot("lower", index, data=b"no picture") for index in range(20)))
+    made(pair, *(shot("lower", index, data=b"no image") for index in range(20)))
     assert pair.counts["broken"] == 0
 
 
@@ -127,10 +127,10 @@ def test_skew_statistics(pair: LivePair) -> None:
 
 @pytest.mark.parametrize("drift_ns", [0, 20_000, -20_000])
 def test_cameras_that_drift_apart_are_found(pair: LivePair, drift_ns: int) -> None:
-    """20 us a picture: 6 ms within 300 pictures."""
+    """20 us a image: 6 ms within 300 images."""
     rng = random.Random(7)
     for index in range(300):
         noise_ns = rng.randrange(-MS, MS)
         made(pair, shot("lower", index), shot("upper", index, index * drift_ns + noise_ns))
-    expected_ns = drift_ns * (300 - 50 - 25)  # the slow mean lags by 50 pictures, the first one by 25
+    expected_ns = drift_ns * (300 - 50 - 25)  # the slow mean lags by 50 images, the first one by 25
     assert pair.skew.wandered_ns == pytest.approx(expected_ns, abs=0.6 * MS)

@@ -17,12 +17,12 @@ from drivers.frame import Camera, Frame
 from drivers.logs.mcap_reader import LogReader
 from drivers.motor import is_stop
 from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
-from omnid.diagnostics.run_statistics import Tally
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream
-from omnid.engine.playback_clock import Pace
+from omnid.engine.playback_clock import PlaybackClock
 from omnid.formats.tum import read_tum
-from omnid.messages import Depth, FramePair, MapUpdate, Odometry, Panoramas
-from omnid.runs.pipeline import Ends, wire
+from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, StereoDepth
+from omnid.runs.pipeline import Sinks, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.guidance import Guidance
@@ -89,7 +89,7 @@ def test_pair_keeps_the_cameras_apart(place: Geometry, frames: list[Frame]) -> N
     assert not np.array_equal(pair.lower, pair.upper)
 
 
-def depth_of(place: Geometry, frames: list[Frame]) -> Depth:
+def depth_of(place: Geometry, frames: list[Frame]) -> StereoDepth:
     (pair,), _ = run_pairs(place, frames[:2])
     return Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
 
@@ -106,8 +106,8 @@ def test_points_lie_on_the_world(scene: Path, place: Geometry, frames: list[Fram
 
 
 def test_points_are_seen_where_they_were_found() -> None:
-    """In a crooked rig whose frame is neither camera's: back in both pictures, a point is where the tables say."""
-    run = build("crooked", seed=1, size=256, pairs=1)
+    """In a misaligned rig whose frame is neither camera's: back in both images, a point is where the tables say."""
+    run = build("misaligned", seed=1, size=256, pairs=1)
     place = geometry(run.rig, CONFIG.panorama)
     pair = FramePair(0, 0, *(render_grey(run.scene, m, run.poses[0]) for m in (run.rig.lower, run.rig.upper)))
     depth = Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
@@ -158,11 +158,11 @@ def test_variance_is_that_of_the_disparity(place: Geometry, frames: list[Frame])
 
 
 def odometry(T: np.ndarray, *, state: str = "tracking", covariance: np.ndarray | None = None, seq: int = 0,
-             depth: Depth | None = None) -> Odometry:
+             depth: StereoDepth | None = None) -> OdometryUpdate:
     zero = np.zeros((6, 6))
     cov = zero if covariance is None else covariance
     velocity = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
-    return Odometry(seq, seq * 100 * MS, T, cov, velocity, zero, state, 0, 0, 0, depth)  # type: ignore[arg-type]
+    return OdometryUpdate(seq, seq * 100 * MS, T, cov, velocity, zero, state, 0, 0, 0, depth)  # type: ignore[arg-type]
 
 
 def test_covariance_of_the_base_is_what_the_rigs_motion_makes_it() -> None:
@@ -255,7 +255,7 @@ def test_guidance_steers_the_base_and_not_the_rig() -> None:
 
 def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:
     apart = stamped(frames, ("lower", 0), ("lower", 3_600_000))
-    pace = Pace()
+    pace = PlaybackClock()
     waiting = pace.frames(apart)
     assert next(waiting) is apart[0]
     pace.wake()
@@ -286,8 +286,8 @@ def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
         def process(self, message: object) -> None:
             time.sleep(0.2 * isinstance(message, slow))
 
-    graph, tally = Graph(), Tally()
-    wire(graph, paired(graph, place, frames)[1], place, CONFIG, Ends({"tally": tally}, bus=SlowBus(), map_every_s=0.5))
+    graph, tally = Graph(), RunStatistics()
+    wire(graph, paired(graph, place, frames)[1], place, CONFIG, Sinks({"tally": tally}, bus=SlowBus(), map_every_s=0.5))
     graph.run()
     assert tally.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
@@ -296,14 +296,14 @@ def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
 @pytest.mark.parametrize("threaded", [True, False])
 def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> None:
     """The pipeline needs no log: any iterable of frames will do."""
-    poses: list[Odometry] = []
+    poses: list[OdometryUpdate] = []
 
     class Keep:
-        def process(self, message: Odometry) -> None:
+        def process(self, message: OdometryUpdate) -> None:
             poses.append(message)
 
     graph = Graph(threaded=threaded)
     pair, pairs = paired(graph, place, frames)
-    wire(graph, pairs, place, CONFIG, Ends(poses={"keep": Keep()}))
+    wire(graph, pairs, place, CONFIG, Sinks(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

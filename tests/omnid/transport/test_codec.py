@@ -182,7 +182,7 @@ def test_point_cloud_needs_a_confidence_a_point() -> None:
 
 def test_diagnostics() -> None:
     payload = codec.diagnostics_cdr(
-        STAMP_NS, [codec.Status("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})])
+        STAMP_NS, [codec.DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})])
     (status,) = read(payload, codec.DIAGNOSTICS_SCHEMA).status
     assert (status.level, status.name, status.message) == (1, "omnid/odometry", "degraded")
     assert [(pair.key, pair.value) for pair in status.values] == [("inliers", "12"), ("fps", "9.8")]
@@ -190,7 +190,7 @@ def test_diagnostics() -> None:
 
 def test_diagnostic_level_must_exist() -> None:
     with pytest.raises(OmnidError, match="level 4"):
-        codec.diagnostics_cdr(STAMP_NS, [codec.Status("omnid", 4, "", {})])
+        codec.diagnostics_cdr(STAMP_NS, [codec.DiagnosticStatus("omnid", 4, "", {})])
 
 
 def test_twist_stamped() -> None:

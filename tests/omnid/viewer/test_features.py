@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from omnid.config import Config
-from omnid.messages import Odometry
-from omnid.runs.replay import Options, Replay
+from omnid.messages import OdometryUpdate
+from omnid.runs.replay import Options, ReplayRun
 from tests.conftest import PAIRS
 
 
@@ -17,47 +17,47 @@ class Watcher:
     """Keeps all poses of a run."""
 
     def __init__(self) -> None:
-        self.poses: list[Odometry] = []
+        self.poses: list[OdometryUpdate] = []
 
     def process(self, message: object) -> None:
-        if isinstance(message, Odometry):
+        if isinstance(message, OdometryUpdate):
             self.poses.append(message)
 
 
 @pytest.fixture(scope="module")
-def poses(scene: Path) -> list[Odometry]:
+def poses(scene: Path) -> list[OdometryUpdate]:
     watcher = Watcher()
     options = Options(inline=True, quiet=True, watch=lambda place, telemetry: watcher)
-    assert Replay(scene / "log.mcap", Config(), options).run(scene / "rig.toml", (None, None)) == 0
+    assert ReplayRun(scene / "log.mcap", Config(), options).run(scene / "rig.toml", (None, None)) == 0
     return watcher.poses
 
 
-def test_the_first_pair_has_new_ones_and_no_others(poses: list[Odometry]) -> None:
+def test_the_first_pair_has_new_ones_and_no_others(poses: list[OdometryUpdate]) -> None:
     first, *others = poses
     assert len(others) == PAIRS - 1
     assert len(first.features.new) >= first.tracks > 50  # a few are left out of the map: too far to be located
-    assert not len(first.features.agreeing) and not len(first.features.rejected)
+    assert not len(first.features.inliers) and not len(first.features.rejected)
 
 
-def test_those_that_agree_carry_the_pose_and_those_that_do_not_are_others(poses: list[Odometry]) -> None:
+def test_those_that_agree_carry_the_pose_and_those_that_do_not_are_others(poses: list[OdometryUpdate]) -> None:
     gaps: list[float] = []
     for odometry in poses[1:]:
         seen = odometry.features
-        assert len(seen.agreeing) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
-        gaps += np.linalg.norm(seen.rejected[:, None] - seen.agreeing[None], axis=2).min(axis=1).tolist()
+        assert len(seen.inliers) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
+        gaps += np.linalg.norm(seen.rejected[:, None] - seen.inliers[None], axis=2).min(axis=1).tolist()
     assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; one that goes wrong may end on another
 
 
-def test_all_are_pixels_of_the_lower_panorama(poses: list[Odometry]) -> None:
+def test_all_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
     for odometry in poses:
         height, width = odometry.depth.disparity.shape
-        for pixels in (odometry.features.agreeing, odometry.features.rejected, odometry.features.new):
+        for pixels in (odometry.features.inliers, odometry.features.rejected, odometry.features.new):
             assert pixels.shape[1] == 2 and (pixels >= -1).all() and (pixels <= [width, height]).all()
 
 
-def test_new_ones_are_where_there_were_none(poses: list[Odometry]) -> None:
+def test_new_ones_are_where_there_were_none(poses: list[OdometryUpdate]) -> None:
     for odometry in poses[1:]:
-        new, known = odometry.features.new, odometry.features.agreeing
+        new, known = odometry.features.new, odometry.features.inliers
         if len(new):
             gaps = np.linalg.norm(new[:, None] - known[None], axis=2).min(axis=1)
             assert gaps.min() > 3

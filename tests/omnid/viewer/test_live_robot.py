@@ -24,7 +24,7 @@ from calib import se3
 from drivers.frame import Frame
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.features_attachment import features_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import Note, note_bytes
@@ -46,13 +46,13 @@ def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
 
 
 def say(bus: Bus, number: int) -> None:
-    """Poses, one of them broken, a picture, a map, reports."""
+    """Poses, one of them broken, a image, a map, reports."""
     stamp_ns, T = START_NS + number * 10**7, se3.transform(np.eye(3), [0.01 * number, 0.5, 0.0])
     pose = codec.odometry_cdr(stamp_ns, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
     bus.publish("odom", pose if number % 7 else b"nonsense",
                 note_bytes(Note(number, "degraded", 0, 50, 60, time.time_ns())))
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
-    said = [Status("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
+    said = [DiagnosticStatus("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, said))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
     pixels = {"agreeing": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}

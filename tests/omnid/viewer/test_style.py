@@ -54,11 +54,11 @@ def test_states_can_be_told_apart_without_colours() -> None:
     assert looks.crosses(np.zeros((0, 2)), 2).shape == (0, 2, 2)
 
 
-def test_the_depth_picture_has_distances_and_the_nearest_is_in_front() -> None:
+def test_the_depth_image_has_distances_and_the_nearest_is_in_front() -> None:
     disparity = np.full((9, 12), np.nan, np.float32)
     disparity[4, 4], disparity[4, 5] = 10, 40
     disparity[0, 0] = 1e-9  # further than fits
-    mm = looks.depth_picture(disparity, 20.0)
+    mm = looks.depth_image(disparity, 20.0)
     assert mm.dtype == np.uint16 and mm[4, 3] == 2000 and mm[4, 4] == mm[3, 6] == 500
     assert mm[0, 0] == mm[1, 1] == 65535 and mm[8, 11] == 0 and (mm > 0).sum() == 12 + 4
     assert looks.depth_range(np.array([[0, 1000, 3000]], np.uint16)) == pytest.approx((1020, 2900))

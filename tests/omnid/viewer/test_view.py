@@ -14,7 +14,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.formats.tum import read_tum
 from omnid.transport import codec
-from omnid.transport.codec import Status
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
 from tests.conftest import PAIRS
 from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified
@@ -52,17 +52,17 @@ def test_the_path_is_that_of_the_tum_file(drawn: Path) -> None:
     assert verified(drawn / "out.rrd")
 
 
-def test_every_pair_has_a_picture_with_its_features_and_depth(drawn: Path) -> None:
-    pictures = rows(drawn / "out.rrd", "/panorama", "EncodedImage:blob")
+def test_every_pair_has_a_image_with_its_features_and_depth(drawn: Path) -> None:
+    images = rows(drawn / "out.rrd", "/panorama", "EncodedImage:blob")
     depths = rows(drawn / "out.rrd", "/depth", "EncodedDepthImage:blob")
-    agreeing = rows(drawn / "out.rrd", "/panorama/agreeing", "Points2D:positions")
+    inliers = rows(drawn / "out.rrd", "/panorama/agreeing", "Points2D:positions")
     found = rows(drawn / "out.rrd", "/landmarks/agreeing", "Scalars:scalars")
-    assert len(pictures) == len(depths) == len(agreeing) == len(found) == PAIRS
-    picture = cv2.imdecode(np.array(pictures[0].value[0], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert len(images) == len(depths) == len(inliers) == len(found) == PAIRS
+    image = cv2.imdecode(np.array(images[0].value[0], np.uint8), cv2.IMREAD_UNCHANGED)
     depth = cv2.imdecode(np.array(depths[0].value[0], np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture.shape == depth.shape and depth.dtype == np.uint16
+    assert image.shape == depth.shape and depth.dtype == np.uint16
     assert 300 < np.median(depth[depth > 0]) < 4000  # mm, of a corridor
-    assert all(len(dots.value) >= count.value[0] for dots, count in zip(agreeing[1:], found[1:], strict=True))
+    assert all(len(dots.value) >= count.value[0] for dots, count in zip(inliers[1:], found[1:], strict=True))
     assert len(rows(drawn / "out.rrd", "/panorama/new", "LineStrips2D:strips")[0].value) > 50
 
 
@@ -79,7 +79,7 @@ def test_there_is_a_map_and_the_ellipsoid_and_plots(drawn: Path) -> None:
 
 def test_a_recording_is_shown_as_it_stands(drawn: Path, omnid: Command) -> None:
     code, said, _ = omnid("view", drawn / "rec.mcap", "-o", drawn / "rec.rrd")
-    assert code == 0 and said.startswith(f"{PAIRS} poses and 0 pictures shown\n")
+    assert code == 0 and said.startswith(f"{PAIRS} poses and 0 images shown\n")
     for ours, recorded in zip(positions(drawn / "out.rrd"), positions(drawn / "rec.rrd"), strict=True):
         np.testing.assert_allclose(ours, recorded, atol=1e-6)
     clouds = [rows(drawn / name, "/odom/map", "Points3D:positions")[-1].value for name in ("out.rrd", "rec.rrd")]
@@ -88,20 +88,20 @@ def test_a_recording_is_shown_as_it_stands(drawn: Path, omnid: Command) -> None:
     assert "/panorama" not in entities(drawn / "rec.rrd") and verified(drawn / "rec.rrd")
 
 
-def test_a_recording_without_pictures_cannot_be_computed_anew(drawn: Path, omnid: Command) -> None:
+def test_a_recording_without_images_cannot_be_computed_anew(drawn: Path, omnid: Command) -> None:
     told = omnid.refused("view", drawn / "rec.mcap", "--replay", "-o", drawn / "not.rrd")
     assert "no image topics" in told and not (drawn / "not.rrd").exists()
 
 
 def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
-    """A recording with three poses, two states, two pictures of either kind and what cannot be read."""
+    """A recording with three poses, two states, two images of either kind and what cannot be read."""
     writer = LogWriter(path, {})
     for robot in robots:
         for number, state in enumerate(("tracking", "tracking", "lost")):
             stamp_ns, T = START_NS + number * 10**8, se3.transform(np.eye(3), [0.1 * number, 0.0, 0.0])
             writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA,
                          codec.odometry_cdr(stamp_ns, T, 1e-4 * np.eye(6), np.zeros(6), np.eye(6)), stamp_ns)
-            said = [Status("omnid: odometry", 0, state, {"landmarks": f"{number} of 9"})]
+            said = [DiagnosticStatus("omnid: odometry", 0, state, {"landmarks": f"{number} of 9"})]
             writer.write(f"/{robot}/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, said), stamp_ns)
         writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA, b"nonsense", START_NS + 10**9)
         raw = Frame(0, START_NS, "lower", "mono8", np.full((8, 16), 50, np.uint8), 16, 8)
@@ -113,15 +113,15 @@ def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
 def test_a_pose_has_the_state_that_is_written_after_it(tmp_path: Path, omnid: Command) -> None:
     need_rerun()
     code, said, warned = omnid("view", made(tmp_path / "made.mcap"), "-o", tmp_path / "made.rrd")
-    assert code == 0 and said.startswith("3 poses and 1 pictures shown") and "1 messages" in warned
+    assert code == 0 and said.startswith("3 poses and 1 images shown") and "1 messages" in warned
     states = rows(tmp_path / "made.rrd", "/state", "StateChange:state")
     assert [row.value[0] for row in states] == ["tracking", "lost"] and states[1].stamp_ns == START_NS + 2 * 10**8
     widths = [-row.value[0] for row in rows(tmp_path / "made.rrd", "/odom/path", "LineStrips3D:radii")]
     assert widths[0] == widths[1] < widths[2]  # on the screen: rerun has it negative
     found = [row.value[0] for row in rows(tmp_path / "made.rrd", "/landmarks/agreeing", "Scalars:scalars")]
     assert found == [0, 1, 2]
-    picture = rows(tmp_path / "made.rrd", "/panorama", "EncodedImage:blob")[0].value[0]
-    assert cv2.imdecode(np.array(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape == (8, 16)
+    image = rows(tmp_path / "made.rrd", "/panorama", "EncodedImage:blob")[0].value[0]
+    assert cv2.imdecode(np.array(image, np.uint8), cv2.IMREAD_UNCHANGED).shape == (8, 16)
 
 
 def test_one_of_several_robots_is_shown(tmp_path: Path, omnid: Command) -> None:

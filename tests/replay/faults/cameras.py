@@ -7,7 +7,7 @@ from tests.replay.live import wait_until
 
 
 def spoilt(place: Place, line: str, part: str, word: str) -> Outcome:
-    """What becomes of pictures that are spoilt for a while."""
+    """What becomes of images that are spoilt for a while."""
     with driving(place, module=SPOILT) as (daemon, operator, base):
         daemon.tell(line)
         wait_until(lambda: word in operator.message(part), f"'{word}'")
@@ -20,20 +20,20 @@ def spoilt(place: Place, line: str, part: str, word: str) -> Outcome:
 
 @trial("upper camera stuck")
 def upper_stuck(place: Place) -> Outcome:
-    """No more pictures of one camera."""
-    return spoilt(place, "upper mute", "pairing", "no pictures of the upper camera")
+    """No more images of one camera."""
+    return spoilt(place, "upper mute", "pairing", "no images of the upper camera")
 
 
 @trial("lower camera stuck")
 def lower_stuck(place: Place) -> Outcome:
-    """No more pictures of the other."""
-    return spoilt(place, "lower mute", "pairing", "no pictures of the lower camera")
+    """No more images of the other."""
+    return spoilt(place, "lower mute", "pairing", "no images of the lower camera")
 
 
 @trial("both cameras stuck")
 def both_stuck(place: Place) -> Outcome:
-    """No more pictures at all."""
-    return spoilt(place, "both mute", "pairing", "no pictures of the lower and the upper camera")
+    """No more images at all."""
+    return spoilt(place, "both mute", "pairing", "no images of the lower and the upper camera")
 
 
 @trial("garbage JPEG")
@@ -44,7 +44,7 @@ def garbage(place: Place) -> Outcome:
 
 @trial("JPEG cut in half")
 def cut(place: Place) -> Outcome:
-    """Pictures whose end is missing."""
+    """Images whose end is missing."""
     return spoilt(place, "both cut", "pairing", "cannot be decoded")
 
 

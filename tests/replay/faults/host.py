@@ -17,7 +17,7 @@ from tests.replay.live import PATIENCE_S, Base, Operator, robot, wait_until
 
 @trial("SIGTERM in the middle of frames")
 def sigterm(place: Place) -> Outcome:
-    """Five times, at five moments of a picture."""
+    """Five times, at five moments of a image."""
     for part in range(5):
         with tempfile.TemporaryDirectory(dir=place.folder) as folder, \
                 driving(Place(place.scene, Path(folder))) as (_, _, base):

@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.odometry import LOST, TRACKING, Ego
+from omnid.core.odometry.odometry import OdometryEstimate
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.stereo_frame import Sight
-from omnid.core.odometry.tracking import Klt, flow, track
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings, flow, track
 from omnid.core.odometry.yaw_search import steps
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -46,20 +47,22 @@ BLIND_SPEED = 0.5  # what may have happened where it is [m/s and rad/s], one dev
 class Reference:
     """The sight that motions are measured against, with its pose and covariance."""
 
-    sight: Sight
+    frame: StereoFrame
     T_odom_rect: Array
     covariance: Array
 
 
-class PaperMotion:
+class PaperOdometry:
     """Follows the rectified frame from each sight to the next; odom is that frame at the first one.
 
-    tracker: 'improved' turns the picture until enough features are found (section IV.F), 'klt' does not. reference:
+    tracker: 'improved' turns the image until enough features are found (section IV.F), 'klt' does not. reference:
     'previous' measures against the sight before, as the paper does; 'keyframe' against one that is kept as long as
     half of its points agree, to tell what keyframes alone are worth.
     """
 
-    def __init__(self, model: StereoModel, klt: Klt, tracker: str = "improved", reference: str = "previous") -> None:
+    def __init__(
+        self, model: StereoModel, klt: KltSettings, tracker: str = "improved", reference: str = "previous"
+    ) -> None:
         for name, found, known in (("tracker", tracker, TRACKERS), ("reference", reference, REFERENCES)):
             if found not in known:
                 raise OmnidError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
@@ -68,51 +71,51 @@ class PaperMotion:
         self._filter = MotionFilter(JERK_PSD)
         self._T, self._covariance = np.eye(4), np.zeros((6, 6))
         self._reference: Reference | None = None
-        self._most_agreeing = 0
+        self._most_inliers = 0
 
-    def process(self, sight: Sight, dt_s: float) -> Ego:
+    def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """The pose at a sight, dt_s after the one before (0 for the first)."""
         reference = self._reference
         if reference is None:
-            self._refer_to(sight)
-            return self._ego(TRACKING, 0, 0)
-        Ma, Mb = self._located(reference.sight, sight)
-        M, agree = consensus(Ma, Mb, np.random.default_rng(sight.seq), THRESHOLD_M)
-        agreeing = int(agree.sum())
-        if agreeing < LEAST:
-            ego = self._refuse(dt_s, len(Ma), agreeing)
-            self._refer_to(sight)
+            self._refer_to(frame)
+            return self._ego(TrackingState.TRACKING, 0, 0)
+        Ma, Mb = self._located(reference.frame, frame)
+        M, agree = consensus(Ma, Mb, np.random.default_rng(frame.seq), THRESHOLD_M)
+        inliers = int(agree.sum())
+        if inliers < LEAST:
+            ego = self._refuse(dt_s, len(Ma), inliers)
+            self._refer_to(frame)
             return ego
         self._move(reference, register(Ma[agree], Mb[agree], M), dt_s)
-        self._most_agreeing = max(self._most_agreeing, agreeing)
-        if not self._keeps or agreeing < WORN * self._most_agreeing:
-            self._refer_to(sight)
-        return self._ego(TRACKING, len(Ma), agreeing)
+        self._most_inliers = max(self._most_inliers, inliers)
+        if not self._keeps or inliers < WORN * self._most_inliers:
+            self._refer_to(frame)
+        return self._ego(TrackingState.TRACKING, len(Ma), inliers)
 
-    def _refer_to(self, sight: Sight) -> None:
+    def _refer_to(self, frame: StereoFrame) -> None:
         """From now on measures against a sight whose pose is the present one."""
-        self._reference = Reference(sight, self._T, self._covariance)
-        self._most_agreeing = 0
+        self._reference = Reference(frame, self._T, self._covariance)
+        self._most_inliers = 0
 
-    def _located(self, previous: Sight, sight: Sight) -> tuple[Array, Array]:
+    def _located(self, previous: StereoFrame, frame: StereoFrame) -> tuple[Array, Array]:
         """Ma, Mb (N, 3): the same features before and now, those that SAD has located in both sights (section IV.A)."""
         F_a = corners(previous.lower, previous.usable, FEATURES)
-        F_b, found = self._tracked(previous, sight, F_a) if len(F_a) else (F_a, np.zeros(0, bool))
+        F_b, found = self._tracked(previous, frame, F_a) if len(F_a) else (F_a, np.zeros(0, bool))
         if not found.any():
             return np.zeros((0, 3)), np.zeros((0, 3))
-        Ma, Mb = self._points(previous, F_a[found]), self._points(sight, F_b[found])
+        Ma, Mb = self._points(previous, F_a[found]), self._points(frame, F_b[found])
         both = np.isfinite(Ma).all(axis=1) & np.isfinite(Mb).all(axis=1)
         return Ma[both], Mb[both]
 
-    def _tracked(self, previous: Sight, sight: Sight, F_a: Array) -> tuple[Array, Flags]:
+    def _tracked(self, previous: StereoFrame, frame: StereoFrame, F_a: Array) -> tuple[Array, Flags]:
         """F_b (N, 2) and which were found; plain KLT takes Lucas and Kanade's word for it."""
         if self._tracker == "klt":
-            return flow(previous.lower, sight.lower, F_a, F_a, self._klt)
-        return turned_track(previous, sight, F_a, self._klt)
+            return flow(previous.lower, frame.lower, F_a, F_a, self._klt)
+        return turned_track(previous, frame, F_a, self._klt)
 
-    def _points(self, sight: Sight, features: Array) -> Array:
+    def _points(self, frame: StereoFrame, features: Array) -> Array:
         """3-D points (N, 3) in the rectified frame of features (N, 2), NaN where no located point is near: eq. (8)."""
-        disparity = nearby_disparity(sight.disparity, features, EPSILON_PX)
+        disparity = nearby_disparity(frame.disparity, features, EPSILON_PX)
         views = np.column_stack([features, features[:, 1] + disparity])
         return triangulate(views, self._model.cylinder, self._model.baseline_m)
 
@@ -130,15 +133,23 @@ class PaperMotion:
         self._T = self._T @ T_prev_curr
         self._covariance = _carried(reference.covariance, T_ref_curr) + found.covariance
 
-    def _refuse(self, dt_s: float, located: int, agreeing: int) -> Ego:
+    def _refuse(self, dt_s: float, located: int, inliers: int) -> OdometryEstimate:
         """Stays where it was: the paper has nothing for this."""
         self._filter.reset()
         self._covariance = self._covariance + (BLIND_SPEED * dt_s) ** 2 * np.eye(6)
-        return self._ego(LOST, located, agreeing)
+        return self._ego(TrackingState.LOST, located, inliers)
 
-    def _ego(self, state: str, tracked: int, agreeing: int) -> Ego:
-        return Ego(self._T, self._covariance, self._filter.velocity, self._filter.velocity_covariance, state, 0,
-                   tracked, agreeing)
+    def _ego(self, state: TrackingState, tracked: int, inliers: int) -> OdometryEstimate:
+        return OdometryEstimate(
+            self._T,
+            self._covariance,
+            self._filter.velocity,
+            self._filter.velocity_covariance,
+            state,
+            0,
+            tracked,
+            inliers,
+        )
 
 
 def _carried(covariance: Array, T_a_b: Array) -> Array:
@@ -147,15 +158,16 @@ def _carried(covariance: Array, T_a_b: Array) -> Array:
     return np.asarray(A @ covariance @ A.T)
 
 
-def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt, turns: Sequence[float] | None = None
-                 ) -> tuple[Array, Flags]:
+def turned_track(
+    previous: StereoFrame, frame: StereoFrame, features: Array, klt: KltSettings, turns: Sequence[float] | None = None
+) -> tuple[Array, Flags]:
     """The improved KLT of section IV.F: turns by 0, 18, 36 ... degrees until enough features (N, 2) are found.
 
     The paper stops at the first turn that will do; but half a step away half of the features may be found as well, so
     the search goes on while the next turn finds more. If none will do, the turn that finds most. turns [rad]: others to
     try instead.
 
-    On a panorama a turn of picture k+1 is a shift of its columns, and to start the search that much further along is
+    On a panorama a turn of image k+1 is a shift of its columns, and to start the search that much further along is
     the same; the columns returned are those of k+1 itself, so the motion estimated from them is the total one. The
     paper counts what Lucas and Kanade report; but their status says only that the search ended, and four of five points
     are then wrong after 18 degrees. Only those that come back are counted here.
@@ -163,7 +175,7 @@ def turned_track(previous: Sight, sight: Sight, features: Array, klt: Klt, turns
     best, most = (features, np.zeros(len(features), bool)), -1
     for turn in steps() if turns is None else turns:
         shift = turn * previous.lower.width / (2 * np.pi)
-        there, found = track(previous.lower, sight.lower, features, features + np.array([shift, 0.0]), klt)
+        there, found = track(previous.lower, frame.lower, features, features + np.array([shift, 0.0]), klt)
         if found.sum() <= most and most >= ENOUGH * len(features):
             break
         if found.sum() > most:

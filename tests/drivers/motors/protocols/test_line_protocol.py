@@ -12,10 +12,10 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.line_protocol import (
     MAX_LINE,
     LineAssembler,
+    LineStatus,
     Message,
     ProtocolError,
     SetWatchdog,
-    Status,
     Velocity,
     WatchdogSet,
     crc16,
@@ -28,8 +28,8 @@ MESSAGES: list[Message] = [
     Velocity(0, stop_command(0)),
     Velocity(65535, VelocityCommand(0, -10.0, 3.142, -20.0)),
     Velocity(1, VelocityCommand(0, 10.0, -3.142, 20.0)),
-    Status(65535, STATUS),
-    Status(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
+    LineStatus(65535, STATUS),
+    LineStatus(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
     SetWatchdog(20),
     WatchdogSet(10_000),
 ]
@@ -46,7 +46,7 @@ def test_checksum_is_ccitt_false() -> None:
 def test_known_lines() -> None:
     command = VelocityCommand(99, 0.3, -1.571, 0.0504)
     assert encode(Velocity(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
-    assert encode(Status(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
+    assert encode(LineStatus(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
     assert encode(SetWatchdog(500)) == sealed(b"W,500")
 
 
@@ -59,10 +59,10 @@ def test_comes_back(message: Message) -> None:
 
 
 def test_unknown_battery_is_nan() -> None:
-    line = encode(Status(3, MotorStatus(0.0, 0.0, 0.0, False, 0, math.nan)))
+    line = encode(LineStatus(3, MotorStatus(0.0, 0.0, 0.0, False, 0, math.nan)))
     assert b",-1,0,0*" in line
     back = decode(line)
-    assert isinstance(back, Status) and math.isnan(back.status.battery_v)
+    assert isinstance(back, LineStatus) and math.isnan(back.status.battery_v)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308, 10.001, -10.001, 20.001, -20.001])

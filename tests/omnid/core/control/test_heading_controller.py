@@ -10,23 +10,23 @@ import pytest
 
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
-    Drive,
-    HeadingHold,
+    HeadingController,
     HeadingLimits,
     Setpoint,
+    Twist,
     wrap_angle,
 )
 from omnid.errors import OmnidError
 
 DT_S = 0.05
-HOLD = HeadingHold()
+HOLD = HeadingController()
 LIMITS = HOLD.limits
 ODD = (math.nan, math.inf, -math.inf)
 
 
-def turn(setpoint: Setpoint, heading_rad: float, seconds: float, hold: HeadingHold = HOLD) -> list[float]:
+def turn(setpoint: Setpoint, heading_rad: float, seconds: float, hold: HeadingController = HOLD) -> list[float]:
     """The unwrapped headings of a unicycle under the hold; measured wrapped, from standstill."""
-    drive, headings = Drive(), [heading_rad]
+    drive, headings = Twist(), [heading_rad]
     for _ in range(round(seconds / DT_S)):
         drive = hold.step(setpoint, wrap_angle(headings[-1]), DT_S, drive)
         headings.append(headings[-1] + drive.yaw_rate_radps * DT_S)
@@ -46,14 +46,14 @@ def test_reaches_the_heading_the_short_way_without_overshoot(start_rad: float, g
 @pytest.mark.parametrize("gain_hz", [0.3, 1.5, 5.0])
 @pytest.mark.parametrize("acceleration_radps2", [0.3, 3.0, 30.0])
 def test_settles_with_any_sensible_gain(gain_hz: float, acceleration_radps2: float) -> None:
-    hold = HeadingHold(replace(LIMITS, gain_hz=gain_hz, yaw_acceleration_radps2=acceleration_radps2))
+    hold = HeadingController(replace(LIMITS, gain_hz=gain_hz, yaw_acceleration_radps2=acceleration_radps2))
     headings = turn(Setpoint(0.0, 2.0), 0.0, 30.0, hold)
     assert headings[-1] == pytest.approx(2.0, abs=0.01)
     assert max(headings) < 2.1
 
 
 def test_noise_at_half_a_turn_does_not_hold_it_there() -> None:
-    heading_rad, drive = 0.0, Drive()
+    heading_rad, drive = 0.0, Twist()
     for i in range(12):
         measured = wrap_angle(heading_rad + (0.1 if i % 2 else -0.1))  # now this side is nearer, now that
         drive = HOLD.step(Setpoint(0.0, math.pi), measured, DT_S, drive)
@@ -72,16 +72,16 @@ def test_never_leaves_its_limits_whatever_comes() -> None:
     for _ in range(20_000):
         heading = None if rng.random() < 0.3 else any_number(rng)
         setpoint = Setpoint(any_number(rng), heading, any_number(rng))
-        previous, dt_s = Drive(any_number(rng), any_number(rng)), any_number(rng)
+        previous, dt_s = Twist(any_number(rng), any_number(rng)), any_number(rng)
         drive = HOLD.step(setpoint, any_number(rng), dt_s, previous)
         assert abs(drive.velocity_mps) <= LIMITS.velocity_mps and abs(drive.yaw_rate_radps) <= LIMITS.yaw_rate_radps
         if all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
             expect_bounded_change(previous, drive, min(max(dt_s, 0.0), LONGEST_TICK_S))
         else:
-            assert drive == Drive()
+            assert drive == Twist()
 
 
-def expect_bounded_change(previous: Drive, drive: Drive, dt_s: float) -> None:
+def expect_bounded_change(previous: Twist, drive: Twist, dt_s: float) -> None:
     was_mps = max(-LIMITS.velocity_mps, min(LIMITS.velocity_mps, previous.velocity_mps))
     was_radps = max(-LIMITS.yaw_rate_radps, min(LIMITS.yaw_rate_radps, previous.yaw_rate_radps))
     assert abs(drive.velocity_mps - was_mps) <= LIMITS.acceleration_mps2 * dt_s + 1e-12
@@ -94,29 +94,29 @@ def test_slows_to_a_stop_on_what_is_not_finite(odd: float, place: str) -> None:
     setpoint = Setpoint(
         odd if place == "velocity" else 0.5, odd if place == "goal" else 1.0, odd if place == "yaw rate" else 0.0
     )
-    drives = [Drive(0.5, -1.0)]
+    drives = [Twist(0.5, -1.0)]
     for _ in range(40):
         drives.append(HOLD.step(setpoint, odd if place == "heading" else 0.0, DT_S, drives[-1]))
         assert abs(drives[-1].velocity_mps) <= abs(drives[-2].velocity_mps)
         assert abs(drives[-1].yaw_rate_radps) <= abs(drives[-2].yaw_rate_radps)
-    assert drives[1] == Drive(0.475, -0.85) and drives[-1] == Drive()
+    assert drives[1] == Twist(0.475, -0.85) and drives[-1] == Twist()
 
 
 @pytest.mark.parametrize("odd", ODD)
 def test_stands_still_at_once_without_a_known_past(odd: float) -> None:
     setpoint = Setpoint(0.5, 1.0)
-    assert HOLD.step(setpoint, 0.0, odd, Drive(0.5, 0.5)) == Drive()
-    assert HOLD.step(setpoint, 0.0, DT_S, Drive(odd, 0.5)) == Drive()
-    assert HOLD.step(setpoint, 0.0, DT_S, Drive(0.5, odd)) == Drive()
+    assert HOLD.step(setpoint, 0.0, odd, Twist(0.5, 0.5)) == Twist()
+    assert HOLD.step(setpoint, 0.0, DT_S, Twist(odd, 0.5)) == Twist()
+    assert HOLD.step(setpoint, 0.0, DT_S, Twist(0.5, odd)) == Twist()
 
 
 def test_no_time_no_change() -> None:
     for dt_s in (0.0, -1.0):
-        assert HOLD.step(Setpoint(-0.5, 3.0), 0.0, dt_s, Drive(0.2, 0.1)) == Drive(0.2, 0.1)
+        assert HOLD.step(Setpoint(-0.5, 3.0), 0.0, dt_s, Twist(0.2, 0.1)) == Twist(0.2, 0.1)
 
 
 def test_without_a_heading_the_yaw_rate_is_followed() -> None:
-    drive = Drive()
+    drive = Twist()
     for _ in range(60):
         drive = HOLD.step(Setpoint(-0.2, None, 0.7), 1.0, DT_S, drive)
     assert (drive.velocity_mps, drive.yaw_rate_radps) == pytest.approx((-0.2, 0.7))
@@ -140,6 +140,6 @@ def test_limits_must_be_above_zero(bad: float) -> None:
 
 
 def test_huge_headings_are_directions_too() -> None:
-    drive = HOLD.step(Setpoint(0.0, 1e308), -1e308, LONGEST_TICK_S, Drive())
+    drive = HOLD.step(Setpoint(0.0, 1e308), -1e308, LONGEST_TICK_S, Twist())
     error_rad = wrap_angle(wrap_angle(1e308) - wrap_angle(-1e308))
     assert math.copysign(1.0, drive.yaw_rate_radps) == math.copysign(1.0, error_rad) and abs(error_rad) < 2.9

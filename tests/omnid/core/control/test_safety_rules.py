@@ -9,10 +9,10 @@ from itertools import combinations
 import pytest
 
 from omnid.core.control import safety_rules as fail_safe
-from omnid.core.control.safety_rules import Deadlines, Situation, reason_to_stop
+from omnid.core.control.safety_rules import Deadlines, SafetyInputs, stop_reason
 
 DEADLINES = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
-GOOD = Situation(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, late_s=0.01)
+GOOD = SafetyInputs(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, late_s=0.01)
 CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are told
     fail_safe.ENDS: {"ending": True},
     fail_safe.ASKED: {"stop_asked": True},
@@ -26,7 +26,7 @@ CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are told
 
 
 def told(**changes: object) -> str:
-    return reason_to_stop(replace(GOOD, **changes), DEADLINES)  # type: ignore[arg-type]
+    return stop_reason(replace(GOOD, **changes), DEADLINES)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("state", ["tracking", "degraded"])

@@ -7,11 +7,11 @@ import random
 
 import pytest
 
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Drive
-from omnid.core.control.velocity_limits import STOP, CommandLimits
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.errors import OmnidError
 
-LIMITS = CommandLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
+LIMITS = VelocityLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
                        yaw_acceleration_radps2=3.0)  # fmt: skip
 ODD = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-9)
 SLACK = 1 + 1e-9
@@ -25,13 +25,13 @@ def anything(rng: random.Random) -> float:
 def test_no_output_ever_breaks_a_limit(seed: int) -> None:
     rng, sent = random.Random(seed), STOP
     for _ in range(5000):
-        wanted = Drive(anything(rng), anything(rng))
+        wanted = Twist(anything(rng), anything(rng))
         dt_s = abs(rng.gauss(0.05, 0.05)) if rng.random() < 0.8 else anything(rng)
         last, sent = sent, LIMITS.step(wanted, sent, dt_s)
         assert_within(last, sent, dt_s)
 
 
-def assert_within(last: Drive, sent: Drive, dt_s: float) -> None:
+def assert_within(last: Twist, sent: Twist, dt_s: float) -> None:
     passed_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
     tiny = 1e-12
     assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
@@ -48,20 +48,20 @@ def assert_within(last: Drive, sent: Drive, dt_s: float) -> None:
 def test_whatever_came_before_the_output_is_finite_and_bounded(seed: int) -> None:
     rng = random.Random(seed)
     for _ in range(3000):
-        sent = LIMITS.step(*(Drive(anything(rng), anything(rng)) for _ in range(2)), anything(rng))
+        sent = LIMITS.step(*(Twist(anything(rng), anything(rng)) for _ in range(2)), anything(rng))
         assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
 
 
 def test_gets_there_and_stays() -> None:
     sent = STOP
     for _ in range(100):
-        sent = LIMITS.step(Drive(0.7, -1.2), sent, 0.05)
-    assert sent == Drive(0.7, -1.2)
+        sent = LIMITS.step(Twist(0.7, -1.2), sent, 0.05)
+    assert sent == Twist(0.7, -1.2)
 
 
-@pytest.mark.parametrize("wanted", [STOP, Drive(math.nan, 1.0), Drive(1.0, math.inf), Drive(-math.inf, 0.0)])
-def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Drive) -> None:
-    sent, speeds = Drive(0.8, 1.0), [0.8]
+@pytest.mark.parametrize("wanted", [STOP, Twist(math.nan, 1.0), Twist(1.0, math.inf), Twist(-math.inf, 0.0)])
+def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Twist) -> None:
+    sent, speeds = Twist(0.8, 1.0), [0.8]
     while sent != STOP:
         sent = LIMITS.step(wanted, sent, 0.1)
         speeds.append(sent.velocity_mps)
@@ -69,16 +69,16 @@ def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Drive) -> None:
 
 
 def test_reversing_stops_first_and_then_gathers_speed() -> None:
-    assert LIMITS.step(Drive(-0.8, 0.0), Drive(0.1, 0.0), 0.1).velocity_mps == pytest.approx(-0.5 * 0.05)
-    assert LIMITS.step(Drive(0.8, 0.0), Drive(-0.1, 0.0), 0.1).velocity_mps == pytest.approx(0.5 * 0.05)
+    assert LIMITS.step(Twist(-0.8, 0.0), Twist(0.1, 0.0), 0.1).velocity_mps == pytest.approx(-0.5 * 0.05)
+    assert LIMITS.step(Twist(0.8, 0.0), Twist(-0.1, 0.0), 0.1).velocity_mps == pytest.approx(0.5 * 0.05)
 
 
 def test_no_time_means_no_change() -> None:
     for dt_s in (0.0, -1.0, math.nan, math.inf):
-        assert LIMITS.step(Drive(0.5, 0.5), Drive(0.2, 0.1), dt_s) == Drive(0.2, 0.1)
+        assert LIMITS.step(Twist(0.5, 0.5), Twist(0.2, 0.1), dt_s) == Twist(0.2, 0.1)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 def test_limits_must_make_sense(bad: float) -> None:
     with pytest.raises(OmnidError, match="deceleration_mps2"):
-        CommandLimits(deceleration_mps2=bad)
+        VelocityLimits(deceleration_mps2=bad)

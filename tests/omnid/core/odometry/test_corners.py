@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
-from omnid.core.odometry.tracking import Klt
+from omnid.core.odometry.tracking import KltSettings
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 ALL = np.ones((120, 480), bool)
@@ -22,11 +22,11 @@ def test_a_poster_full_of_contrast_does_not_take_all() -> None:
 
 
 def test_within_a_cell_the_strongest_come_first() -> None:
-    picture = (texture(3) // 5 + 100).astype(np.uint8)
+    image = (texture(3) // 5 + 100).astype(np.uint8)
     strong = [(24 + 48 * k, 24) for k in range(10)]
     for column, row in strong:
-        picture[row : row + 6, column : column + 6] = 255
-    first = corners(wrapped(picture), np.arange(120)[:, None] * np.ones((1, 480)) < 48, 10)
+        image[row : row + 6, column : column + 6] = 255
+    first = corners(wrapped(image), np.arange(120)[:, None] * np.ones((1, 480)) < 48, 10)
     assert all(np.min(np.hypot(*(first - (c + 2.5, r + 2.5)).T)) < 6 for c, r in strong)
 
 
@@ -42,7 +42,7 @@ def test_corners_keep_apart_and_to_what_is_usable() -> None:
 
 
 def test_the_seam_is_like_any_other_place() -> None:
-    """The same corners, turned with the picture."""
+    """The same corners, turned with the image."""
     found = corners(wrapped(texture(5)), ALL, 1000)
     after = corners(wrapped(turned(texture(5), 200)), ALL, 1000)
     assert set(map(tuple, (found + np.array([200, 0])) % (480, 1000))) == set(map(tuple, after))
@@ -77,17 +77,19 @@ def test_rows_in_the_upper_panorama_to_sub_pixels_or_not_at_all() -> None:
     points = corners(wrapped(lower), np.arange(120)[:, None] * np.ones((1, 480)) < 90, 200)
     points = points[points[:, 1] > 15]
     pair = wrapped(lower), wrapped(np.ascontiguousarray(upper))
-    rows = rows_in_upper(pair, points, points[:, 1] + 9.5, Klt(levels=1))
+    rows = rows_in_upper(pair, points, points[:, 1] + 9.5, KltSettings(levels=1))
     assert np.isfinite(rows).mean() > 0.9
     assert np.nanmax(np.abs(rows - points[:, 1] - 10.4)) < 0.1
     guess = points[:, 1] + np.where(np.arange(len(points)) % 2, 9.5, np.nan)
-    assert np.isnan(rows_in_upper(pair, points, guess, Klt(levels=1))[::2]).all()
+    assert np.isnan(rows_in_upper(pair, points, guess, KltSettings(levels=1))[::2]).all()
 
 
 def test_a_match_beside_its_column_or_above_the_point_is_none() -> None:
     lower = texture(7)
     points = corners(wrapped(lower), ALL, 100)
     aside = wrapped(np.roll(turned(lower, 1.5), 6, axis=0))
-    assert np.isnan(rows_in_upper((wrapped(lower), aside), points, points[:, 1] + 6, Klt(levels=1))).mean() > 0.95
+    assert (
+        np.isnan(rows_in_upper((wrapped(lower), aside), points, points[:, 1] + 6, KltSettings(levels=1))).mean() > 0.95
+    )
     above = wrapped(np.roll(lower, -6, axis=0))
-    assert np.isnan(rows_in_upper((wrapped(lower), above), points, points[:, 1] - 6, Klt(levels=1))).all()
+    assert np.isnan(rows_in_upper((wrapped(lower), above), points, points[:, 1] - 6, KltSettings(levels=1))).all()

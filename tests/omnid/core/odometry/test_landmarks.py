@@ -11,7 +11,7 @@ from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.landmarks import Keyframe, LocalMap
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import Klt, Wrapped
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
 from omnid.core.stereo.triangulation import point_covariance, triangulate
 from tests.omnid.core.scenery import texture, turned, wrapped
 
@@ -21,8 +21,8 @@ MODEL = StereoModel(Cylinder(480, 120, 60.0), 0.2)
 POSE = se3.exp([1.0, -2.0, 0.1, 0.02, 0.03, 0.7])
 
 
-def keyframe(seq: int, T: Array = POSE, picture: Wrapped | None = None) -> Keyframe:
-    return Keyframe(seq, picture or wrapped(texture(1)), T, 1e-6 * np.eye(6))
+def keyframe(seq: int, T: Array = POSE, image: PaddedPanorama | None = None) -> Keyframe:
+    return Keyframe(seq, image or wrapped(texture(1)), T, 1e-6 * np.eye(6))
 
 
 def views(count: int, seed: int = 0) -> Array:
@@ -41,7 +41,7 @@ def add(landmarks: LocalMap, seen_in: Keyframe, seen: Array) -> None:
 
 @pytest.fixture
 def landmarks() -> LocalMap:
-    return LocalMap(MODEL, Klt(), max_keyframes=3, max_misses=2)
+    return LocalMap(MODEL, KltSettings(), max_keyframes=3, max_misses=2)
 
 
 def test_landmarks_stand_in_odom_with_their_covariance(landmarks: LocalMap) -> None:
@@ -90,16 +90,16 @@ def test_patches_are_aligned_to_hundredths_where_the_pose_is_known(landmarks: Lo
 
 
 def test_each_is_looked_for_in_its_own_keyframe(landmarks: LocalMap) -> None:
-    """Two keyframes at one pose, whose pictures have nothing in common."""
+    """Two keyframes at one pose, whose images have nothing in common."""
     other = wrapped(texture(2))
     add(landmarks, keyframe(1), views(40))
     usable = np.ones((120, 480), bool)
     usable[:20] = usable[100:] = False
     points = corners(other, usable, 40)
-    add(landmarks, keyframe(2, picture=other), np.column_stack([points, points[:, 1] + 8]))
-    for picture, seq in ((wrapped(texture(1)), 1), (other, 2)):
+    add(landmarks, keyframe(2, image=other), np.column_stack([points, points[:, 1] + 8]))
+    for image, seq in ((wrapped(texture(1)), 1), (other, 2)):
         shown = landmarks.views.copy()
-        pixels, fitted = landmarks.align(picture, POSE, np.arange(len(landmarks)))
+        pixels, fitted = landmarks.align(image, POSE, np.arange(len(landmarks)))
         close = fitted & (np.abs(pixels - shown[:, :2]).max(axis=1) < 0.1)
         assert landmarks.anchor_shares(np.flatnonzero(close))[seq] > 0.8
         assert close.sum() > 30

@@ -10,7 +10,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import Wrapped
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.scenery import texture, wrapped
 
@@ -74,14 +74,14 @@ def test_slopes_of_a_plane_are_found_beside_a_step_and_with_gaps() -> None:
     np.testing.assert_allclose(disparity_slopes(plane * np.nan, np.array([[98.0, 50.0]]), np.array([20.0])), [[0, 0]])
 
 
-def bent(picture: Wrapped, warp: Array, center: Array) -> Wrapped:
-    """The picture as seen after a warp about a point: resampled by the inverse."""
+def bent(image: PaddedPanorama, warp: Array, center: Array) -> PaddedPanorama:
+    """The image as seen after a warp about a point: resampled by the inverse."""
     inverse = np.linalg.inv(warp)
     offset = center - inverse @ center
-    columns, rows = np.meshgrid(np.arange(picture.width, dtype=float), np.arange(picture.image.shape[0], dtype=float))
-    x = inverse[0, 0] * columns + inverse[0, 1] * rows + offset[0] + picture.pad_px
+    columns, rows = np.meshgrid(np.arange(image.width, dtype=float), np.arange(image.image.shape[0], dtype=float))
+    x = inverse[0, 0] * columns + inverse[0, 1] * rows + offset[0] + image.pad_px
     y = inverse[1, 0] * columns + inverse[1, 1] * rows + offset[1]
-    return wrapped(cv2.remap(picture.image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR))
+    return wrapped(cv2.remap(image.image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR))
 
 
 def test_a_bent_patch_is_found_to_hundredths_where_a_stiff_one_errs() -> None:
@@ -102,8 +102,8 @@ def test_a_bent_patch_is_found_to_hundredths_where_a_stiff_one_errs() -> None:
 
 
 def test_patches_far_from_where_they_were_predicted_are_refused() -> None:
-    picture = wrapped(texture(3))
+    image = wrapped(texture(3))
     pixels = np.array([[100.0, 50.0], [200.0, 60.0]])
-    templates = warped_templates(picture, pixels, np.broadcast_to(np.eye(2), (2, 2, 2)), pixels + 5.0)
-    _, close = align(templates, picture, pixels + 5.0)
+    templates = warped_templates(image, pixels, np.broadcast_to(np.eye(2), (2, 2, 2)), pixels + 5.0)
+    _, close = align(templates, image, pixels + 5.0)
     assert not close.any()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.odometry.tracking import Klt, flow, track
+from omnid.core.odometry.tracking import KltSettings, flow, track
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 Array = NDArray[np.float64]
 
-KLT = Klt()
+KLT = KltSettings()
 
 
 def grid(width: int = 480, height: int = 120) -> Array:
@@ -64,7 +64,7 @@ def test_what_is_gone_is_called_gone_though_lucas_and_kanade_report_it() -> None
     assert found[(points[:, 0] < 180) | (points[:, 0] > 300)].mean() > 0.98
 
 
-def test_a_blank_picture_gives_no_tracks_and_no_points_none() -> None:
+def test_a_blank_image_gives_no_tracks_and_no_points_none() -> None:
     blank, points = wrapped(np.full((120, 480), 90, np.uint8)), grid()
     assert not track(wrapped(texture(6)), blank, points, points, KLT)[1].any()
     there, found = track(blank, blank, np.zeros((0, 2)), np.zeros((0, 2)), KLT)
@@ -72,6 +72,6 @@ def test_a_blank_picture_gives_no_tracks_and_no_points_none() -> None:
 
 
 def test_the_panorama_is_what_was_padded() -> None:
-    picture = texture(7)
-    np.testing.assert_array_equal(wrapped(picture).panorama, picture)
-    assert wrapped(picture).width == 480
+    image = texture(7)
+    np.testing.assert_array_equal(wrapped(image).panorama, image)
+    assert wrapped(image).width == 480

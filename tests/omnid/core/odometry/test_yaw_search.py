@@ -24,7 +24,7 @@ def test_any_turn_is_found_to_the_column(degrees: float) -> None:
     assert math.remainder(found - math.radians(degrees), 2 * math.pi) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_turn_to_the_left_is_positive_and_moves_the_picture_right() -> None:
+def test_a_turn_to_the_left_is_positive_and_moves_the_image_right() -> None:
     """What stands ahead is on the robot's right after a turn to the left, so right of the middle."""
     cylinder = Cylinder(480, 120, 60.0)
     T_before_after = se3.exp([0, 0, 0, 0, 0, 0.5])
@@ -41,15 +41,15 @@ def test_what_turns_with_the_camera_locks_the_peak_at_zero_unless_left_out() -> 
     strut[:, 40:60] = strut[:, 200:220] = strut[:, 360:380] = strut[100:] = True
     dots = 255 * np.random.default_rng(4).integers(0, 2, (120, 480)).astype(np.uint8)
     pattern = cv2.GaussianBlur(dots, (0, 0), 0.8)
-    for picture in (before, after):
-        picture[strut] = pattern[strut]
+    for image in (before, after):
+        image[strut] = pattern[strut]
     usable = cv2.erode((~strut).astype(np.uint8), np.ones((5, 5))) > 0
     assert abs(correlation_peaks(before, after, ALL)[0]) < 0.05
     assert correlation_peaks(before, after, usable)[0] == pytest.approx(97 / 480 * 2 * math.pi)
 
 
 def test_the_peaks_are_different_turns_the_second_best_among_them() -> None:
-    """Half of the picture turned one way and half the other: both show."""
+    """Half of the image turned one way and half the other: both show."""
     before = texture(5)
     after = turned(before, 100)
     after[70:] = turned(before, -60)[70:]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.stereo_frame import Sight
+from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from tests.omnid.core.scenery import Eyes, motion_errors
 from tests.simulation import corridor
@@ -21,25 +21,25 @@ PLACES = planar_poses(np.array([[0.0, 0], [0.25, 0.17]]), np.array([0.0, 0.7]))
 
 
 @pytest.fixture(scope="module")
-def keyframe(eyes: Eyes) -> Sight:
-    return eyes.sight(1, PLACES[0])
+def keyframe(cameras: Eyes) -> StereoFrame:
+    return cameras.frame(1, PLACES[0])
 
 
 @pytest.fixture(scope="module")
-def nearby(eyes: Eyes) -> Sight:
+def nearby(cameras: Eyes) -> StereoFrame:
     """0.3 m away and turned by 40 degrees."""
-    return eyes.sight(2, PLACES[1])
+    return cameras.frame(2, PLACES[1])
 
 
-def _remember(places: Relocaliser, sight: Sight, T_odom_rect: NDArray[np.float64]) -> None:
-    places.remember(sight, Keyframe(sight.seq, sight.lower, T_odom_rect, np.diag([1e-6] * 6)))
+def _remember(places: Relocaliser, frame: StereoFrame, T_odom_rect: NDArray[np.float64]) -> None:
+    places.remember(frame, Keyframe(frame.seq, frame.lower, T_odom_rect, np.diag([1e-6] * 6)))
 
 
-def test_the_pose_beside_a_keyframe_is_found(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
-    places = Relocaliser(eyes.model)
+def test_the_pose_beside_a_keyframe_is_found(cameras: Eyes, keyframe: StereoFrame, nearby: StereoFrame) -> None:
+    places = Relocaliser(cameras.model)
     _remember(places, keyframe, T_ODOM_KEYFRAME)
     fit = places.locate(nearby)
-    assert fit is not None and fit.agreeing >= 12 and fit.agreeing <= fit.tracked
+    assert fit is not None and fit.inliers >= 12 and fit.inliers <= fit.tracked
     truth = T_ODOM_KEYFRAME @ se3.inverse(PLACES[0]) @ PLACES[1]
     distance, angle = motion_errors(fit.T_odom_rect, truth)
     assert distance < 0.02 and angle < 0.01
@@ -47,25 +47,27 @@ def test_the_pose_beside_a_keyframe_is_found(eyes: Eyes, keyframe: Sight, nearby
     assert distance < 4 * np.linalg.norm(deviations[:3]) and deviations.max() < 0.02
 
 
-def test_another_place_and_darkness_fit_nowhere(eyes: Eyes, keyframe: Sight) -> None:
-    elsewhere = replace(eyes, scene=corridor(7)).sight(3, PLACES[0])
-    places = Relocaliser(eyes.model)
+def test_another_place_and_darkness_fit_nowhere(cameras: Eyes, keyframe: StereoFrame) -> None:
+    elsewhere = replace(cameras, scene=corridor(7)).frame(3, PLACES[0])
+    places = Relocaliser(cameras.model)
     assert places.locate(keyframe) is None
     _remember(places, keyframe, T_ODOM_KEYFRAME)
     fit = places.locate(elsewhere)
-    assert fit is None or fit.agreeing < 20 or fit.share < 0.4
-    assert places.locate(eyes.darkness(4)) is None
+    assert fit is None or fit.inliers < 20 or fit.share < 0.4
+    assert places.locate(cameras.darkness(4)) is None
     places.forget()
     assert places.locate(keyframe) is None
 
 
-def test_of_many_keyframes_a_bounded_number_is_kept_the_newest(eyes: Eyes, keyframe: Sight, nearby: Sight) -> None:
+def test_of_many_keyframes_a_bounded_number_is_kept_the_newest(
+    cameras: Eyes, keyframe: StereoFrame, nearby: StereoFrame
+) -> None:
     """Blank sights push the good one out; one at the same place replaces the last."""
-    places = Relocaliser(eyes.model, places=3)
+    places = Relocaliser(cameras.model, places=3)
     _remember(places, keyframe, T_ODOM_KEYFRAME)
     for k in range(2):
-        _remember(places, eyes.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
-        _remember(places, eyes.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
+        _remember(places, cameras.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
+        _remember(places, cameras.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
     assert places.locate(nearby) is not None
-    _remember(places, eyes.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
+    _remember(places, cameras.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
     assert places.locate(nearby) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.anchors import CELL_PX, CHUNK, Candidates, Settlement, line_difference
+from omnid.core.stereo.anchors import CELL_PX, CHUNK, AnchorPropagation, Candidates, line_difference
 from tests.omnid.core.scenery import texture
 
 Flags = NDArray[np.bool_]
@@ -24,21 +24,21 @@ def test_the_difference_along_lines_is_that_of_the_pixels_on_them() -> None:
     start, end = lines((10, 20, 10)), lines((42, 84, 22))
     along = (np.arange(32) + 0.5) / 32
     picked = []
-    for picture, first, last in ((lower, (10, 20), (42, 84)), (upper, (10, 30), (42, 106))):
+    for image, first, last in ((lower, (10, 20), (42, 84)), (upper, (10, 30), (42, 106))):
         column, row = (np.array(first) + along[:, None] * (np.array(last) - first)).T
         c, r = column.astype(int), row.astype(int)
         u, v = column - c, row - r
-        picked.append((picture[r, c] * (1 - u) + picture[r, c + 1] * u) * (1 - v)
-                      + (picture[r + 1, c] * (1 - u) + picture[r + 1, c + 1] * u) * v)
+        picked.append((image[r, c] * (1 - u) + image[r, c + 1] * u) * (1 - v)
+                      + (image[r + 1, c] * (1 - u) + image[r + 1, c + 1] * u) * v)
     expected = np.abs(picked[0] - picked[1]).mean()
     assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
 
 
 def test_many_lines_give_what_each_of_them_gives() -> None:
-    picture = texture(15, SHAPE)
+    image = texture(15, SHAPE)
     start, end = np.repeat(lines((10, 20, 0)), CHUNK + 7, axis=1), np.repeat(lines((40, 80, 0)), CHUNK + 7, axis=1)
     start[2, -1] = 40
-    difference = line_difference((picture, picture), start, end, 4)
+    difference = line_difference((image, image), start, end, 4)
     assert (difference[:-1] == 0).all() and difference[-1] > 5
 
 
@@ -70,7 +70,7 @@ def settled(sure: Flags, pixels: Indices) -> tuple[Indices, Flags]:
     true = np.array([SHIFT_PX + k * COURSE_PX for k in (-1, 0, 1, 2)])
     several = np.flatnonzero(~sure)
     point, disparity = np.repeat(several, 4), np.tile(true, len(several))
-    settlement = Settlement(courses(), pixels, np.where(sure, SHIFT_PX, true[0]))
+    settlement = AnchorPropagation(courses(), pixels, np.where(sure, SHIFT_PX, true[0]))
     clear = settlement.settle(sure, Candidates(point, disparity, np.ones(len(point), np.float32)))
     return settlement.disparity, clear
 

@@ -12,10 +12,10 @@ EVERYWHERE = np.ones((60, 80), bool)
 
 def step(levels: int) -> np.ndarray:
     """Dark above row 30, brighter by some grey levels from there on, and a vertical edge that no column can see."""
-    picture = np.full((60, 80), 60, np.uint8)
-    picture[30:] += levels
-    picture[:, 40:] += 60
-    return picture
+    image = np.full((60, 80), 60, np.uint8)
+    image[30:] += levels
+    image[:, 40:] += 60
+    return image
 
 
 def test_a_horizontal_edge_is_found_once_a_column_and_a_vertical_one_not_at_all() -> None:
@@ -42,16 +42,16 @@ def test_only_valid_pixels_in_ascending_order() -> None:
 
 
 def test_the_limit_thins_out_evenly() -> None:
-    picture = texture(2, (60, 80))
-    everything, few = (edge_pixels(picture, EVERYWHERE, 20, limit) for limit in (10_000, 60))
+    image = texture(2, (60, 80))
+    everything, few = (edge_pixels(image, EVERYWHERE, 20, limit) for limit in (10_000, 60))
     assert len(everything) > 300
     assert 30 < len(few) <= 60
     assert set(few) <= set(everything)
     np.testing.assert_array_less(5, np.histogram(few // 80, bins=4, range=(0, 60))[0])
-    assert len(edge_pixels(picture, EVERYWHERE, 2000, 10)) == 0
+    assert len(edge_pixels(image, EVERYWHERE, 2000, 10)) == 0
 
 
-def test_smoothing_takes_noise_away_and_zero_leaves_the_picture_alone() -> None:
+def test_smoothing_takes_noise_away_and_zero_leaves_the_image_alone() -> None:
     noise = np.random.default_rng(3).integers(0, 256, (60, 80)).astype(np.uint8)
     assert smooth(noise, 1.5).std() < noise.std() / 3
     assert smooth(noise, 0.0) is noise

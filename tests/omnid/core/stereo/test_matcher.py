@@ -1,4 +1,4 @@
-"""Matching two panoramas: walls that repeat, textures that do not, fractions, seams and the picture's end."""
+"""Matching two panoramas: walls that repeat, textures that do not, fractions, seams and the image's end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.stereo.edges import smooth
-from omnid.core.stereo.matcher import METHODS, Matcher, Matching
+from omnid.core.stereo.matcher import METHODS, Matcher, MatchingSettings
 from tests.omnid.core.scenery import PAD_PX, Eyes, texture, turned
 from tests.simulation import make_rig, room
 
@@ -20,19 +20,19 @@ SHAPE, SHIFT_PX, COURSE_PX, DISPARITIES = (160, 240), 20, 16, 44
 
 
 def matched(method: str, lower: Image, upper: Image, valid: Flags) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    return Matcher(lower.shape, Matching(method=method, disparities=DISPARITIES)).match(lower, upper, valid)
+    return Matcher(lower.shape, MatchingSettings(method=method, disparities=DISPARITIES)).match(lower, upper, valid)
 
 
 def middle(rows: tuple[int, int] = (12, SHAPE[0] - DISPARITIES - 4)) -> Flags:
-    """Pixels whose every candidate lies inside the picture."""
+    """Pixels whose every candidate lies inside the image."""
     valid = np.zeros(SHAPE, bool)
     valid[rows[0] : rows[1], 12:-12] = True
     return valid
 
 
-def noisy(picture: Image, seed: int) -> Image:
-    noise = np.random.default_rng(seed).normal(0, 1.5, picture.shape)
-    return np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+def noisy(image: Image, seed: int) -> Image:
+    noise = np.random.default_rng(seed).normal(0, 1.5, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
 
 
 def brick_wall() -> tuple[Image, Image]:
@@ -66,7 +66,7 @@ def test_the_original_takes_the_lowest_sum_of_absolute_differences() -> None:
     """Eq. (1) written out: the lowest of the column, and from the match's column the lowest as well."""
     lower, upper = brick_wall()
     pixels, disparity = matched("sad", lower, upper, middle())
-    soft = [smooth(picture, 0.8).astype(int) for picture in (lower, upper)]
+    soft = [smooth(image, 0.8).astype(int) for image in (lower, upper)]
     window = np.arange(-4, 5)
 
     def cost(row: int, column: int, d: int) -> float:
@@ -107,8 +107,8 @@ def test_without_a_single_anchor_the_enhanced_sad_is_the_original() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_to_match(method: str) -> None:
-    picture = texture(19, SHAPE)
-    pixels, disparity = matched(method, picture, picture, np.zeros(SHAPE, bool))
+    image = texture(19, SHAPE)
+    pixels, disparity = matched(method, image, image, np.zeros(SHAPE, bool))
     assert len(pixels) == len(disparity) == 0
 
 
@@ -119,12 +119,12 @@ class RenderedRoom:
 
     def __init__(self, *walls: str) -> None:
         rig = make_rig(size=512, baseline_m=0.2)
-        eyes = Eyes.of(rig, room(3, (2 * self.HALF_M, 2 * self.HALF_M), 0, (*walls, "tiles")))
-        self._sight = eyes.sight(0, se3.transform(np.eye(3), np.array([0, 0, self.EYE_M])))
+        cameras = Eyes.of(rig, room(3, (2 * self.HALF_M, 2 * self.HALF_M), 0, (*walls, "tiles")))
+        self._sight = cameras.frame(0, se3.transform(np.eye(3), np.array([0, 0, self.EYE_M])))
         height, width = self._sight.lower.image.shape
         self._shape, self._valid = (height, width), np.zeros((height, width), bool)
-        self._valid[:, PAD_PX:-PAD_PX] = cv2.erode(eyes.usable.astype(np.uint8), np.ones((15, 15), np.uint8))
-        self._cylinder, self._R, self._baseline_m = eyes.cylinder, rig.T_rect_rig[:3, :3], rig.baseline_m
+        self._valid[:, PAD_PX:-PAD_PX] = cv2.erode(cameras.usable.astype(np.uint8), np.ones((15, 15), np.uint8))
+        self._cylinder, self._R, self._baseline_m = cameras.cylinder, rig.T_rect_rig[:3, :3], rig.baseline_m
 
     def disparity(self, pixels: NDArray[np.intp]) -> NDArray[np.float64]:
         """Of the surface that a pixel of the lower panorama sees."""
@@ -137,14 +137,14 @@ class RenderedRoom:
 
     def counts(self, method: str) -> tuple[int, int]:
         """How many matches are right to a pixel, and how many wrong."""
-        matcher = Matcher(self._shape, Matching(method=method, disparities=self.DISPARITIES))
+        matcher = Matcher(self._shape, MatchingSettings(method=method, disparities=self.DISPARITIES))
         pixels, disparity = matcher.match(self._sight.lower.image, self._sight.upper.image, self._valid)
         wrong = np.abs(disparity - self.disparity(pixels)) > 1
         return int((~wrong).sum()), int(wrong.sum())
 
 
 def test_in_a_room_of_identical_bricks_the_enhanced_sad_has_few_wrong_matches() -> None:
-    """The paper's experiment: bricks, seen from 1.2 m and 1.4 m, with a few pictures among them."""
+    """The paper's experiment: bricks, seen from 1.2 m and 1.4 m, with a few images among them."""
     bricks = RenderedRoom("brick", "brick", "brick", "brick")
     (right, wrong), (enhanced_right, enhanced_wrong) = bricks.counts("sad"), bricks.counts("enhanced")
     assert wrong > 0.3 * right  # or there was nothing to improve
@@ -195,7 +195,7 @@ def test_two_distances_side_by_side(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_row_is_matched_whose_match_lies_in_the_picture(method: str) -> None:
+def test_every_row_is_matched_whose_match_lies_in_the_image(method: str) -> None:
     """Down to the floor: a small disparity needs no room for the largest."""
     lower, valid = texture(16, SHAPE), middle((12, SHAPE[0] - 16))
     pixels, disparity = matched(method, lower, np.roll(lower, 8, axis=0), valid)

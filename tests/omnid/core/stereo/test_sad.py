@@ -38,7 +38,7 @@ def test_the_planes_are_eq_1(volume: SadVolume) -> None:
                 assert volume.planes[d, row, column] == literal(LOWER, UPPER, column, row, d)
 
 
-def test_nothing_matches_below_the_picture(volume: SadVolume) -> None:
+def test_nothing_matches_below_the_image(volume: SadVolume) -> None:
     for d in range(1, DISPARITIES):
         assert (volume.planes[d, -d:] == NEVER).all()
         assert (volume.planes[d, :-d] < NEVER).all()

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.odometry import LOST, TRACKING
-from omnid.core.odometry.paper.paper_odometry import PaperMotion, turned_track
+from omnid.core.odometry.paper.paper_odometry import PaperOdometry, turned_track
 from omnid.core.odometry.paper.registration import consensus, euler_matrix, euler_parameters, register
-from omnid.core.odometry.stereo_frame import Sight
-from omnid.core.odometry.tracking import Klt
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings
 from omnid.errors import OmnidError
+from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import Eyes, motion_errors, texture, turned, wrapped
 from tests.simulation.paths import planar_poses
 
@@ -29,9 +29,9 @@ def cloud(count: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).normal(0, 1.5, (count, 3))
 
 
-def picture(panorama: NDArray[np.uint8], seq: int = 0) -> Sight:
+def image(panorama: NDArray[np.uint8], seq: int = 0) -> StereoFrame:
     nothing = np.full(panorama.shape, np.nan, np.float32)
-    return Sight(seq, wrapped(panorama), wrapped(panorama), nothing, np.ones(panorama.shape, bool))
+    return StereoFrame(seq, wrapped(panorama), wrapped(panorama), nothing, np.ones(panorama.shape, bool))
 
 
 def test_the_matrix_is_rz_ry_rx_as_eq_7_writes_it() -> None:
@@ -83,78 +83,78 @@ def test_the_covariance_is_what_noise_scatters_though_far_points_have_more() -> 
 @pytest.mark.parametrize("degrees", [0.0, 26.0, -45.0, 94.0, 180.0])
 def test_the_improved_tracker_finds_features_through_any_turn(degrees: float) -> None:
     columns = round(degrees / 360 * 480)
-    before, after = picture(texture(1)), picture(turned(texture(1), columns))
+    before, after = image(texture(1)), image(turned(texture(1), columns))
     features = corners(before.lower, before.usable, 300)
-    there, found = turned_track(before, after, features, Klt())
+    there, found = turned_track(before, after, features, KltSettings())
     assert found.mean() > 0.5
     error = (there[found, 0] - features[found, 0] - columns + 240) % 480 - 240
     assert np.mean(np.abs(error) < 0.5) > 0.95
 
 
 def test_where_no_turn_finds_enough_the_best_is_taken() -> None:
-    """A third of the picture turned by 90 degrees, the rest is new."""
+    """A third of the image turned by 90 degrees, the rest is new."""
     after = texture(2)
     after[:, 100:260] = turned(texture(1), 120)[:, 100:260]
-    before = picture(texture(1))
+    before = image(texture(1))
     features = corners(before.lower, before.usable, 300)
-    there, found = turned_track(before, picture(after), features, Klt())
+    there, found = turned_track(before, image(after), features, KltSettings())
     assert 0.1 < found.mean() < 0.5
     error = (there[found, 0] - features[found, 0] - 120 + 240) % 480 - 240
     assert np.mean(np.abs(error) < 0.5) > 0.9
 
 
 @pytest.fixture(scope="module")
-def sights(eyes: Eyes) -> list[Sight]:
-    return [eyes.sight(k, T) for k, T in enumerate(PATH)]
+def frames(cameras: Eyes) -> list[StereoFrame]:
+    return [cameras.frame(k, T) for k, T in enumerate(PATH)]
 
 
-def test_a_path_through_a_right_angle(eyes: Eyes, sights: list[Sight]) -> None:
-    motion = PaperMotion(eyes.model, Klt())
-    for k, sight in enumerate(sights):
-        ego = motion.process(sight, 0.1 if k else 0.0)
+def test_a_path_through_a_right_angle(cameras: Eyes, frames: list[StereoFrame]) -> None:
+    motion = PaperOdometry(cameras.model, KltSettings())
+    for k, frame in enumerate(frames):
+        ego = motion.process(frame, 0.1 if k else 0.0)
         distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
         assert distance < 0.025 and angle < 0.01, k
-        assert (ego.state, ego.resets) == (TRACKING, 0)
+        assert (ego.state, ego.resets) == (TrackingState.TRACKING, 0)
     deviations = np.sqrt(np.diag(ego.covariance))
     assert deviations.min() > 5e-4 and deviations.max() < 0.02
 
 
-def test_the_covariance_accumulates_frame_by_frame(eyes: Eyes, sights: list[Sight]) -> None:
-    motion = PaperMotion(eyes.model, Klt())
-    traces = [np.trace(motion.process(sight, 0.1).covariance[:3, :3]) for sight in sights[:4]]
+def test_the_covariance_accumulates_frame_by_frame(cameras: Eyes, frames: list[StereoFrame]) -> None:
+    motion = PaperOdometry(cameras.model, KltSettings())
+    traces = [np.trace(motion.process(frame, 0.1).covariance[:3, :3]) for frame in frames[:4]]
     assert traces[0] == 0 and (np.diff(traces) > 0).all()
 
 
-def test_a_keyframe_is_kept_as_long_as_its_points_agree(eyes: Eyes, sights: list[Sight]) -> None:
+def test_a_keyframe_is_kept_as_long_as_its_points_agree(cameras: Eyes, frames: list[StereoFrame]) -> None:
     """So the covariance does not grow from sight to sight, as it does from frame to frame."""
-    motion = PaperMotion(eyes.model, Klt(), reference="keyframe")
-    egos = [motion.process(sight, 0.1 if k else 0.0) for k, sight in enumerate(sights)]
+    motion = PaperOdometry(cameras.model, KltSettings(), reference="keyframe")
+    egos = [motion.process(frame, 0.1 if k else 0.0) for k, frame in enumerate(frames)]
     for k, ego in enumerate(egos):
         distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
         assert distance < 0.025 and angle < 0.01, k
-    previous = PaperMotion(eyes.model, Klt())
-    kept, carried = egos[3], [previous.process(sight, 0.1) for sight in sights[:4]][3]
+    previous = PaperOdometry(cameras.model, KltSettings())
+    kept, carried = egos[3], [previous.process(frame, 0.1) for frame in frames[:4]][3]
     assert np.trace(kept.covariance[:3, :3]) < 0.8 * np.trace(carried.covariance[:3, :3])
 
 
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
-def test_darkness_is_lost_and_stays_where_it_was(eyes: Eyes, sights: list[Sight], tracker: str) -> None:
-    motion = PaperMotion(eyes.model, Klt(), tracker)
-    motion.process(sights[0], 0.0)
-    before = motion.process(sights[1], 0.1)
-    into, out = motion.process(eyes.darkness(9), 0.1), motion.process(sights[1], 0.1)
+def test_darkness_is_lost_and_stays_where_it_was(cameras: Eyes, frames: list[StereoFrame], tracker: str) -> None:
+    motion = PaperOdometry(cameras.model, KltSettings(), tracker)
+    motion.process(frames[0], 0.0)
+    before = motion.process(frames[1], 0.1)
+    into, out = motion.process(cameras.darkness(9), 0.1), motion.process(frames[1], 0.1)
     for ego in (into, out):
-        assert ego.state == LOST
+        assert ego.state == TrackingState.LOST
         np.testing.assert_array_equal(ego.T_odom_rect, before.T_odom_rect)
     assert np.trace(out.covariance) > np.trace(into.covariance) > np.trace(before.covariance)
-    again = motion.process(sights[2], 0.1)
-    assert again.state == TRACKING
+    again = motion.process(frames[2], 0.1)
+    assert again.state == TrackingState.TRACKING
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
 
 
-def test_an_unknown_tracker_or_reference_is_refused(eyes: Eyes) -> None:
+def test_an_unknown_tracker_or_reference_is_refused(cameras: Eyes) -> None:
     with pytest.raises(OmnidError, match="improved, klt, found 'sift'"):
-        PaperMotion(eyes.model, Klt(), "sift")
+        PaperOdometry(cameras.model, KltSettings(), "sift")
     with pytest.raises(OmnidError, match="previous, keyframe, found 'first'"):
-        PaperMotion(eyes.model, Klt(), reference="first")
+        PaperOdometry(cameras.model, KltSettings(), reference="first")
