@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from os import PathLike
+from types import MappingProxyType
+from typing import Final
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from drivers.logs.log_folder import Rotation
@@ -14,7 +18,7 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.core.odometry.odometry import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.stereo.matcher import MatchingSettings
-from omnid.settings import knob
+from omnid.settings import knob, load
 from omnid.transport.bus_config import BusConfig
 
 
@@ -258,3 +262,15 @@ class Config:
     graph: GraphConfig = field(default_factory=GraphConfig)
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     service: ServiceConfig = field(default_factory=ServiceConfig)
+
+
+# Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.
+RENAMED: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:
+    """Return the configuration of a TOML file, or the defaults, changed by overrides such as "motor.rate_hz=50".
+
+    Raises OmnidError, also for keys of earlier versions: it names the new one.
+    """
+    return load(Config, path, overrides, renamed=RENAMED)

@@ -9,6 +9,8 @@
         stereo: Stereo = field(default_factory=Stereo)
 
     config = load(Config, "omnid.toml", ["stereo.window_px=9"])
+
+A key that was renamed or removed is refused with its new name: `load(..., renamed={"stereo.side": "stereo.window_px"})`.
 """
 
 from __future__ import annotations
@@ -18,9 +20,10 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from os import PathLike
+from types import MappingProxyType
 from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from omnid.errors import OmnidError
@@ -81,24 +84,69 @@ def knob(
     return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
 
 
-def load(root: type[T], path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> T:
-    """The settings of a TOML file, or the defaults without one, with overrides such as "stereo.window_px=11" on top.
+@dataclass(frozen=True, slots=True)
+class _Keys:
+    """The keys that exist and those that existed once: words the errors for all others."""
 
-    OmnidError for a file that cannot be read and for everything in it that is not exactly as declared.
+    known: tuple[_Path, ...]
+    renamed: Mapping[str, str]
+
+    def moved(self, path: _Path) -> OmnidError | None:
+        """Return the error for a key that was renamed or removed, itself or with a section that it stood in."""
+        for depth in range(len(path), 0, -1):
+            new = self.renamed.get(".".join(path[:depth]))
+            if new is None:
+                continue
+            if " " in new:
+                return OmnidError(f"{_dotted(path)} was removed: {new}")
+            moved = (*new.split("."), *path[depth:])
+            if not any(known[: len(moved)] == moved for known in self.known):
+                return OmnidError(f"{_dotted(path[:depth])} is now called {new}, which has no {_dotted(path[depth:])}")
+            return OmnidError(f"{_dotted(path)} is now called {_dotted(moved)}")
+        return None
+
+    def unknown(self, path: _Path) -> OmnidError:
+        """Return the error for a key that never existed; it proposes a similar one of the section, else of all."""
+        depth = len(path)
+        neighbours = {other[depth - 1]: other[:depth] for other in self.known if other[: depth - 1] == path[:-1]}
+        for candidates in (neighbours, {other[-1]: other for other in self.known}):
+            for nearest in difflib.get_close_matches(path[-1][:80], candidates, n=1, cutoff=0.6):
+                return OmnidError(f"unknown key {_dotted(path)}: did you mean {_dotted(candidates[nearest])}?")
+        return OmnidError(f"unknown key {_dotted(path)}: known are {', '.join(map(_dotted, neighbours.values()))}")
+
+
+def load(
+    root: type[T],
+    path: str | PathLike[str] | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    renamed: Mapping[str, str] = MappingProxyType({}),
+) -> T:
+    """Return the settings of a TOML file, or the defaults without one, changed by overrides "stereo.window_px=11".
+
+    renamed: old dotted path of a key or a section -> its new path, or a sentence where no key takes its place.
+    Raises OmnidError for a file that cannot be read and for everything in it that is not exactly as declared.
     """
-    if path is None:
-        return parse(root, b"", origin="defaults", overrides=overrides)
-    return parse(root, _bytes_of(path), origin=str(path), overrides=overrides)
+    data, origin = (b"", "defaults") if path is None else (_bytes_of(path), str(path))
+    return parse(root, data, origin=origin, overrides=overrides, renamed=renamed)
 
 
-def parse(root: type[T], data: bytes, *, origin: str, overrides: Sequence[str] = ()) -> T:
-    """The settings of TOML bytes, which came from `origin`; else as `load`."""
-    changes = [_parsed_override(root, text) for text in overrides]
+def parse(
+    root: type[T],
+    data: bytes,
+    *,
+    origin: str,
+    overrides: Sequence[str] = (),
+    renamed: Mapping[str, str] = MappingProxyType({}),
+) -> T:
+    """Return the settings of TOML bytes that were read from `origin`; the rest is as in `load`."""
+    keys = _Keys(tuple(_paths(root)), renamed)
+    changes = [_parsed_override(root, text, keys) for text in overrides]
     try:
         table = _table_of(data)
         for path, value in changes:
             _insert(table, path, value)
-        return cast("T", _built(root(), table, (), tuple(_paths(root))))
+        return cast("T", _built(root(), table, (), keys))
     except OmnidError as error:
         raise OmnidError(f"{origin}: {error}") from None
 
@@ -129,13 +177,13 @@ def _table_of(data: bytes) -> dict[str, Any]:
         raise OmnidError(f"expected TOML, found: {' '.join(str(error).split())}") from None
 
 
-def _parsed_override(root: type, text: str) -> tuple[_Path, object]:
+def _parsed_override(root: type, text: str, keys: _Keys) -> tuple[_Path, object]:
     name, equals, raw = text.partition("=")
     path = tuple(part.strip() for part in name.split("."))
     if not equals:
         raise OmnidError(f"override {_shown(text)}: expected section.key=value, found no '='")
     try:
-        kind, entry = _entry_at(root, path)
+        kind, entry = _entry_at(root, path, keys)
         value = _scalar(raw.strip())
         if kind is str and not isinstance(value, str):
             value = raw.strip()
@@ -152,14 +200,14 @@ def _scalar(raw: str) -> object:
     return table["value"] if table.keys() == {"value"} else raw
 
 
-def _entry_at(root: type, path: _Path) -> tuple[Any, Knob]:
+def _entry_at(root: type, path: _Path, keys: _Keys) -> tuple[Any, Knob]:
     kind: Any = root
     for depth, name in enumerate(path):
         if not is_dataclass(kind):
             raise OmnidError(f"{_dotted(path[:depth])} is a key, not a section: it has no {_dotted(path[depth:])}")
         entries = {entry.name: (hint, entry) for entry, hint in _entries(kind)}
         if name not in entries:
-            raise _unknown(path[: depth + 1], tuple(_paths(root)))
+            raise keys.moved(path) or keys.unknown(path[: depth + 1])
         kind, entry = entries[name]
     if is_dataclass(kind):
         first = next(_paths(cast("type", kind), path))
@@ -175,17 +223,17 @@ def _insert(table: dict[str, Any], path: _Path, value: object) -> None:
     table[path[-1]] = value
 
 
-def _built(default: object, table: dict[str, Any], path: _Path, known: tuple[_Path, ...]) -> object:
+def _built(default: object, table: dict[str, Any], path: _Path, keys: _Keys) -> object:
     entries = _entries(type(default))
     for name in table.keys() - {entry.name for entry, _ in entries}:
-        raise _unknown((*path, name), known)
+        raise keys.moved(_first_leaf(table[name], (*path, name))) or keys.unknown((*path, name))
     values: dict[str, object] = {}
     for entry, kind in entries:
         here, value = (*path, entry.name), getattr(default, entry.name)
         if is_dataclass(kind):
             inner = table.get(entry.name, {})
             _require_section(inner, here)
-            values[entry.name] = _built(value, inner, here, known)
+            values[entry.name] = _built(value, inner, here, keys)
         else:
             values[entry.name] = _checked(kind, _knob_of(entry), table.get(entry.name, value), here)
     return type(default)(**values)
@@ -223,14 +271,12 @@ def _require_section(value: object, path: _Path) -> None:
         raise OmnidError(f"{_dotted(path)}: expected a section, found {_shown(value)}")
 
 
-def _unknown(path: _Path, known: tuple[_Path, ...]) -> OmnidError:
-    """The error for a key that nobody reads: likely meant is a neighbour of it, else a key elsewhere."""
-    depth = len(path)
-    neighbours = {other[depth - 1]: other[:depth] for other in known if other[: depth - 1] == path[:-1]}
-    for candidates in (neighbours, {other[-1]: other for other in known}):
-        for nearest in difflib.get_close_matches(path[-1][:80], candidates, n=1, cutoff=0.6):
-            return OmnidError(f"unknown key {_dotted(path)}: did you mean {_dotted(candidates[nearest])}?")
-    return OmnidError(f"unknown key {_dotted(path)}: known are {', '.join(map(_dotted, neighbours.values()))}")
+def _first_leaf(value: object, path: _Path) -> _Path:
+    """Return the path of the first key below a value of a TOML file, or that of the value where it is no section."""
+    while isinstance(value, dict) and value:
+        name, value = next(iter(value.items()))
+        path = (*path, name)
+    return path
 
 
 def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:

@@ -22,8 +22,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints the settings."""
-    from omnid.config import Config
-    from omnid.settings import dump, load
+    from omnid.config import load_config
+    from omnid.settings import dump
 
-    print(dump(load(Config, args.config, args.overrides)), end="")
+    print(dump(load_config(args.config, args.overrides)), end="")
     return 0

@@ -20,17 +20,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Replays the sample and prints its errors."""
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
     from omnid.runs.replay import Options, ReplayRun
-    from omnid.settings import load
 
     _make(args.output)
     tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
     options = Options(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
                       bus_optional=True, realtime=True, quiet=args.quiet, settings=args.config)
-    config = load(Config, args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
+    config = load_config(args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
         code = ReplayRun(log, config, options).run(rig=None, topics=(None, None))

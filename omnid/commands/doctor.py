@@ -26,12 +26,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints a line for each check; 1 if something is wrong."""
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.doctor.finding import verdict
-    from omnid.settings import load
 
     found: list[Finding] = []
-    for finding in examine(load(Config, args.config, args.overrides)):
+    for finding in examine(load_config(args.config, args.overrides)):
         print(finding, flush=True)
         found.append(finding)
     print(verdict(found))

@@ -25,13 +25,12 @@ def run(args: argparse.Namespace) -> int:
     """Listens; 1 where not one pose came."""
     from dataclasses import replace
 
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.errors import OmnidError
     from omnid.monitor.follow import listen
-    from omnid.settings import load
 
     if args.seconds is not None and not 0 < args.seconds < 1e9:
         raise OmnidError(f"--seconds {args.seconds} is no time to listen for; give seconds above 0, or leave it out")
-    bus = load(Config, args.config, args.overrides).bus
+    bus = load_config(args.config, args.overrides).bus
     bus = replace(bus, robot=args.robot or bus.robot, connect=tuple(args.connect or bus.connect))
     return listen(bus, args.tum, args.mcap, args.seconds)

@@ -27,12 +27,11 @@ def run(args: argparse.Namespace) -> int:
     """Records; 1 where nothing was recorded."""
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.runs.record import record
-    from omnid.settings import load
 
     named = {"record.folder": args.folder, "cameras.rig": args.rig}
-    config = load(Config, args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, Camera] = ("lower", "upper")
     with ExitStack() as closing:

@@ -45,13 +45,12 @@ def _add_manner(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replays the log."""
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.runs.replay import Options, ReplayRun
-    from omnid.settings import load
 
     options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
                       inline=args.inline, realtime=args.realtime, quiet=args.quiet, settings=args.config)
-    config = load(Config, args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
+    config = load_config(args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
     return ReplayRun(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
 
 

@@ -35,14 +35,13 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.malloc_settings import share_heap
 
     share_heap()  # before anything else: the next line loads numpy, which starts threads
-    from omnid.config import Config
+    from omnid.config import load_config
     from omnid.engine.logging_setup import say
     from omnid.runs.live import LiveRun
-    from omnid.settings import load
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load(Config, args.config, [*args.overrides, *shortcuts])
+    config = load_config(args.config, [*args.overrides, *shortcuts])
     if args.log is None:
         _refuse_what_needs_a_log(args)
         return LiveRun(config, _devices(config), say).run()

@@ -48,14 +48,13 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Shows it; 1 where there was no pose to show."""
-    from omnid.config import Config
-    from omnid.settings import load
+    from omnid.config import load_config
 
     _refuse_contradictions(args)
     _require_rerun()
     from omnid.viewer.view import check_file, place_for
 
-    config = load(Config, args.config, args.overrides)
+    config = load_config(args.config, args.overrides)
     check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
                ("the configuration that is read", args.config))
     place = place_for(args.output, args.web)

@@ -170,6 +170,44 @@ def test_a_wrong_override_is_refused_by_name(override: str, said: str) -> None:
     assert said in message
 
 
+RENAMED = {
+    "depth.window": "stereo.window_px",
+    "wheels": "motor",
+    "wheels.port": "motor.serial.port",
+    "wheels.top_mps": "the base keeps its own limit, set it there",
+    "stereo.window": "stereo.window_px",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("depth.window", "depth.window is now called stereo.window_px"),
+        ("stereo.window", "stereo.window is now called stereo.window_px"),
+        ("wheels.limit_mps", "wheels.limit_mps is now called motor.limit_mps"),
+        ("wheels.serial.bauds", "wheels.serial.bauds is now called motor.serial.bauds"),
+        ("wheels.port", "wheels.port is now called motor.serial.port"),
+        ("wheels.top_mps", "wheels.top_mps was removed: the base keeps its own limit, set it there"),
+        ("wheels.colour", "wheels is now called motor, which has no colour"),
+        ("depth.widow", "unknown key depth"),
+    ],
+)
+def test_refuses_a_key_of_an_earlier_version_with_its_new_name(tmp_path: Path, name: str, expected: str) -> None:
+    section, _, key = name.rpartition(".")
+    with pytest.raises(OmnidError) as in_file:
+        load(Config, written(tmp_path, f"robot = 'r2'\n[{section}]\n{key} = 5"), renamed=RENAMED)
+    assert str(in_file.value).startswith(f"{tmp_path / 'omnid.toml'}: {expected}")
+    with pytest.raises(OmnidError) as in_override:
+        load(Config, None, [f"{name}=5"], renamed=RENAMED)
+    assert str(in_override.value).startswith(f"override '{name}=5': {expected}")
+    assert "\n" not in str(in_file.value) + str(in_override.value)
+
+
+def test_refuses_an_empty_section_of_an_earlier_version() -> None:
+    with pytest.raises(OmnidError, match=r"^omnid\.toml: wheels is now called motor$"):
+        parse(Config, b"[wheels]", origin="omnid.toml", renamed=RENAMED)
+
+
 def test_an_override_below_a_value_of_the_file_is_refused() -> None:
     assert "stereo: expected a section, found 5" in refusal("stereo = 5", "stereo.window_px=5")
 

@@ -22,9 +22,8 @@ import numpy as np
 from calib.rig_file import read_rig
 from drivers.cameras.log_camera import LogCamera, LogImages
 from drivers.frame import Camera, Frame, gray
-from omnid.config import Config
+from omnid.config import load_config
 from omnid.runs.live import LiveRun
-from omnid.settings import load
 
 TIME, TIME_NS = time.time, time.time_ns
 
@@ -84,7 +83,7 @@ def main() -> int:
     faults: dict[str, str] = {}
     threading.Thread(target=obey, args=(faults,), daemon=True).start()
     images, epoch_ns = LogImages.of(args.log), time.monotonic_ns()
-    config = load(Config, None, [*args.settings, f"motor.port={args.motor}"])
+    config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
     live = LiveRun(config, lambda camera: SpoiltCamera(images, camera, epoch_ns, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()

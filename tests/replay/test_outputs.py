@@ -13,12 +13,12 @@ from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import parse_rig, read_rig, write_rig
-from omnid.config import Config
+from omnid.config import Config, load_config
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import Options, ReplayRun
-from omnid.settings import load, parse
+from omnid.settings import parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import map_from, report_from
 from tests.conftest import PAIRS
@@ -149,7 +149,7 @@ def test_a_taken_port_silences_the_demo_only(omnid: Command, tmp_path: Path, sce
     words = ("--rig", scene / "rig.toml", "--quiet", "--publish", "--set", listen)
     assert "bus" in omnid.refused("replay", scene / "log.mcap", *words)
     options = Options(tum=tmp_path / "est.txt", publish=True, bus_optional=True, quiet=True)
-    code = ReplayRun(scene / "log.mcap", load(Config, None, [listen]), options).run(scene / "rig.toml", (None, None))
+    code = ReplayRun(scene / "log.mcap", load_config(None, [listen]), options).run(scene / "rig.toml", (None, None))
     assert code == 0 and len(rows(tmp_path / "est.txt")) == PAIRS
     assert "going on without a bus" in capsys.readouterr().err
 
