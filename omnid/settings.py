@@ -10,7 +10,7 @@
 
     config = load(Config, "omnid.toml", ["stereo.window_px=9"])
 
-A key that was renamed or removed is refused with its new name: `load(..., renamed={"stereo.side": "stereo.window_px"})`.
+A renamed or removed key is refused with its new name: `load(..., renamed={"stereo.side": "stereo.window_px"})`.
 """
 
 from __future__ import annotations
