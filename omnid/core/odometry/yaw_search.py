@@ -15,8 +15,12 @@ STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
 
 
 def steps() -> list[float]:
-    """The paper's turns [rad]: 0, 18, 36, ... 342 degrees, in its own order."""
-    return [k * STEP_RAD for k in range(20)]
+    """Return the paper's yaw hypotheses [rad] in order of magnitude: 0, 18, -18, 36, -36, ... 162, -162, 180 degrees.
+
+    The paper counts from 0 to 342 degrees, and so tries a small turn to the right last.
+    """
+    both = [sign * k * STEP_RAD for k in range(1, 10) for sign in (1, -1)]
+    return [0.0, *both, 10 * STEP_RAD]
 
 
 def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = 3) -> list[float]:

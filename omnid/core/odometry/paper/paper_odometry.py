@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,25 +162,29 @@ def _carried(covariance: Array, T_a_b: Array) -> Array:
 def turned_track(
     previous: StereoFrame, frame: StereoFrame, features: Array, klt: KltSettings, turns: Sequence[float] | None = None
 ) -> tuple[Array, Flags]:
-    """The improved KLT of section IV.F: turns by 0, 18, 36 ... degrees until enough features (N, 2) are found.
+    """Track features (N, 2) with the improved KLT of section IV.F: rotate image k+1 until enough of them are found.
+
+    turns [rad]: the hypotheses in the order in which they are tried; by default 0, 18, -18, 36, -36, ... degrees.
 
     The paper stops at the first turn that will do; but half a step away half of the features may be found as well, so
-    the search goes on while the next turn finds more. If none will do, the turn that finds most. turns [rad]: others to
-    try instead.
+    the search goes on while the next larger turn, to the left or to the right, finds more. If no turn finds enough,
+    the one that finds most is taken.
 
     On a panorama a turn of image k+1 is a shift of its columns, and to start the search that much further along is
     the same; the columns returned are those of k+1 itself, so the motion estimated from them is the total one. The
     paper counts what Lucas and Kanade report; but their status says only that the search ended, and four of five points
-    are then wrong after 18 degrees. Only those that come back are counted here.
+    are then wrong after 18 degrees. Only features that pass the forward-backward check are counted here.
     """
     best, most = (features, np.zeros(len(features), bool)), -1
-    for turn in steps() if turns is None else turns:
-        shift = turn * previous.lower.width / (2 * np.pi)
-        there, found = track(previous.lower, frame.lower, features, features + np.array([shift, 0.0]), klt)
-        if found.sum() <= most and most >= ENOUGH * len(features):
-            break
-        if found.sum() > most:
-            best, most = (there, found), int(found.sum())
-        if most >= AMPLE * len(features):
+    for _, both_directions in groupby(steps() if turns is None else turns, key=abs):
+        before = most
+        for turn in both_directions:
+            shift = turn * previous.lower.width / (2 * np.pi)
+            there, found = track(previous.lower, frame.lower, features, features + np.array([shift, 0.0]), klt)
+            if found.sum() > most:
+                best, most = (there, found), int(found.sum())
+            if most >= AMPLE * len(features):
+                return best
+        if most == before and most >= ENOUGH * len(features):
             break
     return best

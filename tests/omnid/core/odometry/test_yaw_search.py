@@ -59,5 +59,8 @@ def test_the_peaks_are_different_turns_the_second_best_among_them() -> None:
     assert min(abs(math.remainder(a - b, 360)) for i, a in enumerate(peaks) for b in peaks[:i]) > 9.9
 
 
-def test_the_papers_steps() -> None:
-    np.testing.assert_allclose(np.rad2deg(steps()), 18 * np.arange(20))
+def test_the_papers_steps_go_both_ways_by_magnitude_and_meet_at_180_degrees() -> None:
+    degrees = np.rad2deg(steps())
+    np.testing.assert_allclose(degrees[:5], [0, 18, -18, 36, -36])
+    np.testing.assert_allclose(np.sort(degrees % 360), 18 * np.arange(20), atol=1e-9)
+    assert (np.diff(np.abs(degrees)) > -1e-9).all()
