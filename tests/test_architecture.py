@@ -80,7 +80,7 @@ def test_imports_point_one_way(rule: Rule) -> None:
         ("omnid/stages/graph.py", "import os, threading"),
         ("omnid/stages/a.py", "import time"),
         ("omnid/core/a.py", "from omnid import engine"),
-        ("omnid/core/a.py", "from ..stages.pair import PairSync"),
+        ("omnid/core/a.py", "from ..stages.synchronise import Synchronise"),
         ("omnid/core/a.py", "from .. import cli"),
         ("omnid/core/a.py", "import logging.handlers"),
     ],

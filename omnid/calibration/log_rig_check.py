@@ -19,9 +19,9 @@ from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_check import RigCheck, RigFinding
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
+from omnid.stages.decoder import Decoder
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
-from omnid.stages.log_pairing import Decoder
 
 PAIRS = 24
 

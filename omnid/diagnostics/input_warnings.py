@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from omnid.config import PairConfig
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.stages.log_pairing import PairSync
 from omnid.stages.stereo import Stereo
+from omnid.stages.synchronise import Synchronise
 
 
 def no_pose(tally: RunStatistics) -> bool:
@@ -15,15 +15,15 @@ def no_pose(tally: RunStatistics) -> bool:
     return tally.poses == tally.states["lost"]
 
 
-def input_warnings(pair: PairSync, stereo: Stereo, tally: RunStatistics, config: PairConfig) -> Iterator[str]:
+def input_warnings(pair: Synchronise, stereo: Stereo, tally: RunStatistics, config: PairConfig) -> Iterator[str]:
     """One line for each thing that is amiss."""
     if pair.fault:
         yield f"{pair.counts['broken']} images could not be decoded; the first: {pair.fault}"
     counts = pair.counts
     if not counts["pairs"]:
-        yield _no_pair(pair.nearest_ms, config.tolerance_ms)
+        yield _no_pair(pair.closest_miss_ms, config.tolerance_ms)
     elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
-        yield (f"most images of both cameras found no partner: the next ones are {pair.nearest_ms or 0.0:.3f} ms "
+        yield (f"most images of both cameras found no partner: the next ones are {pair.closest_miss_ms or 0.0:.3f} ms "
                f"apart, pair.tolerance_ms is {config.tolerance_ms:g}; where none are missing, synchronise the cameras")
     if stereo.exchanged:
         yield ("the images match better the other way round: is --lower the lower camera, and is the rig that of "

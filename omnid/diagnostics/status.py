@@ -13,7 +13,7 @@ from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
-from omnid.stages.live_pairing import LivePair
+from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
 from omnid.transport.commands import Commands
 
@@ -47,7 +47,7 @@ class StatusSources(NamedTuple):
 
     telemetry: Telemetry
     cameras: Mapping[Camera, CameraState]
-    pair: LivePair
+    pair: Synchronise
     tally: RunStatistics
     to_pose: Histogram
     helm: ControllerStatistics | None
@@ -89,11 +89,11 @@ class StatusReport:
         skew, counts = pair.skew, pair.counts
         fault = self._fault(pair)
         values = {name: str(count) for name, count in counts.items()} | {
-            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "most_skew_ms": f"{skew.most_ns * 1e-6:.3f}",
-            "wandered_ms": f"{skew.wandered_ns * 1e-6:.3f}"}
+            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "most_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
+            "wandered_ms": f"{skew.drift_ns * 1e-6:.3f}"}
         return DiagnosticStatus("omnid: pairing", WARN if fault else OK, fault or "in step", values)
 
-    def _fault(self, pair: LivePair) -> str:
+    def _fault(self, pair: Synchronise) -> str:
         """What is wrong with the pairing, in the order of what explains the rest; empty where it goes well."""
         rate_hz, broken_hz = self._rates("pairs", pair.counts["pairs"]), self._rates("broken", pair.counts["broken"])
         silent = [name for name in self._watched.cameras if self._silent_s(name) > SILENT_S]
@@ -103,7 +103,7 @@ class StatusReport:
             return f"images that cannot be decoded, the first: {pair.fault}"
         if rate_hz == 0:
             return "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
-        return "the cameras drift apart in time: synchronise them" if abs(pair.skew.wandered_ns) > WANDERED_NS else ""
+        return "the cameras drift apart in time: synchronise them" if abs(pair.skew.drift_ns) > WANDERED_NS else ""
 
     def _silent_s(self, camera: Camera) -> float:
         """How long ago the camera's newest image was taken; inf before the first."""

@@ -19,7 +19,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
 from omnid.errors import OmnidError
 from omnid.report.page import Image
-from omnid.stages.log_pairing import Decoder
+from omnid.stages.decoder import Decoder
 
 WIDTH_PX: Final = 1200
 MOST_HEIGHT_PX: Final = 500

@@ -39,7 +39,7 @@ from omnid.sinks.command_log import keeper_of_commands
 from omnid.sinks.encoder import Encoder, clouds_of, status_report
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
-from omnid.stages.live_pairing import LivePair
+from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import Commands
@@ -109,7 +109,7 @@ class LiveRun:
         config, graph = self._config, self._graph
         helm = self._helm(place, ends) if config.motor.port else None
         bus = self._bus(place, ends)
-        pair = LivePair(place.rig, config.pair)
+        pair = Synchronise(place.rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         recorder = self._recorder(place, ends) if config.record.enabled else None
         poses: dict[str, Sink[OdometryUpdate]] = {"tally": self._tally, "latency": self._latency}

@@ -37,7 +37,7 @@ from omnid.sinks.encoder import Encoder, Outgoing, clouds_of
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, geometry, with_rims
-from omnid.stages.log_pairing import PairSync
+from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import OK, DiagnosticStatus
 
@@ -92,7 +92,7 @@ class ReplayRun:
             closing.callback(reader.close)
             place = self._geometry(reader, rig)
             ends = self._ends(place, closing)
-            pair = PairSync(place.rig, self._config.pair)
+            pair = Synchronise(place.rig, self._config.pair)
             pairs = self._graph.stage("pair", pair, self._frames(reader))
             watched = wire(self._graph, pairs, place, self._config, ends)
             if isinstance(ends.recorder, Recorder):
@@ -181,7 +181,7 @@ class ReplayRun:
             progress = Progress(self._tally, reader.pair_estimate())
             self._graph.ticker("progress", progress.period_s, progress)
 
-    def _conclude(self, reader: LogReader, pair: PairSync, watched: WiredStages) -> None:
+    def _conclude(self, reader: LogReader, pair: Synchronise, watched: WiredStages) -> None:
         found = self._tally.poses or not self._signal
         doubtful = input_warnings(pair, watched.stereo, self._tally, self._config.pair) if found else ()
         for warning in [*self._warnings, *reader.warnings, *doubtful]:
@@ -199,7 +199,7 @@ class ReplayRun:
         boxes = (stats for stats in self._graph.telemetry.stages if stats.name not in QUIET_BOXES)
         return [DiagnosticStatus("omnid: summary", OK, "the run has ended", values), *map(stage_status, boxes)]
 
-    def _dropped(self, reader: LogReader, pair: PairSync) -> dict[str, int]:
+    def _dropped(self, reader: LogReader, pair: Synchronise) -> dict[str, int]:
         """Everything that was lost on the way, by reason; zeros too."""
         drops = {name: reader.counts[name] for name in READER_DROPS}
         drops |= {name: count for name, count in pair.counts.items() if name.startswith("unpaired")}

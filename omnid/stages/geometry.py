@@ -17,7 +17,7 @@ from calib.rig import MountedCamera, Rig
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.stages.log_pairing import Decoder
+from omnid.stages.decoder import Decoder
 
 Array = NDArray[np.float64]
 

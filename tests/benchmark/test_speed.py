@@ -20,7 +20,7 @@ from omnid.engine.graph import Graph
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.log_pairing import PairSync
+from omnid.stages.synchronise import Synchronise
 from tests.replay.test_memory import to_and_fro
 
 TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"
@@ -46,7 +46,7 @@ def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
     graph = Graph(threaded=threaded)
     ends = Sinks({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
+    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)

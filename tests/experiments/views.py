@@ -17,7 +17,7 @@ from omnid.config import Config
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.log_pairing import PairSync
+from omnid.stages.synchronise import Synchronise
 from tests.experiments.scenes import RigOptions, build
 from tests.simulation.recipes import Run
 
@@ -86,7 +86,7 @@ def look(folder: Path) -> Views:
 
 
 def _pairs(folder: Path, place: Geometry, config: Config) -> Iterator[FramePair]:
-    sync, reader = PairSync(place.rig, config.pair), LogReader(folder / "log.mcap")
+    sync, reader = Synchronise(place.rig, config.pair), LogReader(folder / "log.mcap")
     try:
         yield from (pair for frame in reader.frames() if (pair := sync.process(frame)) is not None)
     finally:

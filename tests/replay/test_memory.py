@@ -21,7 +21,7 @@ from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.log_pairing import PairSync
+from omnid.stages.synchronise import Synchronise
 
 PAIRS = 2000
 PERIOD_NS = 100_000_000
@@ -60,7 +60,7 @@ def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
     graph = Graph(threaded=threaded)
     ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, graph.stage("pair", PairSync(place.rig, config.pair), read), place, config, ends)
+    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
     graph.run()
     print(tally.states, watch.mib)
     assert tally.poses == PAIRS

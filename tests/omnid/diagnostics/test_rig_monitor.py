@@ -20,7 +20,7 @@ from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
-from omnid.stages.log_pairing import PairSync
+from omnid.stages.synchronise import Synchronise
 from tests.simulation import build, write_log
 from tests.simulation.logs import PERIOD_NS
 from tests.simulation.rigs import misturned
@@ -49,7 +49,8 @@ def watched(folder: Path, rig: Rig) -> tuple[RigMonitor, Kept]:
     """A whole run over a log, as the daemon does it."""
     place, config, graph = geometry(rig, PanoramaConfig()), PanoramaConfig(), Graph(threaded=False)
     watch, kept = RigMonitor(place.cylinder, PERIOD_NS / SECONDS), Kept()
-    pairs = graph.stage("pair", PairSync(rig, PairConfig()), graph.source("log", LogReader(folder / "log.mcap").frames))
+    frames = graph.source("log", LogReader(folder / "log.mcap").frames)
+    pairs = graph.stage("pair", Synchronise(rig, PairConfig()), frames)
     panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
     graph.sink("rig", watch, panoramas, policy=NEWEST, depth=1)
     graph.sink("kept", kept, panoramas)

@@ -25,7 +25,7 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.diagnostics.status import SILENT_S, StatusReport, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
-from omnid.stages.live_pairing import LivePair
+from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import Commands
 from tests.simulation import build
@@ -54,7 +54,7 @@ class Daemon:
         self.telemetry, self.tally, self.latency = Telemetry(), RunStatistics(), Latency()
         self.stages = [self.telemetry.add(StageStats(name)) for name in ("stereo", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
-        self.pair = LivePair(rig, PairConfig())
+        self.pair = Synchronise(rig, PairConfig())
         self.wheels = Wheels()
         self.helm = Controller(self.wheels, ControllerSettings(0.05))
         self.logbook = ControllerStatistics(self.stages[1])

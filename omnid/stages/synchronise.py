@@ -1,0 +1,171 @@
+"""Pair the images of the two cameras by their stamps: one stage for live cameras and for logs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+
+from calib.rig import Rig
+from drivers.frame import Camera, Frame
+from omnid.config import PairConfig
+from omnid.messages import FramePair
+from omnid.stages.decoder import Decoder, Image
+
+MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
+SKEW_GAIN = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
+OTHER: dict[Camera, Camera] = {"lower": "upper", "upper": "lower"}
+
+
+class Skew:
+    """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
+
+    def __init__(self) -> None:
+        self.mean_ns = math.nan  # running mean
+        self.max_ns = 0  # largest absolute value
+        self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
+        self._pairs = 0
+
+    def add(self, skew_ns: int) -> None:
+        """Add the skew of a pair."""
+        self._pairs += 1
+        gain = max(SKEW_GAIN, 1 / self._pairs)
+        self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
+        self.max_ns = max(self.max_ns, abs(skew_ns))
+        if self._pairs == round(1 / SKEW_GAIN):
+            self._settled_ns = self.mean_ns
+
+    @property
+    def drift_ns(self) -> float:
+        """Change of the running mean since it had settled; NaN before."""
+        return self.mean_ns - self._settled_ns
+
+
+class FrameMatcher:
+    """Nearest-stamp matching of the frames of two cameras; reads stamps only, no images and no clock.
+
+    Frames of one camera come in the order of their stamps, those of both in any order. A match is final as soon as
+    there is one within the tolerance: waiting for a nearer one would delay every pair by a period.
+    """
+
+    def __init__(self, tolerance_ns: int) -> None:
+        self._tolerance_ns = tolerance_ns
+        self._waiting: dict[Camera, deque[Frame]] = {"lower": deque(), "upper": deque()}
+        self.unpaired: Counter[Camera] = Counter()
+        self.closest_miss_ns: int | None = None  # smallest gap between frames of both cameras that made no pair
+
+    @property
+    def waiting(self) -> int:
+        """Number of frames that wait for a partner."""
+        return sum(map(len, self._waiting.values()))
+
+    def partner(self, frame: Frame) -> Frame | None:
+        """Return the waiting frame of the other camera that is nearest in time, None without one in the tolerance."""
+        nearest = self._nearest(frame)
+        return nearest if nearest is not None and _gap_ns(frame, nearest) <= self._tolerance_ns else None
+
+    def wait(self, frame: Frame) -> None:
+        """Let a frame without a partner wait; the oldest one gives way when too many wait."""
+        nearest = self._nearest(frame)
+        if nearest is not None:
+            gap_ns = _gap_ns(frame, nearest)
+            self.closest_miss_ns = gap_ns if self.closest_miss_ns is None else min(gap_ns, self.closest_miss_ns)
+        waiting = self._waiting[frame.camera]
+        waiting.append(frame)
+        if len(waiting) > MAX_WAITING:
+            waiting.popleft()
+            self.unpaired[frame.camera] += 1
+
+    def remove(self, frame: Frame) -> None:
+        """Remove a waiting frame that turned out to be of no use; it does not count as unpaired."""
+        self._waiting[frame.camera].remove(frame)
+
+    def join(self, *pair: Frame) -> None:
+        """Make frames a pair: no later frame can match what waits from before them, so that is dropped and counted."""
+        for frame in pair:
+            waiting = self._waiting[frame.camera]
+            while waiting and waiting[0].stamp_ns <= frame.stamp_ns:
+                dropped = waiting.popleft()
+                if dropped is not frame:
+                    self.unpaired[frame.camera] += 1
+
+    def drain(self) -> None:
+        """Drop and count all frames that wait."""
+        for camera, waiting in self._waiting.items():
+            self.unpaired[camera] += len(waiting)
+            waiting.clear()
+
+    def _nearest(self, frame: Frame) -> Frame | None:
+        return min(self._waiting[OTHER[frame.camera]], key=lambda other: _gap_ns(frame, other), default=None)
+
+
+class Synchronise:
+    """Joins each frame with the frame of the other camera that is nearest in time.
+
+    Live cameras and logs need no different policy. A log's frames come in the order of all stamps, a live camera's in
+    that of its own: the first is a case of the second. Images are decoded once they have a partner, so that a camera
+    without the other one costs no time. A frame that cannot be decoded counts as `broken` and is treated as if it
+    had never come; one that never finds a partner is not decoded and counts as unpaired.
+    """
+
+    def __init__(self, rig: Rig, config: PairConfig) -> None:
+        self._decode = Decoder(rig)
+        self._matcher = FrameMatcher(round(config.tolerance_ms * 1e6))
+        self._pairs = 0
+        self.skew = Skew()
+        self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
+
+    @property
+    def fault(self) -> str:
+        """Reason why the first of the broken images could not be decoded; empty without one."""
+        return self._decode.fault
+
+    @property
+    def closest_miss_ms(self) -> float | None:
+        """Smallest gap between images of both cameras that made no pair, ms; None without such images."""
+        miss_ns = self._matcher.closest_miss_ns
+        return None if miss_ns is None else miss_ns * 1e-6
+
+    @property
+    def waiting(self) -> int:
+        """Number of frames that wait for a partner."""
+        return self._matcher.waiting
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pairs made, frames of either camera without a partner, images that could not be decoded."""
+        unpaired = self._matcher.unpaired
+        return {"pairs": self._pairs, "unpaired_lower": unpaired["lower"], "unpaired_upper": unpaired["upper"],
+                "broken": self._decode.broken}
+
+    def process(self, frame: Frame) -> FramePair | None:
+        """Return the pair that this frame completes; None where the frame waits or is broken."""
+        self.newest_ns[frame.camera] = frame.stamp_ns
+        image: Image | None = None
+        while (partner := self._matcher.partner(frame)) is not None:
+            image = self._decode(frame) if image is None else image
+            partner_image = self._decode(partner)
+            if partner_image is None:
+                self._matcher.remove(partner)
+            if image is None:
+                return None
+            if partner_image is not None:
+                return self._joined({frame.camera: (frame, image), partner.camera: (partner, partner_image)})
+        self._matcher.wait(frame)
+        return None
+
+    def finish(self) -> tuple[()]:
+        """Count the frames that still wait."""
+        self._matcher.drain()
+        return ()
+
+    def _joined(self, pair: dict[Camera, tuple[Frame, Image]]) -> FramePair:
+        (lower, lower_image), (upper, upper_image) = pair["lower"], pair["upper"]
+        self._matcher.join(lower, upper)
+        self.skew.add(upper.stamp_ns - lower.stamp_ns)
+        seq = self._pairs
+        self._pairs += 1
+        return FramePair(seq, lower.stamp_ns, lower_image, upper_image)
+
+
+def _gap_ns(frame: Frame, other: Frame) -> int:
+    return abs(other.stamp_ns - frame.stamp_ns)

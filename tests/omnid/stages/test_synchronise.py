@@ -1,0 +1,175 @@
+"""Pairing by stamps: frames in any order of arrival, unpaired and broken frames, skew and drift."""
+
+from __future__ import annotations
+
+import math
+import random
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from drivers.frame import Camera, Frame
+from omnid.config import PairConfig
+from omnid.messages import FramePair
+from omnid.stages.synchronise import MAX_WAITING, Synchronise
+from tests.simulation import build
+
+MS = 1_000_000
+PERIOD_NS = 33_333_333
+SIZE = 256
+JPEG = cv2.imencode(".jpg", np.full((SIZE, SIZE), 90, np.uint8))[1].tobytes()
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return build("two_walls", seed=3, size=SIZE, pairs=2).rig
+
+
+@pytest.fixture
+def pair(rig: Rig) -> Synchronise:
+    return Synchronise(rig, PairConfig(tolerance_ms=10.0))
+
+
+def shot(camera: Camera, index: int, skew_ns: int = 0, data: bytes = JPEG) -> Frame:
+    return Frame(index, 10**12 + index * PERIOD_NS + skew_ns, camera, "jpeg", data)
+
+
+def made(pair: Synchronise, *frames: Frame) -> list[FramePair]:
+    return [found for frame in frames if (found := pair.process(frame)) is not None]
+
+
+def unpaired(pair: Synchronise) -> tuple[int, int]:
+    return pair.counts["unpaired_lower"], pair.counts["unpaired_upper"]
+
+
+def test_a_pair_has_the_lower_stamp_and_both_images(pair: Synchronise) -> None:
+    dark = cv2.imencode(".jpg", np.zeros((SIZE, SIZE), np.uint8))[1].tobytes()
+    for index, order in enumerate((("lower", "upper"), ("upper", "lower"))):
+        (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG)
+                                for c in order))  # type: ignore[arg-type]
+        assert (found.seq, found.stamp_ns) == (index, shot("lower", index).stamp_ns)
+        assert found.lower.mean() > 80 and found.upper.mean() < 5
+
+
+def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
+    """Frames of one camera arrive up to three periods later than those of the other."""
+    rng, order = random.Random(5), []
+    for camera in ("lower", "upper"):
+        late = 0.0
+        for index in range(200):
+            late = max(late - 1.0, rng.uniform(0.0, 3.0))  # of one camera they stay in order
+            order.append((index + late, shot(camera, index, rng.randrange(-4 * MS, 4 * MS))))  # type: ignore[arg-type]
+    found = made(pair, *(frame for _, frame in sorted(order, key=lambda entry: entry[0])))
+    assert [p.seq for p in found] == list(range(200)) and unpaired(pair) == (0, 0)
+    assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(found))
+
+
+def test_takes_the_nearest_frame_and_counts_the_older_ones(pair: Synchronise) -> None:
+    near = [shot("upper", 0, skew) for skew in (-9 * MS, -2 * MS, 8 * MS)]
+    assert made(pair, *near) == []
+    (found,) = made(pair, shot("lower", 0))
+    assert found is not None and pair.skew.mean_ns == -2 * MS
+    assert unpaired(pair) == (0, 1), "the older frame is dropped, the newer one still waits"
+    assert len(made(pair, shot("lower", 0, 9 * MS))) == 1
+
+
+@pytest.mark.parametrize(("skew_ns", "pairs"), [(10 * MS, 1), (10 * MS + 1, 0), (-10 * MS, 1), (-10 * MS - 1, 0)])
+def test_pairs_within_the_tolerance_only(pair: Synchronise, skew_ns: int, pairs: int) -> None:
+    assert len(made(pair, shot("lower", 1), shot("upper", 1, skew_ns))) == pairs
+    pair.finish()
+    assert unpaired(pair) == (1 - pairs, 1 - pairs)
+
+
+@pytest.mark.parametrize(
+    ("order", "stamps", "expected"),
+    [
+        ([("lower", 0), ("upper", 2), ("upper", 99), ("lower", 100)], [0, 100], (0, 0)),
+        ([("lower", 0), ("upper", 10)], [0], (0, 0)),
+        ([("lower", 0), ("upper", 11)], [], (1, 1)),
+        ([("lower", 0), ("lower", 5), ("upper", 6)], [5], (1, 0)),
+        ([("upper", 0), ("upper", 100), ("lower", 101), ("lower", 200)], [101], (1, 1)),
+    ],
+)
+def test_pairs_frames_in_the_order_of_their_stamps(
+    pair: Synchronise, order: list[tuple[Camera, int]], stamps: list[int], expected: tuple[int, int]
+) -> None:
+    found = made(pair, *(Frame(0, stamp_ms * MS, camera, "jpeg", JPEG) for camera, stamp_ms in order))
+    pair.finish()
+    assert [p.stamp_ns for p in found] == [stamp_ms * MS for stamp_ms in stamps]
+    assert [p.seq for p in found] == list(range(len(stamps))) and unpaired(pair) == expected
+
+
+def test_reports_the_closest_miss(pair: Synchronise) -> None:
+    assert pair.closest_miss_ms is None
+    made(pair, shot("lower", 0), shot("lower", 1), shot("upper", 1, 12 * MS), shot("upper", 2, -11 * MS))
+    assert pair.closest_miss_ms == 12.0
+    made(pair, shot("lower", 2))
+    assert pair.closest_miss_ms == 11.0
+
+
+@pytest.mark.parametrize(("running", "stopped"), [("lower", "upper"), ("upper", "lower")])
+def test_pairs_again_after_a_camera_was_away(pair: Synchronise, running: Camera, stopped: Camera) -> None:
+    for index in range(10):
+        made(pair, shot("lower", index), shot("upper", index))
+    assert made(pair, *(shot(running, index) for index in range(10, 1000))) == []
+    assert pair.waiting <= MAX_WAITING, "few frames wait"
+    assert pair.newest_ns[stopped] < pair.newest_ns[running]
+    back = [frame for index in range(1000, 1010) for frame in (shot("lower", index), shot("upper", index))]
+    assert len(made(pair, *back)) == 10
+    pair.finish()
+    assert unpaired(pair) == ((990, 0) if running == "lower" else (0, 990)) and pair.counts["pairs"] == 20
+
+
+def test_cameras_that_never_match_keep_few_frames(pair: Synchronise) -> None:
+    """Stamps half a period apart make no pairs; all frames are counted."""
+    for index in range(500):
+        assert made(pair, shot("lower", index), shot("upper", index, PERIOD_NS // 2)) == []
+    assert pair.waiting <= 2 * MAX_WAITING
+    pair.finish()
+    assert unpaired(pair) == (500, 500)
+
+
+def test_a_broken_image_counts_and_its_partner_is_unpaired(pair: Synchronise) -> None:
+    frames = [frame for index in range(6) for frame in
+              (shot("lower", index, data=JPEG[:100] if index % 2 else JPEG), shot("upper", index))]
+    assert [p.seq for p in made(pair, *frames)] == [0, 1, 2]
+    pair.finish()
+    assert pair.counts["broken"] == 3 and "lower frame 1" in pair.fault and unpaired(pair) == (0, 3)
+
+
+@pytest.mark.parametrize("broken", [("lower",), ("upper",), ("lower", "upper")])
+def test_a_broken_image_is_treated_as_if_it_had_never_come(pair: Synchronise, broken: tuple[Camera, ...]) -> None:
+    """The frames before a broken one can still be paired."""
+    data = {camera: JPEG[:100] if camera in broken else JPEG for camera in ("lower", "upper")}
+    early = [shot("lower", 0), shot("lower", 0, 2 * MS, data["lower"])]
+    found = made(pair, *early, shot("upper", 0, 3 * MS, data["upper"]), shot("upper", 0, 4 * MS))
+    assert len(found) == 1 and pair.counts["broken"] == len(broken)
+    assert found[0].stamp_ns == shot("lower", 0, 0 if "lower" in broken else 2 * MS).stamp_ns
+
+
+def test_decodes_only_frames_with_a_partner(pair: Synchronise) -> None:
+    made(pair, *(shot("lower", index, data=b"no image") for index in range(20)))
+    pair.finish()
+    assert pair.counts["broken"] == 0 and unpaired(pair) == (20, 0)
+
+
+def test_skew_statistics(pair: Synchronise) -> None:
+    skews = [1 * MS, 3 * MS, -5 * MS]
+    for index, skew_ns in enumerate(skews):
+        made(pair, shot("lower", index), shot("upper", index, skew_ns))
+    assert pair.skew.mean_ns == pytest.approx(sum(skews) / 3) and pair.skew.max_ns == 5 * MS
+    assert math.isnan(pair.skew.drift_ns), "needs 50 pairs"
+
+
+@pytest.mark.parametrize("drift_ns", [0, 20_000, -20_000])
+def test_finds_the_drift_between_the_cameras(pair: Synchronise, drift_ns: int) -> None:
+    """A drift of 20 us per image is 6 ms within 300 images."""
+    rng = random.Random(7)
+    for index in range(300):
+        noise_ns = rng.randrange(-MS, MS)
+        made(pair, shot("lower", index), shot("upper", index, index * drift_ns + noise_ns))
+    expected_ns = drift_ns * (300 - 50 - 25)  # the slow mean lags by 50 images, the first one by 25
+    assert pair.skew.drift_ns == pytest.approx(expected_ns, abs=0.6 * MS)
