@@ -1,4 +1,4 @@
-"""Listens to robots and tells them where to go: a few lines of Python on any machine.
+"""Client of a robot: subscribe to its messages and send it commands, from any machine.
 
     from omnid.client import subscribe
 
@@ -8,9 +8,9 @@
             if pose.x_m > 2.0:
                 break
 
-Each step of the loop gives the newest pose; those that came while it was busy are gone. The first is the last one that
-the robot had found, however long ago: see its stamp. A lost connection is taken up again, without an error. Several
-kinds of message and commands go over one connection, see Robot and Driver. Needs eclipse-zenoh, rosbags and numpy.
+Each step of the loop yields the newest pose; older ones that arrived meanwhile are dropped. The first one is the last
+pose that the robot has published, which may be old: check its stamp. A lost connection is restored without an error.
+Several kinds of message, and commands, share one connection: see Robot and Driver. Needs eclipse-zenoh, rosbags, numpy.
 """
 
 from __future__ import annotations
@@ -25,50 +25,60 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.decode import Cloud, Map, Pose, Report, cloud_from, map_from, pose_from, report_from
-from omnid.transport.pose_attachment import Note
+from omnid.transport.decode import (
+    Cloud,
+    Diagnostics,
+    Map,
+    Pose,
+    decode_cloud,
+    decode_diagnostics,
+    decode_map,
+    decode_pose,
+)
+from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.session import Unreachable, open_session
 
-__all__ = ["HERE", "Cloud", "Driver", "Map", "Note", "Pose", "Report", "Robot", "Subscription", "Unreachable",
-           "subscribe"]
+__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Map", "Pose", "PoseAttachment", "Robot", "Subscription",
+           "Unreachable", "subscribe"]
 
 T = TypeVar("T")
 HERE: Final = "tcp/127.0.0.1:7447"
 _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
-    Pose: ("odom", pose_from),
-    Report: ("status", report_from),
-    Cloud: ("cloud", cloud_from),
-    Map: ("map", map_from),
+    Pose: ("odom", decode_pose),
+    Diagnostics: ("status", decode_diagnostics),
+    Cloud: ("cloud", decode_cloud),
+    Map: ("map", decode_map),
 }
-_ANSWER_S: Final = 1.0
-_NAP_S: Final = 0.002
+_QUERY_TIMEOUT_S: Final = 1.0
+_POLL_S: Final = 0.002
+_MAX_RETRY_S: Final = 0.5
 
 
 class Subscription(Generic[T]):
-    """The newest message of one kind, again and again; broken: how many could not be read."""
+    """The newest message of one kind; broken: messages that could not be decoded."""
 
     def __init__(self, session: zenoh.Session, key: str, decode: Callable[[bytes, bytes], T],
-                 hang_up: Callable[[], None] | None = None) -> None:
-        self._decode, self._hang_up = decode, hang_up
+                 on_close: Callable[[], None] | None = None) -> None:
+        self._decode, self._on_close = decode, on_close
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
-        self._late = _asked(session, key)
+        self._latched = _queried(session, key)
         self.broken = 0
 
     def newest(self) -> T | None:
-        """What has come since the last time of asking, if anything; waits for nothing."""
+        """Return the newest message since the last call, or None; does not block."""
         sample = self._subscriber.try_recv()
-        late, self._late = self._late, None  # what comes by itself is newer
-        return self._message(sample or late)
+        latched, self._latched = self._latched, None  # a sample that arrived is newer
+        return self._message(sample or latched)
 
     def wait(self, timeout_s: float) -> T | None:
-        """The next message, or None after so long."""
+        """Return the next message, or None after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while (message := self.newest()) is None and time.monotonic() < deadline_s:
-            time.sleep(_NAP_S)
+            time.sleep(_POLL_S)
         return message
 
     def __iter__(self) -> Iterator[T]:
-        """Messages as long as somebody wants them."""
+        """Yield messages without end."""
         while True:
             message = self.newest()
             if message is None:
@@ -77,11 +87,11 @@ class Subscription(Generic[T]):
                 yield message
 
     def close(self) -> None:
-        """Ends the subscription."""
+        """End the subscription."""
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
-        if self._hang_up is not None:
-            self._hang_up()
+        if self._on_close is not None:
+            self._on_close()
 
     def __enter__(self) -> Self:
         return self
@@ -93,76 +103,76 @@ class Subscription(Generic[T]):
         if sample is None:
             return None
         try:
-            return self._decode(sample.payload.to_bytes(), _beside(sample))
+            return self._decode(sample.payload.to_bytes(), _attachment(sample))
         except OmnidError:
             self.broken += 1
             return None
 
 
-def _beside(sample: zenoh.Sample) -> bytes:
+def _attachment(sample: zenoh.Sample) -> bytes:
     return b"" if sample.attachment is None else sample.attachment.to_bytes()
 
 
-def _asked(session: zenoh.Session, key: str) -> zenoh.Sample | None:
-    """What is answered under a key, if anything."""
-    for reply in session.get(key, timeout=_ANSWER_S):
+def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
+    """Return the answer to a query for a key, if there is any."""
+    for reply in session.get(key, timeout=_QUERY_TIMEOUT_S):
         if reply.ok is not None:
             return reply.ok
     return None
 
 
 class Robot:
-    """A connection to a robot, directly or through a router.
+    """A connection to a robot, direct or through a router.
 
-    settings: of TLS, user and password, as in the section [bus] of omnid's own.
+    settings: for TLS, user and password; the same as section [bus] of omnid's configuration.
     """
 
     def __init__(self, robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None,
-                 patience_s: float = 0.0) -> None:
-        """Connects; OmnidError where nobody answers within patience_s."""
+                 timeout_s: float = 0.0) -> None:
+        """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
         given = settings or BusConfig(robot=robot, connect=connect)
         self.name = given.robot
-        self._session = _reached(checked(_as_client(given)), patience_s)
-        self._each: list[object] = []  # what is declared lives as long as it is referred to
+        self._session = _connected(checked(_as_client(given)), timeout_s)
+        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
-        """Messages of a kind: Pose, Report or Cloud."""
+        """Subscribe to messages of a kind: Pose, Diagnostics, Cloud or Map."""
         return self._subscription(kind)
 
-    def _subscription(self, kind: type[T], hang_up: Callable[[], None] | None = None) -> Subscription[T]:
+    def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
         key, decode = _DECODE[kind]
         decoder = cast("Callable[[bytes, bytes], T]", decode)
-        return Subscription(self._session, f"{self.name}/{key}", decoder, hang_up)
+        return Subscription(self._session, f"{self.name}/{key}", decoder, on_close)
 
-    def each(self, take: Callable[[str, bytes, bytes], None]) -> None:
-        """Has take(topic, message, note) called for whatever the robot says from now on, in a thread of zenoh's.
+    def on_message(self, callback: Callable[[str, bytes, bytes], None]) -> None:
+        """Call callback(topic, payload, attachment) for each message of the robot from now on, in a zenoh thread.
 
-        The message is CDR of ROS 2, the note what goes along with `odom`. take must be quick and never raise.
+        The payload is CDR; `odom` and `panorama` have an attachment. The callback must be quick and never raise.
         """
-        skipped = len(self.name) + 1
+        prefix_length = len(self.name) + 1
 
         def on_sample(sample: zenoh.Sample) -> None:
-            take(str(sample.key_expr)[skipped:], sample.payload.to_bytes(), _beside(sample))
+            callback(str(sample.key_expr)[prefix_length:], sample.payload.to_bytes(), _attachment(sample))
 
-        self._each.append(self._session.declare_subscriber(f"{self.name}/*", on_sample))
+        self._declared.append(self._session.declare_subscriber(f"{self.name}/*", on_sample))
 
     def driver(self) -> Driver:
-        """What sends commands to the wheels."""
+        """Return a sender of commands to the wheels."""
         return Driver(self._session, self.name)
 
-    def ask(self, name: str) -> str:
-        """What the robot says of itself: its `config` or its `rig`, both TOML; "" where it does not answer."""
-        answer = _asked(self._session, f"{self.name}/{name}")
+    def query(self, name: str) -> str:
+        """Return the robot's `config` or `rig`, both TOML; "" where it does not answer."""
+        answer = _queried(self._session, f"{self.name}/{name}")
         return "" if answer is None else answer.payload.to_bytes().decode("utf-8", "replace")
 
     @property
     def alive(self) -> bool:
-        """Whether its daemon runs and can be reached."""
-        replies = self._session.liveliness().get(f"{self.name}/alive", timeout=_ANSWER_S)
+        """True if the robot's daemon runs and can be reached."""
+        replies = self._session.liveliness().get(f"{self.name}/alive", timeout=_QUERY_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
     def close(self) -> None:
-        """Ends the connection; a second call does nothing."""
+        """End the connection; a second call does nothing."""
         with suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
@@ -174,28 +184,28 @@ class Robot:
 
 
 def _as_client(given: BusConfig) -> BusConfig:
-    """Peers that share a router never hear of each other, clients do."""
+    """Return the settings in client mode: peers that only share a router exchange no messages, clients do."""
     chosen = {name: getattr(given, name) for name in
               ("robot", "connect", "config", "retry_s", "tls_ca", "tls_connect_key", "tls_connect_certificate", "user",
                "password_file")}
     return BusConfig(mode="client", listen=(), **{**chosen, "connect": given.connect or (HERE,)})
 
 
-def _reached(config: BusConfig, patience_s: float) -> zenoh.Session:
-    deadline_s = time.monotonic() + patience_s
+def _connected(config: BusConfig, timeout_s: float) -> zenoh.Session:
+    deadline_s = time.monotonic() + timeout_s
     while True:
         try:
             return open_session(config, guarded=False)
         except Unreachable:
             if time.monotonic() >= deadline_s:
                 raise
-        time.sleep(min(config.retry_s, 0.5))
+        time.sleep(min(config.retry_s, _MAX_RETRY_S))
 
 
 class Driver:
-    """Sends commands. They are good for a moment only (helm.deadlines.command_s): go on sending, or the wheels stop.
+    """Sender of commands. Each is valid for a moment only (helm.deadlines.command_s): keep sending, or the wheels stop.
 
-    From one point to the next, from anywhere:
+    Drive from one waypoint to the next:
 
         import math
         from omnid.client import Pose, Robot
@@ -212,30 +222,31 @@ class Driver:
     """
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
-        self._publishers = {name: _commander(session, f"{robot}/cmd/{name}") for name in ("twist", "heading", "stop")}
+        self._publishers = {name: _command_publisher(session, f"{robot}/cmd/{name}")
+                            for name in ("twist", "heading", "stop")}
 
     @property
-    def heard(self) -> bool:
-        """Whether a robot listens to commands at the other end."""
+    def connected(self) -> bool:
+        """True if a robot subscribes to the commands."""
         status: Any = self._publishers["twist"].matching_status  # zenoh's stub takes it for a bool
         return bool(status.matching)
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
-        """Drives with this forward speed and yaw rate (counter-clockwise)."""
+        """Drive with this forward speed and yaw rate (counter-clockwise)."""
         payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
         self._publishers["twist"].put(payload)
 
     def heading(self, velocity_mps: float, heading_rad: float) -> None:
-        """Drives with this speed while it holds a heading in odom (counter-clockwise)."""
+        """Drive with this speed and hold a heading in odom (counter-clockwise)."""
         self._publishers["heading"].put(codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
 
     def stop(self) -> None:
-        """Stops the wheels, whatever else was asked for."""
+        """Stop the wheels, whatever else was commanded."""
         self._publishers["stop"].put(b"")
 
 
-def _commander(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """Commands overtake everything and wait for room: a stop that is dropped is none."""
+def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """Declare a publisher that overtakes all others and blocks rather than drops: a stop must not be lost."""
     return session.declare_publisher(
         key,
         encoding=zenoh.Encoding.APPLICATION_CDR,
@@ -246,7 +257,7 @@ def _commander(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 
 def subscribe(robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None,
-              patience_s: float = 0.0) -> Subscription[Pose]:
-    """A robot's poses over a connection of their own; all else as Robot takes it."""
-    connection = Robot(robot, connect, settings, patience_s)
+              timeout_s: float = 0.0) -> Subscription[Pose]:
+    """Subscribe to a robot's poses over a connection of their own; arguments as those of Robot."""
+    connection = Robot(robot, connect, settings, timeout_s)
     return connection._subscription(Pose, connection.close)

@@ -15,7 +15,7 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
-from omnid.transport.commands import Commands
+from omnid.transport.commands import CommandReceiver
 
 WANDERED_NS = 3_000_000  # of the skew of the cameras: their clocks do not run alike
 SILENT_S = 1.0  # a camera without a image, or an odometry without a pose, for longer is told
@@ -51,7 +51,7 @@ class StatusSources(NamedTuple):
     tally: RunStatistics
     to_pose: Histogram
     helm: ControllerStatistics | None
-    commands: Commands | None
+    commands: CommandReceiver | None
     tickers: frozenset[str]  # their `dropped` are missed deadlines
     others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that speak for themselves
 
@@ -122,7 +122,7 @@ class StatusReport:
             yield DiagnosticStatus(f"omnid: {name} camera", OK if said == state.status else ERROR, said,
                          {"mode": state.mode, "rate_hz": rate, **counts})
 
-    def _helm(self, helm: ControllerStatistics, commands: Commands | None) -> DiagnosticStatus:
+    def _helm(self, helm: ControllerStatistics, commands: CommandReceiver | None) -> DiagnosticStatus:
         account = helm.account  # once, for another thread replaces it
         counts = ("sent", "late", "errors", "expiries", "fault", "untold")
         values = {name: str(getattr(account, name)) for name in counts}

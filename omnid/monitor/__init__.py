@@ -1,1 +1,1 @@
-"""A robot watched over the bus: what came is counted, kept in files and shown."""
+"""`omnid listen`: a robot followed over the bus; its messages are counted, written to files and shown."""

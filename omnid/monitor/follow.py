@@ -1,4 +1,4 @@
-"""Follows a robot until it is enough."""
+"""Receiving, showing and writing a robot's messages until a signal or for a given time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from omnid.client import Report, Robot
+from omnid.client import Diagnostics, Robot
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.monitor.screen import Screen
 from omnid.monitor.writers import BusLogWriter, TumWriter
@@ -17,53 +17,55 @@ from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import Unreachable
 
-SHOWN_S: Final = 1.0
-_PATIENCE_S: Final = 0.5
-Keeper: TypeAlias = TumWriter | BusLogWriter
+SHOW_PERIOD_S: Final = 1.0
+_RETRY_S: Final = 0.5
+Writer: TypeAlias = TumWriter | BusLogWriter
 
 
 def listen(bus: BusConfig, tum: Path | None, mcap: Path | None, seconds: float | None) -> int:
-    """Shows the robot until Ctrl-C or for so many seconds; the exit code, 1 where not one pose came."""
+    """Show the robot until Ctrl-C or for so many seconds. Return the exit code, 1 where no pose arrived."""
     check_outputs([(name, path) for name, path in (("--tum", tum), ("--mcap", mcap)) if path is not None], [])
-    heard, screen = RobotState(), Screen(bus.robot)
+    state, screen = RobotState(), Screen(bus.robot)
     end_s = math.inf if seconds is None else time.monotonic() + seconds
-    with suppress(KeyboardInterrupt), ExitStack() as ends:
-        robot = _reached(bus, end_s, screen)
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        robot = _connected(bus, end_s, screen)
         if robot is not None:
-            ends.enter_context(robot)
-            keepers: list[Keeper] = [TumWriter(tum)] if tum else []
-            keepers += [BusLogWriter(mcap, robot)] if mcap else []
-            for keeper in keepers:
-                ends.callback(keeper.close)
-            _follow(robot, heard, screen, keepers, end_s)
-    screen.show(heard)
-    return int(heard.poses == 0)
+            stack.enter_context(robot)
+            writers: list[Writer] = [TumWriter(tum)] if tum else []
+            if mcap:
+                writers.append(BusLogWriter(mcap, robot))
+            for writer in writers:
+                stack.callback(writer.close)
+            _follow(robot, state, screen, writers, end_s)
+    screen.show(state)
+    return int(state.poses == 0)
 
 
-def _reached(bus: BusConfig, end_s: float, screen: Screen) -> Robot | None:
-    """The robot as soon as something listens there."""
+def _connected(bus: BusConfig, end_s: float, screen: Screen) -> Robot | None:
+    """Return a connection to the robot as soon as it can be reached, None where the time is over first."""
     while time.monotonic() < end_s:
         try:
             return Robot(settings=bus)
         except Unreachable as error:
-            screen.say(str(error))
-        time.sleep(_PATIENCE_S)
+            screen.waiting(str(error))
+        time.sleep(_RETRY_S)
     return None
 
 
-def _follow(robot: Robot, heard: RobotState, screen: Screen, keepers: Sequence[Keeper], end_s: float) -> None:
-    mailbox = Inbox()
-    robot.each(mailbox.take)
-    status = robot.subscribe(Report)
-    next_s = time.monotonic() + SHOWN_S
-    heard.take_report(status.newest())
-    status.close()
+def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[Writer], end_s: float) -> None:
+    inbox = Inbox()
+    robot.on_message(inbox.put)
+    with robot.subscribe(Diagnostics) as subscription:
+        latched = subscription.newest()  # published before this connection was made
+    if latched is not None:
+        state.add_diagnostics(latched)
+    next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
-        letter = mailbox.next(min(next_s, end_s) - now_s)
-        if letter is not None:
-            pose = heard.take(letter)
-            for keeper in keepers:
-                keeper(letter, pose)
+        message = inbox.get(min(next_s, end_s) - now_s)
+        if message is not None:
+            pose = state.process(message)
+            for writer in writers:
+                writer.write(message, pose)
         if time.monotonic() >= next_s:
-            screen.show(heard, mailbox.forgotten)
-            next_s = max(next_s + SHOWN_S, time.monotonic())
+            screen.show(state, inbox.dropped)
+            next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())

@@ -1,4 +1,4 @@
-"""What has come of a robot: letters as they arrive, and what they add up to."""
+"""The state of a robot as its messages show it, and the inbox in which they wait."""
 
 from __future__ import annotations
 
@@ -12,106 +12,107 @@ from typing import Final, NamedTuple
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Pose, Report, pose_from, report_from
+from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode_pose
 
-SILENT_S: Final = 2.0
-_MOST_WAITING: Final = 2000
-_LONGEST_LINE: Final = 400  # letters
-_MOST_STATUSES: Final = 100
-_RATE_OVER: Final = 100  # poses
-_LONGEST_NS: Final = 3_600 * 10**9  # a message that is older, or from the future, was stamped by another clock
+NO_POSE_S: Final = 2.0  # without a pose, from which the state and the rate of the last poses are no longer shown
+_INBOX_DEPTH: Final = 2000
+_MAX_LINE: Final = 400  # characters
+_MAX_STATUSES: Final = 100
+_RATE_WINDOW: Final = 100  # poses
+_MAX_AGE_NS: Final = 3_600 * 10**9  # a message that is older, or from the future, was stamped by another clock
 
 
 class ReceivedMessage(NamedTuple):
-    """One message as it came."""
+    """A message as it arrived."""
 
-    received_ns: int  # of Unix time
+    received_ns: int  # Unix time
     topic: str
     payload: bytes
-    note: bytes
+    attachment: bytes
 
 
 class Inbox:
-    """What has come and was not looked at yet; when too much waits, the oldest is forgotten and counted."""
+    """Messages that wait to be processed; when full, the oldest is dropped and counted."""
 
     def __init__(self) -> None:
-        self._letters: SimpleQueue[ReceivedMessage] = SimpleQueue()
-        self.forgotten = 0
+        self._messages: SimpleQueue[ReceivedMessage] = SimpleQueue()
+        self.dropped = 0
 
-    def take(self, topic: str, payload: bytes, note: bytes) -> None:
-        """Adds a message that has just come; never waits."""
-        self._letters.put(ReceivedMessage(time.time_ns(), topic, payload, note))
-        if self._letters.qsize() > _MOST_WAITING:
+    def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
+        """Add a message that has just arrived; does not block."""
+        self._messages.put(ReceivedMessage(time.time_ns(), topic, payload, attachment))
+        if self._messages.qsize() > _INBOX_DEPTH:
             with suppress(Empty):
-                self._letters.get_nowait()
-                self.forgotten += 1
+                self._messages.get_nowait()
+                self.dropped += 1
 
-    def next(self, timeout_s: float) -> ReceivedMessage | None:
-        """The oldest message, waited for at most so long."""
+    def get(self, timeout_s: float) -> ReceivedMessage | None:
+        """Return the oldest message, or None after the timeout."""
         with suppress(Empty):
-            return self._letters.get(timeout=max(0.0, timeout_s))
+            return self._messages.get(timeout=max(0.0, timeout_s))
         return None
 
 
 class RobotState:
-    """What has come of one robot, in constant memory."""
+    """Newest pose and status of one robot, counters and latencies, in constant memory."""
 
     def __init__(self) -> None:
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.poses = self.missed = self.broken = 0
-        self.age, self.way = Histogram(), Histogram()  # from the images to here; from the robot's network to here
-        self._arrivals: deque[float] = deque(maxlen=_RATE_OVER)
+        self.age = Histogram()  # s, from the capture of a pose's images to its arrival
+        self.network = Histogram()  # s, from the robot's network to the arrival of a pose
+        self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
 
-    def take(self, letter: ReceivedMessage) -> Pose | None:
-        """Counts a message; the pose in it, if it is one."""
+    def process(self, message: ReceivedMessage) -> Pose | None:
+        """Count a message and return the pose in it, if it is one."""
         try:
-            if letter.topic == "odom":
-                return self._take_pose(pose_from(letter.payload, letter.note, letter.received_ns))
-            if letter.topic == "status":
-                self.take_report(report_from(letter.payload))
+            if message.topic == "odom":
+                return self._add_pose(decode_pose(message.payload, message.attachment, message.received_ns))
+            if message.topic == "status":
+                self.add_diagnostics(decode_diagnostics(message.payload))
         except OmnidError:
             self.broken += 1
         return None
 
-    def take_report(self, report: Report | None) -> None:
-        """What the parts of the robot say of themselves; the newest of each."""
-        for status in report.statuses if report is not None else ():
-            if status.name in self.statuses or len(self.statuses) < _MOST_STATUSES:
+    def add_diagnostics(self, diagnostics: Diagnostics) -> None:
+        """Keep the newest status of each part of the robot."""
+        for status in diagnostics.statuses:
+            if status.name in self.statuses or len(self.statuses) < _MAX_STATUSES:
                 self.statuses[status.name] = status
 
-    def _take_pose(self, pose: Pose) -> Pose:
-        """Numbers that were left out were missed; a smaller one is a new start."""
-        if self.pose is not None and 0 <= self.pose.note.seq < pose.note.seq:
-            self.missed += pose.note.seq - self.pose.note.seq - 1
+    def _add_pose(self, pose: Pose) -> Pose:
+        """Count a pose. Skipped sequence numbers are missed poses; a smaller number means that the daemon restarted."""
+        if self.pose is not None and 0 <= self.pose.attachment.seq < pose.attachment.seq:
+            self.missed += pose.attachment.seq - self.pose.attachment.seq - 1
         self.pose = pose
         self.poses += 1
-        self._arrivals.append(pose.received_ns * 1e-9)
-        for histogram, since_ns in ((self.age, pose.stamp_ns), (self.way, pose.note.sent_ns)):
-            if 0 <= pose.received_ns - since_ns < _LONGEST_NS:
+        self._arrivals_s.append(pose.received_ns * 1e-9)
+        for histogram, since_ns in ((self.age, pose.stamp_ns), (self.network, pose.attachment.sent_ns)):
+            if 0 <= pose.received_ns - since_ns < _MAX_AGE_NS:
                 histogram.add((pose.received_ns - since_ns) * 1e-9)
         return pose
 
     @property
-    def silent_s(self) -> float:
-        """How long ago the newest pose came."""
-        return time.time() - self._arrivals[-1] if self._arrivals else math.inf
+    def time_since_pose_s(self) -> float:
+        """Time since the newest pose arrived; inf before the first."""
+        return time.time() - self._arrivals_s[-1] if self._arrivals_s else math.inf
 
     @property
     def rate_hz(self) -> float:
-        """Poses per second of late."""
-        if len(self._arrivals) < 2 or self.silent_s > SILENT_S:
+        """Rate of the last poses; 0 where there are none."""
+        if len(self._arrivals_s) < 2 or self.time_since_pose_s > NO_POSE_S:
             return 0.0
-        return (len(self._arrivals) - 1) / max(1e-6, self._arrivals[-1] - self._arrivals[0])
+        return (len(self._arrivals_s) - 1) / max(1e-6, self._arrivals_s[-1] - self._arrivals_s[0])
 
     @property
     def state(self) -> str:
-        """Of the newest pose, or for how long there has been none."""
-        if self.pose is None or self.silent_s > SILENT_S:
-            return f"silent for {self.silent_s:.0f} s"
+        """Tracking state of the newest pose, or the time since it."""
+        if self.pose is None or self.time_since_pose_s > NO_POSE_S:
+            return f"no pose for {self.time_since_pose_s:.0f} s"
         return plain(self.pose.state)
 
 
 def plain(text: str) -> str:
-    """Without what could command a terminal, and not endless: it comes from the network."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_LONGEST_LINE]
+    """Return a text from the network without control characters and of limited length, for a terminal."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_MAX_LINE]

@@ -1,4 +1,4 @@
-"""Files of what a robot says: its path in the TUM format, and a log of everything."""
+"""Files of a robot's messages: its path in the TUM format, and a log of all messages."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
 from omnid.formats.tum import tum_row
 from omnid.monitor.robot_state import ReceivedMessage
-from omnid.transport.bus import ros_name
 from omnid.transport.decode import Pose
-from omnid.transport.topics import SAID
+from omnid.transport.topics import PUBLISHED, ros_name
 
 
 class TumWriter:
-    """Writes the poses of the base, a line each, as they come."""
+    """Writes the poses of the base as they arrive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: IO[str] | None = None
         self._newest_ns = -1
 
-    def __call__(self, letter: ReceivedMessage, pose: Pose | None) -> None:
-        """Adds a pose; one that is no later than the last is left out: a line for each moment."""
+    def write(self, message: ReceivedMessage, pose: Pose | None) -> None:
+        """Add a row for a pose; one that is not later than the last is left out."""
         if pose is None or pose.stamp_ns <= self._newest_ns:
             return
         if self._file is None:
@@ -32,25 +31,26 @@ class TumWriter:
         self._file.write(f"{tum_row(pose.stamp_ns, pose.T_odom_base)}\n")
 
     def close(self) -> None:
-        """Ends the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
 
 
 class BusLogWriter:
-    """Writes all messages to a log, with the robot's rig and configuration."""
+    """Writes all messages to a log, with the robot's rig and configuration attached."""
 
     def __init__(self, path: Path, robot: Robot) -> None:
         self._robot = robot.name
-        asked = {f"{file}.toml": robot.ask(name).encode() for file, name in (("rig", "rig"), ("omnid", "config"))}
-        self._writer = LogWriter(path, {name: text for name, text in asked.items() if text})
+        files = {f"{file}.toml": robot.query(name).encode() for file, name in (("rig", "rig"), ("omnid", "config"))}
+        self._writer = LogWriter(path, {name: text for name, text in files.items() if text})
 
-    def __call__(self, letter: ReceivedMessage, _: Pose | None) -> None:
-        """Adds a message under its name in ROS 2; its time is that of its arrival."""
-        for name in (letter.topic, f"/{letter.topic}"):
-            if name in SAID:
-                self._writer.write(ros_name(self._robot, name), SAID[name].schema, letter.payload, letter.received_ns)
+    def write(self, message: ReceivedMessage, pose: Pose | None) -> None:
+        """Add a message under its ROS 2 name, logged at its time of arrival."""
+        for name in (message.topic, f"/{message.topic}"):
+            if name in PUBLISHED:
+                schema = PUBLISHED[name].schema
+                self._writer.write(ros_name(self._robot, name), schema, message.payload, message.received_ns)
 
     def close(self) -> None:
-        """Makes the file whole."""
+        """Complete the file."""
         self._writer.close()

@@ -23,7 +23,7 @@ from drivers.logs.mcap_records import LogFile, RecordError
 from omnid.errors import OmnidError
 from omnid.recordings.series_differences import Series
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, TWIST_SCHEMA, odometry_from_cdr, twist_from_cdr
-from omnid.transport.decode import report_from
+from omnid.transport.decode import decode_diagnostics
 
 STATES: Final = ("tracking", "degraded", "lost")
 MOST: Final = 1 << 20  # rows of a series: 9 hours of poses at 30 Hz
@@ -153,7 +153,7 @@ def _pose(payload: bytes) -> Row:
 
 def _state(payload: bytes) -> Row | None:
     """What a report of a change says; None for one of those that come every second, stamped when they were made."""
-    report = report_from(payload)
+    report = decode_diagnostics(payload)
     state, resets = report.value(_NAME, "state"), report.value(_NAME, "resets")
     if state not in STATES or not (resets.isascii() and resets.isdigit() and len(resets) < 10):
         return None

@@ -36,7 +36,7 @@ from omnid.transport.codec import (
     odometry_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.decode import Cloud, Report, cloud_from, report_from
+from omnid.transport.decode import Cloud, Diagnostics, decode_cloud, decode_diagnostics
 
 LARGEST_MESSAGE: Final = 64 * 2**20  # bytes
 EARLY: Final = 64  # reports
@@ -149,7 +149,7 @@ class _Reading:
         self._to = recording
         self._waiting: OdometryRecord | None = None  # the report of a new state comes right after its first pose
         self._offset_ns: int | None = None  # from the stamps of the poses to the time of logging
-        self._early: deque[Report] = deque(maxlen=EARLY)  # that came before the first pose
+        self._early: deque[Diagnostics] = deque(maxlen=EARLY)  # that came before the first pose
         self._cloud: bytes | None = None
 
     def take(self, messages: Iterable[Message], catalog: Catalog) -> None:
@@ -199,7 +199,7 @@ class _Reading:
             self._waiting = None
 
     def _status(self, payload: bytes) -> None:
-        report = report_from(payload)
+        report = decode_diagnostics(payload)
         if self._offset_ns is None:
             self._early.append(report)
         else:
@@ -216,7 +216,7 @@ class _Reading:
 
     def _last_cloud(self) -> Cloud | None:
         try:
-            return None if self._cloud is None else cloud_from(self._cloud)
+            return None if self._cloud is None else decode_cloud(self._cloud)
         except OmnidError:
             self._to.unread += 1
             return None

@@ -10,7 +10,7 @@ from omnid.report.downsampling import Downsampled
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.report.poses import STATES, UNKNOWN
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Report
+from omnid.transport.decode import Diagnostics
 
 ODOMETRY: Final = "omnid: odometry"
 SUMMARY: Final = "omnid: summary"
@@ -45,7 +45,7 @@ class StatusHistory:
         self.newest: dict[str, DiagnosticStatus] = {}
         self.course: dict[tuple[str, str], Downsampled] = {}
 
-    def process(self, report: Report, seconds: Callable[[int], float]) -> None:
+    def process(self, report: Diagnostics, seconds: Callable[[int], float]) -> None:
         """Takes what the parts of the robot said at a time."""
         t_s = seconds(report.stamp_ns)
         for status in map(_bounded, report.statuses):

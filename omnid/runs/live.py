@@ -42,7 +42,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
-from omnid.transport.commands import Commands
+from omnid.transport.commands import CommandReceiver
 
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
 LOOKS = 60  # images of either camera in which the rim is looked for, where the rig has no mask
@@ -143,10 +143,10 @@ class LiveRun:
         """The bus, on which whoever asks is told how this robot is set."""
         bus = Bus(self._config.bus)
         ends.callback(bus.close)
-        bus.tell("config", dump(self._config))
-        bus.tell("rig", rig_toml(place.rig))
-        if bus.seeks:
-            self._graph.ticker("router", self._config.bus.retry_s, bus.join)
+        bus.serve("config", dump(self._config))
+        bus.serve("rig", rig_toml(place.rig))
+        if bus.needs_router:
+            self._graph.ticker("router", self._config.bus.retry_s, bus.connect)
         return bus
 
     def _helm(self, place: Geometry, ends: ExitStack) -> ControllerLink:
@@ -167,15 +167,15 @@ class LiveRun:
     def _encoder(self, place: Geometry, points: int) -> Encoder:
         return Encoder(place.rig.T_base_rig, clouds_of(self._config, points), self.offset_ns)
 
-    def _commands(self, bus: Bus, helm: ControllerLink, recorder: FrameRecorder | None) -> Commands:
-        commands = Commands(helm.command, helm.stop, self._config.helm.deadlines.command_s)
+    def _commands(self, bus: Bus, helm: ControllerLink, recorder: FrameRecorder | None) -> CommandReceiver:
+        commands = CommandReceiver(helm.command, helm.stop, self._config.helm.deadlines.command_s)
         keep = nothing if recorder is None else keeper_of_commands(recorder, self.offset_ns)
 
         def take(key: str, payload: bytes) -> None:
-            commands.take(key, payload)  # first: a stop waits for nothing
+            commands.receive(key, payload)  # first: a stop waits for nothing
             keep(key, payload)
 
-        bus.hear(take)
+        bus.subscribe_commands(take)
         return commands
 
     def _publisher(self, bus: Bus) -> Callable[[list[DiagnosticStatus]], None]:

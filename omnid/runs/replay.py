@@ -171,9 +171,9 @@ class ReplayRun:
             print(f"omnid: warning: going on without a bus: {error}", file=sys.stderr)
             return None
         closing.callback(bus.close)
-        bus.tell("config", dump(self._config))
-        if bus.seeks:
-            self._graph.ticker("router", self._config.bus.retry_s, bus.join)
+        bus.serve("config", dump(self._config))
+        if bus.needs_router:
+            self._graph.ticker("router", self._config.bus.retry_s, bus.connect)
         return BusSink(bus, encode)
 
     def _show_progress(self, reader: LogReader) -> None:

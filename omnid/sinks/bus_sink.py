@@ -10,9 +10,9 @@ from drivers.frame import Frame
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
-from omnid.transport.features_attachment import features_bytes
+from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
-from omnid.transport.pose_attachment import Note, note_bytes
+from omnid.transport.pose_attachment import PoseAttachment
 
 
 class BusSink:
@@ -23,16 +23,17 @@ class BusSink:
 
     def process(self, message: Outgoing) -> None:
         """Sends what there is to say about a message."""
-        note = note_bytes(_note(message)) if isinstance(message, OdometryUpdate) else None
+        attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
-            self._bus.publish(topic, payload, note if topic == "odom" else None)
+            self._bus.publish(topic, payload, attachment if topic == "odom" else None)
         if isinstance(message, OdometryUpdate):
             for topic, _, payload in self._states(message):
                 self._bus.publish(topic, payload)
 
 
-def _note(odometry: OdometryUpdate) -> Note:
-    return Note(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks, time.time_ns())
+def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
+    return PoseAttachment(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks,
+                          time.time_ns())
 
 
 class PanoramaSink:
@@ -50,5 +51,6 @@ class PanoramaSink:
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
         features = odometry.features
-        pixels = {"agreeing": features.inliers, "rejected": features.rejected, "new": features.new}
-        self._bus.publish("panorama", image_cdr(frame, odometry.stamp_ns + self._offset_ns)[1], features_bytes(pixels))
+        pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
+        _, payload = image_cdr(frame, odometry.stamp_ns + self._offset_ns)
+        self._bus.publish("panorama", payload, features_to_bytes(pixels))

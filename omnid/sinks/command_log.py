@@ -11,7 +11,7 @@ from omnid.sinks.encoder import OutgoingMessage
 from omnid.sinks.frame_recorder import FrameRecorder
 from omnid.transport.codec import message_from_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD
-from omnid.transport.topics import EMPTY_SCHEMA, HEARD
+from omnid.transport.topics import EMPTY_SCHEMA, SUBSCRIBED
 
 _EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the head, and the one byte that stands for nothing
 
@@ -32,7 +32,7 @@ def keeper_of_commands(recorder: FrameRecorder, offset_ns: int) -> Callable[[str
 
 def command_as_logged(key: str, payload: bytes) -> OutgoingMessage | None:
     """The message of a log, whatever came with a stop; None for what no reader could decode. Any bytes may come."""
-    schema = HEARD.get(key)
+    schema = SUBSCRIBED.get(key)
     if schema is None or len(payload) > LONGEST_PAYLOAD:
         return None
     if schema == EMPTY_SCHEMA:

@@ -1,1 +1,1 @@
-"""Messages to the outside: CDR bytes and the zenoh bus."""
+"""Messages to and from other programs: CDR bytes, the zenoh bus, names of topics and status entries."""

@@ -1,7 +1,7 @@
-"""Who may do what on the bus, as zenoh's access control puts it.
+"""Permissions on the bus, as rules of zenoh's access control.
 
-Everybody who can connect may listen and ask. Nobody may write but commands, and those only from whom the configuration
-names; zenoh checks it where a link comes in, so what is refused never reaches the daemon.
+Every connected program may subscribe and query. Only commands may be written, and only by those that the configuration
+names. zenoh applies the rules where a link enters the session, so that refused messages never reach the daemon.
 """
 
 from __future__ import annotations
@@ -12,39 +12,39 @@ from omnid.transport.bus_config import BusConfig
 
 _ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
                   "declare_liveliness_subscriber")
-_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**")  # a star is not for a part that begins with @
+_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**")  # a star does not match parts that begin with @
 
 
 def access_control(config: BusConfig) -> dict[str, Any]:
-    """The rules as JSON, for zenoh's key access_control."""
+    """Return the rules as JSON, for zenoh's key access_control."""
     commanders = [_subject(f"name-{i}", cert_common_names=[name]) for i, name in enumerate(config.command_names)]
     commanders += [_subject(f"user-{i}", usernames=[user]) for i, user in enumerate(config.command_users)]
     everybody = _subject("everybody")
-    obeyed = [subject["id"] for subject in commanders] or [everybody["id"]]
+    allowed = [subject["id"] for subject in commanders] or [everybody["id"]]
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [
-            _rule("hear", "egress", (*_ALWAYS, "put", "delete"), list(_EVERYTHING)),
-            _rule("ask", "ingress", _ALWAYS, list(_EVERYTHING)),
+            _rule("subscribe", "egress", (*_ALWAYS, "put", "delete"), list(_EVERYTHING)),
+            _rule("query", "ingress", _ALWAYS, list(_EVERYTHING)),
             _rule("command", "ingress", ("put",), command_keys(config)),
         ],
         "subjects": [everybody, *commanders],
         "policies": [
-            {"id": "all", "rules": ["hear", "ask"], "subjects": [everybody["id"]]},
-            {"id": "some", "rules": ["command"], "subjects": obeyed},
+            {"id": "all", "rules": ["subscribe", "query"], "subjects": [everybody["id"]]},
+            {"id": "some", "rules": ["command"], "subjects": allowed},
         ],
     }
 
 
 def command_keys(config: BusConfig) -> list[str]:
-    """The keys that commands come by."""
+    """Return the key expressions of commands."""
     plain = f"{config.robot}/cmd/**"
     return [plain, f"{config.ros2_domain}/{plain}"] if config.ros2 == "rmw_zenoh" else [plain]
 
 
-def _subject(name: str, **who: list[str]) -> dict[str, Any]:
-    return {"id": name, **who}
+def _subject(name: str, **properties: list[str]) -> dict[str, Any]:
+    return {"id": name, **properties}
 
 
 def _rule(name: str, flow: str, messages: tuple[str, ...], keys: list[str]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""The zenoh bus: publishes CDR messages under the robot's name, answers who asks for the newest, hears commands.
+"""The zenoh bus: publishes CDR messages below the robot's name, answers queries and receives commands.
 
-A session owns no thread of ours: whoever calls `publish` may wait up to zenoh's drop time (1 ms, 50 ms for fragmented
-messages), so only sinks with a bounded inbox of their own, and tickers, call it.
+Bus starts no thread of its own. `publish` may block for up to zenoh's drop time (1 ms, 50 ms for fragmented messages),
+so only sinks with a bounded inbox of their own, and tickers, call it.
 """
 
 from __future__ import annotations
@@ -18,138 +18,139 @@ from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.session import open_session, reason
-from omnid.transport.topics import HEARD, SAID, Topic
+from omnid.transport.topics import PUBLISHED, SUBSCRIBED, Topic, ros_name
 
 __all__ = ["Bus", "BusConfig"]
 
-ALIVE: Final = "alive"  # below the robot's name: a liveliness token, there as long as the daemon is
-Take = Callable[[str, bytes], None]
+ALIVE: Final = "alive"  # liveliness token below the robot's name; exists as long as the daemon runs
+CommandCallback = Callable[[str, bytes], None]  # key from `cmd` on, payload
 
 
 class Bus:
-    """An open zenoh session; endpoints to connect to may come and go, those to listen on must be free.
+    """An open zenoh session. Remote endpoints may come and go; local endpoints must be free.
 
-    lost: messages that nobody could be sent, since a client has not found its router yet.
+    lost: messages that could not be sent because a client has not reached its router yet.
     """
 
     def __init__(self, config: BusConfig) -> None:
-        """Opens the session, a client's with the first `join`; OmnidError where the configuration cannot be used."""
+        """Open the session, or that of a client with the first `connect`. Raise OmnidError for a wrong configuration.
+        """
         self._config = checked(config)
         self._session: zenoh.Session | None = None
-        self._channels: dict[str, _Channel] = {}
+        self._publishers: dict[str, _TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
-        self._take: Take | None = None
-        self._graph: _Graph | None = None
-        self._held: list[object] = []  # what is declared lives as long as it is referred to
-        self._left = False
+        self._on_command: CommandCallback | None = None
+        self._graph: _RosGraph | None = None
+        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
+        self._closed = False
         self.lost = 0
-        if not self.seeks:
+        if not self.needs_router:
             self._open()
 
     @property
-    def seeks(self) -> bool:
-        """Whether it is one for which somebody must call `join` now and then."""
+    def needs_router(self) -> bool:
+        """True for a client, whose `connect` must be called from time to time."""
         return self._config.mode == "client"
 
-    def join(self) -> None:
-        """Looks for the router once, unless it was found: zenoh itself waits for none, but comes back to a lost one."""
-        if self._session is None and not self._left:
-            with suppress(OmnidError):  # the configuration has been checked: it is not there yet
+    def connect(self) -> None:
+        """Try once to reach the router, unless it was reached before: zenoh reconnects by itself only after that."""
+        if self._session is None and not self._closed:
+            with suppress(OmnidError):  # the configuration has been checked, so the router is not there yet
                 self._open()
 
     def status(self) -> DiagnosticStatus:
-        """Whether there is anybody to speak to, and what was said to nobody."""
+        """Return whether the bus is open, and the number of messages lost before that."""
         waiting = self._session is None
-        said = f"no router yet at {', '.join(self._config.connect)}" if waiting else "open"
+        message = f"no router yet at {', '.join(self._config.connect)}" if waiting else "open"
         return DiagnosticStatus(
-            "omnid: bus", WARN if waiting else OK, said, {"mode": self._config.mode, "lost": str(self.lost)}
+            "omnid: bus", WARN if waiting else OK, message, {"mode": self._config.mode, "lost": str(self.lost)}
         )
 
-    def publish(self, topic: str, payload: bytes, note: bytes | None = None) -> None:
-        """Sends CDR bytes as `<robot>/<topic>`, and as ROS 2 wants them; dropped in congestion.
+    def publish(self, topic: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Send CDR bytes as `<robot>/<topic>`, and under the key that ROS 2 expects; dropped in congestion.
 
-        note: what goes along for those who know omnid. A topic with a leading '/' is the same for all robots of ROS 2.
+        attachment: zenoh attachment for subscribers that know omnid. A topic with a leading '/' has no robot's name.
         """
-        if topic not in SAID:
-            raise OmnidError(f"bus key {topic!r} is not said here; one of {', '.join(SAID)}")
-        if SAID[topic].late:
-            self._newest[topic] = (payload, zenoh.Encoding.APPLICATION_CDR, note)
+        if topic not in PUBLISHED:
+            raise OmnidError(f"bus key {topic!r} is not published; expected one of {', '.join(PUBLISHED)}")
+        if PUBLISHED[topic].latched:
+            self._newest[topic] = (payload, zenoh.Encoding.APPLICATION_CDR, attachment)
         if self._session is None:
             self.lost += 1
             return
         try:
-            self._channels[topic].put(payload, note)
+            self._publishers[topic].put(payload, attachment)
         except zenoh.ZError as error:
             raise OmnidError(f"bus cannot publish {topic}: {reason(error)}; restart") from error
 
-    def tell(self, name: str, text: str) -> None:
-        """Has whoever asks for `<robot>/<name>` told the text, such as the configuration."""
+    def serve(self, name: str, text: str) -> None:
+        """Answer queries for `<robot>/<name>` with a text, such as the configuration."""
         self._newest[name] = (text.encode(), zenoh.Encoding.TEXT_PLAIN, None)
         if self._session is not None:
-            self._answer(self._session, name)
+            self._declare_queryable(self._session, name)
 
-    def hear(self, take: Take) -> None:
-        """Has take(key, payload) called for whatever comes as `<robot>/cmd/...`, key from `cmd` on.
-
-        In a thread of zenoh's.
-        """
-        self._take = take
+    def subscribe_commands(self, callback: CommandCallback) -> None:
+        """Call callback(key, payload) for each message on `<robot>/cmd/...`, key from `cmd` on, in a zenoh thread."""
+        self._on_command = callback
         if self._session is not None:
-            self._listen(self._session, take)
+            self._declare_subscribers(self._session, callback)
 
     def close(self) -> None:
-        """Ends the session; a second call does nothing. A listener that hangs is left alone after zenoh's 10 s."""
-        if not self._left and self._session is not None:
-            with suppress(zenoh.ZError):  # told of such a listener: nothing is lost here
+        """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
+        if not self._closed and self._session is not None:
+            with suppress(zenoh.ZError):  # raised for such a subscriber; nothing of ours is lost
                 self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-        self._left = True
+        self._closed = True
 
     def _open(self) -> None:
         session = open_session(self._config)
-        self._graph = graph = _Graph(session, self._config)
-        self._held.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
-        self._channels = {name: _Channel(session, self._config, name, graph) for name in SAID}
-        for name in {*self._newest, *(name for name, topic in SAID.items() if topic.late)}:
-            self._answer(session, name)
-        if self._take is not None:
-            self._listen(session, self._take)
+        self._graph = graph = _RosGraph(session, self._config)
+        self._declared.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
+        self._publishers = {name: _TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
+        for name in {*self._newest, *(name for name, topic in PUBLISHED.items() if topic.latched)}:
+            self._declare_queryable(session, name)
+        if self._on_command is not None:
+            self._declare_subscribers(session, self._on_command)
         self._session = session
 
-    def _answer(self, session: zenoh.Session, name: str) -> None:
+    def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = f"{self._config.robot}/{name}"
 
         def on_query(query: zenoh.Query) -> None:
             if name in self._newest:
-                payload, encoding, note = self._newest[name]
-                query.reply(key, payload, encoding=encoding, attachment=note)
+                payload, encoding, attachment = self._newest[name]
+                query.reply(key, payload, encoding=encoding, attachment=attachment)
 
-        self._held.append(session.declare_queryable(key, on_query))
+        self._declared.append(session.declare_queryable(key, on_query))
 
-    def _listen(self, session: zenoh.Session, take: Take) -> None:
+    def _declare_subscribers(self, session: zenoh.Session, callback: CommandCallback) -> None:
         plain = f"{self._config.robot}/cmd/**"
-        skipped = len(self._config.robot) + 1
-        self._held.append(session.declare_subscriber(plain, _taker(take, skipped)))
+        prefix_length = len(self._config.robot) + 1
+        self._declared.append(session.declare_subscriber(plain, _sample_callback(callback, prefix_length)))
         if self._config.ros2 == "rmw_zenoh":
             key = f"{self._config.ros2_domain}/{plain}"
-            skipped += len(str(self._config.ros2_domain)) + 1
-            self._held.append(session.declare_subscriber(key, _taker(take, skipped, ending=2)))
+            prefix_length += len(str(self._config.ros2_domain)) + 1
+            on_sample = _sample_callback(callback, prefix_length, suffix_parts=2)  # message type and its hash
+            self._declared.append(session.declare_subscriber(key, on_sample))
         if self._graph is not None:
-            for name, schema in HEARD.items():
+            for name, schema in SUBSCRIBED.items():
                 self._graph.announce("MS", name, schema)
 
 
-def _taker(take: Take, skipped: int, ending: int = 0) -> Callable[[zenoh.Sample], None]:
-    """Hands samples on under their key without its first characters and last parts."""
+def _sample_callback(
+    callback: CommandCallback, prefix_length: int, suffix_parts: int = 0
+) -> Callable[[zenoh.Sample], None]:
+    """Return a zenoh callback that passes key and payload on, without the key's first characters and last parts."""
 
     def on_sample(sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)[skipped:]
-        take(key.rsplit("/", ending)[0] if ending else key, sample.payload.to_bytes())
+        key = str(sample.key_expr)[prefix_length:]
+        callback(key.rsplit("/", suffix_parts)[0] if suffix_parts else key, sample.payload.to_bytes())
 
     return on_sample
 
 
-class _Graph:
-    """What ROS 2 is told of us: a node and its topics."""
+class _RosGraph:
+    """The entries in the graph of ROS 2: a node and its topics."""
 
     def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
         self._session, self._config = session, config
@@ -159,10 +160,10 @@ class _Graph:
             self._declare(self._node.token)
 
     def announce(self, kind: str, topic: str, schema: str) -> str:
-        """Declares a publisher (MP) or a subscription (MS); its token, "" where ROS 2 is off."""
+        """Declare a publisher (MP) or a subscription (MS) and return its token, "" where ROS 2 is off."""
         name = ros_name(self._config.robot, topic)
         if self._config.ros2 == "rmw_zenoh":
-            entity = 1 + [*SAID, *HEARD].index(topic)
+            entity = 1 + [*PUBLISHED, *SUBSCRIBED].index(topic)
             make = self._node.publisher if kind == "MP" else self._node.subscription
             return self._declare(make(entity, name, schema))
         if self._config.ros2 == "ros2dds":
@@ -174,37 +175,33 @@ class _Graph:
         return token
 
 
-def ros_name(robot: str, topic: str) -> str:
-    """A topic's name in ROS 2."""
-    return topic if topic.startswith("/") else f"/{robot}/{topic}"
+class _TopicPublisher:
+    """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another."""
 
-
-class _Channel:
-    """The publishers of one topic: the plain one, and the one that ROS 2 wants where that is another."""
-
-    def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: _Graph) -> None:
-        topic, ros = SAID[name], ros_name(config.robot, name)
+    def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: _RosGraph) -> None:
+        topic, ros = PUBLISHED[name], ros_name(config.robot, name)
         plain = f"{config.robot}/{name.removeprefix('/')}"
-        self._plain = _publisher(session, plain, topic)
+        self._plain = _declared_publisher(session, plain, topic)
         token = graph.announce("MP", name, topic.schema)
         key = ros2.data_key(config.ros2_domain, ros, topic.schema) if config.ros2 == "rmw_zenoh" else ros[1:]
         other = config.ros2 != "off" and key != plain
-        self._ros = _publisher(session, key, topic) if other else None
+        self._ros = _declared_publisher(session, key, topic) if other else None
         self._gid = ros2.gid_of(token) if config.ros2 == "rmw_zenoh" else b""
         self._seq = 0
 
-    def put(self, payload: bytes, note: bytes | None) -> None:
-        """Sends to whoever listens; what nobody listens to costs microseconds."""
-        self._plain.put(payload, attachment=note)
+    def put(self, payload: bytes, attachment: bytes | None) -> None:
+        """Send to all subscribers; microseconds where there are none."""
+        self._plain.put(payload, attachment=attachment)
         if self._ros is not None:
             self._seq += 1
-            beside = ros2.attachment(self._seq, time.time_ns(), self._gid) if self._gid else None
-            self._ros.put(payload, attachment=beside)
+            ros_attachment = ros2.attachment(self._seq, time.time_ns(), self._gid) if self._gid else None
+            self._ros.put(payload, attachment=ros_attachment)
 
 
-def _publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh.Publisher:
-    """Not express: each message would fill one of the few batches of every router on the way, and poses were dropped
-    there; the latency is the same.
+def _declared_publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh.Publisher:
+    """Declare a publisher, not express: each express message fills one of the few batches of every router on the way.
+
+    Poses were dropped there, and the latency is the same.
     """
     return session.declare_publisher(
         key,

@@ -1,4 +1,4 @@
-"""The knobs of the bus, and what is wrong with them before anything is opened."""
+"""Settings of the bus, checked before a session is opened."""
 
 from __future__ import annotations
 
@@ -18,53 +18,53 @@ _FILES: Final = ("config", "tls_ca", "tls_listen_key", "tls_listen_certificate",
 _PAIRS: Final = (("tls_listen_key", "tls_listen_certificate"), ("tls_connect_key", "tls_connect_certificate"),
                  ("user", "password_file"))
 _ENCRYPTED: Final = ("tls/", "quic/")
-_LONGEST_FILE: Final = 1 << 20  # bytes
+_MAX_FILE_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """Where the bus is and who may do what on it: keys are `<robot>/...`; this machine only, unless told otherwise."""
+    """Endpoints of the bus and permissions on it; keys are `<robot>/...`. The default is this machine only."""
 
     robot: str = knob("omnid", "first part of every key, and of the topics of --record")
-    mode: str = knob("peer", "peer: others come here as well; client: everything goes through a router, which may come "
-                     "later", choices=("peer", "client"))
+    mode: str = knob("peer", "peer: other programs connect to this one; client: all traffic goes through a router, "
+                     "which may be started later", choices=("peer", "client"))
     listen: tuple[str, ...] = knob(("tcp/127.0.0.1:7447",), "zenoh endpoints to listen on")
     connect: tuple[str, ...] = knob((), "zenoh endpoints to connect to")
-    retry_s: float = knob(2.0, "longest wait between two tries to reach an endpoint of connect, s", low=0.1, high=60)
-    config: str = knob("", "a zenoh file (JSON5) that is read first: what is set here goes over it")
-    tls_ca: str = knob("", "certificate of who signs those of the others, PEM; for endpoints tls/...")
-    tls_listen_key: str = knob("", "private key for those who connect to us, PEM")
-    tls_listen_certificate: str = knob("", "certificate for those who connect to us, PEM")
-    tls_connect_key: str = knob("", "private key for those we connect to, PEM")
-    tls_connect_certificate: str = knob("", "certificate for those we connect to, PEM; with one, tls_mutual is on")
-    tls_mutual: bool = knob(False, "whoever connects must show a certificate that tls_ca has signed")
-    user: str = knob("", "our name for those who ask for one")
-    password_file: str = knob("", "file with our password, one line")
-    users_file: str = knob("", "who may connect: lines user:password")
-    command_names: tuple[str, ...] = knob((), "who may send commands, by the common name of the certificate")
-    command_users: tuple[str, ...] = knob((), "who may send commands, by user; neither: whoever can connect")
-    ros2: str = knob("off", "how ROS 2 sees the topics: by rmw_zenoh or by zenoh-bridge-ros2dds",
+    retry_s: float = knob(2.0, "longest wait between two attempts to reach an endpoint of connect, s", low=0.1, high=60)
+    config: str = knob("", "a zenoh configuration file (JSON5) that is read first; settings here override it")
+    tls_ca: str = knob("", "certificate of the authority that signs the others' certificates, PEM; for tls/ endpoints")
+    tls_listen_key: str = knob("", "private key for incoming connections, PEM")
+    tls_listen_certificate: str = knob("", "certificate for incoming connections, PEM")
+    tls_connect_key: str = knob("", "private key for outgoing connections, PEM")
+    tls_connect_certificate: str = knob("", "certificate for outgoing connections, PEM; with one, tls_mutual is on")
+    tls_mutual: bool = knob(False, "clients must present a certificate that tls_ca has signed")
+    user: str = knob("", "user name for outgoing connections")
+    password_file: str = knob("", "file with the password of user, one line")
+    users_file: str = knob("", "file with the users that may connect: lines user:password")
+    command_names: tuple[str, ...] = knob((), "certificates (common names) that may send commands")
+    command_users: tuple[str, ...] = knob((), "users that may send commands; with neither: all that can connect")
+    ros2: str = knob("off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds",
                      choices=("off", "rmw_zenoh", "ros2dds"))
     ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)
     panorama_hz: float = knob(0.0, "panoramas on the bus per second, as JPEG; 0: none", low=0, high=60)
 
 
 def checked(config: BusConfig) -> BusConfig:
-    """The same; OmnidError where a name, an endpoint or a file cannot be used, or one knob asks for another."""
+    """Return the settings unchanged. Raise OmnidError for an invalid name, endpoint or file, or a missing knob."""
     for problem in _problems(config):
         raise OmnidError(problem)
     return config
 
 
 def text_of(config: BusConfig, name: str) -> str:
-    """The text of the file that a knob names; OmnidError where there is none."""
+    """Return the text of the file that a knob names. Raise OmnidError where it cannot be read."""
     path = getattr(config, name)
     try:
         with open(path, encoding="utf-8") as file:
-            return file.read(_LONGEST_FILE)
+            return file.read(_MAX_FILE_BYTES)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not text in UTF-8"
-        raise OmnidError(f"bus.{name}: cannot read {path!r}: {reason}; name a file that omnid may read") from None
+        raise OmnidError(f"bus.{name}: cannot read {path!r}: {reason}; name a readable file") from None
 
 
 def _problems(config: BusConfig) -> Iterator[str]:
@@ -83,11 +83,11 @@ def _problems(config: BusConfig) -> Iterator[str]:
 
 
 def _unfit_files(config: BusConfig) -> Iterator[str]:
-    """Each file is read once, so that a wrong name is told now and not by whoever fails later because of it."""
+    """Read each file once, so that a wrong name is reported here and not by a later failure of zenoh."""
     for name in _FILES:
         text = text_of(config, name) if getattr(config, name) else None
         if text is not None and name.startswith("tls_") and "-----BEGIN " not in text:
-            yield f"bus.{name}: {getattr(config, name)!r} has no PEM block; give a file with -----BEGIN ...-----"
+            yield f"bus.{name}: {getattr(config, name)!r} has no PEM block; name a file with -----BEGIN ...-----"
         if text is not None and name == "users_file" and not all(map(_is_user, filter(None, text.splitlines()))):
             yield f"bus.users_file: {config.users_file!r} has a line that is not user:password"
 
@@ -98,7 +98,7 @@ def _is_user(line: str) -> bool:
 
 
 def _missing(config: BusConfig) -> Iterator[str]:
-    """What one knob needs of another."""
+    """Yield the knobs that are missing beside those that are set."""
     for a, b in _PAIRS:
         for given, other in ((a, b), (b, a)):
             if getattr(config, given) and not getattr(config, other):
@@ -106,15 +106,15 @@ def _missing(config: BusConfig) -> Iterator[str]:
     if any(endpoint.startswith(_ENCRYPTED) for endpoint in config.listen) and not config.tls_listen_key:
         yield "bus.listen has a tls or quic endpoint; set bus.tls_listen_key and bus.tls_listen_certificate for it"
     if config.tls_mutual and not config.tls_ca:
-        yield "bus.tls_mutual is set; name in bus.tls_ca who signs the others' certificates"
+        yield "bus.tls_mutual is set and bus.tls_ca is not; name the certificate of the authority there"
     if config.command_names and not config.tls_mutual:
-        yield "bus.command_names are names of certificates; set bus.tls_mutual so that they are asked for"
+        yield "bus.command_names are names of certificates; set bus.tls_mutual so that clients must present one"
     if config.command_users and not config.users_file:
         yield "bus.command_users are set; give their passwords in bus.users_file"
 
 
 def set_knobs(config: BusConfig) -> frozenset[str]:
-    """The names of the knobs that are not at their default."""
-    usual = BusConfig()
+    """Return the names of the knobs that are not at their default."""
+    default = BusConfig()
     names = (entry.name for entry in fields(config))
-    return frozenset(name for name in names if getattr(config, name) != getattr(usual, name))
+    return frozenset(name for name in names if getattr(config, name) != getattr(default, name))

@@ -1,4 +1,4 @@
-"""Messages as CDR bytes, the same for the log and the bus: ROS 2 (Humble) types, serialised by rosbags.
+"""Encoding and decoding of ROS 2 (Humble) messages as CDR bytes, by rosbags; the same for recordings and the bus.
 
 Arrays in SI units; p_a = T_a_b @ p_b; covariances in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry).
 """
@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +33,7 @@ SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, D
            VECTOR_SCHEMA, GRID_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
-CLOUD_BLOCK = 4096  # points moved at once: what is as large as a map leaves holes in memory that nothing else fills
+CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
 QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
@@ -44,7 +45,7 @@ Cartesian = ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ro
 
 @dataclass(frozen=True, slots=True)
 class OdometryRecord:
-    """What a nav_msgs/msg/Odometry message says."""
+    """Content of a nav_msgs/msg/Odometry message."""
 
     stamp_ns: int
     T_odom_base: Array  # (4, 4)
@@ -63,12 +64,30 @@ class FrameTransform:
     T_parent_child: Array  # (4, 4)
 
 
-OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/msg/DiagnosticStatus
+class Twist(NamedTuple):
+    """Content of a TwistStamped of a ground robot."""
+
+    stamp_ns: int
+    frame: str
+    velocity_mps: float
+    yaw_rate_radps: float
+
+
+class HeadingCommand(NamedTuple):
+    """Content of a Vector3Stamped that commands a heading."""
+
+    stamp_ns: int
+    frame: str
+    velocity_mps: float
+    heading_rad: float
+
+
+OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticStatus:
-    """What one part has to say of itself."""
+    """Status of one part of the robot; names and keys: omnid.transport.status_names."""
 
     name: str
     level: int  # OK ...
@@ -78,13 +97,12 @@ class DiagnosticStatus:
 
 @cache
 def _typestore() -> Typestore:
-    """The message definitions, made at first use: the serialisers are compiled then."""
+    """Return the message definitions; made at first use, because their serialisers are compiled then."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def compile_serialisers() -> None:
-    """Has what writes and reads the messages compiled now: at first use it would hold up all threads, the motor's too.
-    """
+    """Compile all serialisers now: compilation at first use would delay all threads, that of the motor included."""
     for schema in SCHEMAS:
         _typestore().get_msgdef(schema)
 
@@ -114,7 +132,7 @@ def _quaternion(R: ArrayLike) -> ros.geometry_msgs__msg__Quaternion:
 
 @lru_cache(maxsize=8)
 def _xyzw(R: bytes) -> list[float]:
-    """The quaternion of a rotation; several messages tell of the same one, and one part of the tree never turns."""
+    """Return the quaternion of a rotation; cached because several messages carry the same pose."""
     return list(se3.quaternion(np.frombuffer(R).reshape(3, 3)).tolist())
 
 
@@ -126,7 +144,7 @@ def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
 def _covariance(matrix: ArrayLike) -> Array:
     flat = np.ascontiguousarray(matrix, np.float64).reshape(-1)
     if flat.shape != (36,):
-        raise OmnidError(f"a covariance is (6, 6); got {np.shape(matrix)}; give it in the order x y z rx ry rz")
+        raise OmnidError(f"covariance of shape {np.shape(matrix)}: expected (6, 6), in the order x y z rx ry rz")
     return flat
 
 
@@ -138,7 +156,7 @@ def odometry_cdr(
     velocity_covariance: Array,
     frames: Frames = ("odom", "base_link"),
 ) -> bytes:
-    """A nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
+    """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
     parent, child = frames
     twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
     message = ros.nav_msgs__msg__Odometry(
@@ -151,13 +169,13 @@ def odometry_cdr(
 
 
 def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") -> bytes:
-    """A geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
+    """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
     message = ros.geometry_msgs__msg__PoseStamped(_header(stamp_ns, frame), _pose(T_frame_body))
     return _cdr(message, POSE_SCHEMA)
 
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
-    """A tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
+    """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
     edges = [_edge(stamp_ns, edge) for edge in transforms]
     return _cdr(ros.tf2_msgs__msg__TFMessage(edges), TRANSFORM_SCHEMA)
 
@@ -170,9 +188,9 @@ def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__Transf
 
 def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *,
                     T_frame_points: Array | None = None) -> bytes:
-    """A sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): 16 bytes a point, float32.
+    """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
 
-    T_frame_points (4, 4): what brings the points into `frame`; None where they are in it.
+    T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
     """
     packed = _packed(points, confidence, T_frame_points)
     number = ros.sensor_msgs__msg__PointField.FLOAT32
@@ -192,10 +210,10 @@ def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: Ar
 
 
 def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArray[np.float32]:
-    """Points, moved by T in double precision, and confidence side by side (N, 4), little-endian float32."""
+    """Return points, transformed in double precision, and confidence as (N, 4) little-endian float32."""
     points, confidence = np.asarray(points).reshape(-1, 3), np.asarray(confidence).reshape(-1)
     if len(points) != len(confidence):
-        raise OmnidError(f"{len(points)} points but {len(confidence)} confidences; give one for each point")
+        raise OmnidError(f"{len(confidence)} confidences for {len(points)} points: expected one for each point")
     packed = np.empty((len(points), 4), "<f4")
     packed[:, 3] = confidence
     for start in range(0, len(points), CLOUD_BLOCK):
@@ -205,7 +223,7 @@ def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArra
 
 
 def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
-    """A nav_msgs/msg/OccupancyGrid of cells (H, W) in the plane z = 0 of `frame`; corner: x, y of cell (0, 0), m."""
+    """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
     height, width = cells.shape
     T_frame_corner = se3.transform(np.eye(3), (*corner, 0.0))
     info = ros.nav_msgs__msg__MapMetaData(_time(stamp_ns), cell_m, width, height, _pose(T_frame_corner))
@@ -213,7 +231,7 @@ def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, 
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
-    """A diagnostic_msgs/msg/DiagnosticArray."""
+    """Encode a diagnostic_msgs/msg/DiagnosticArray."""
     entries = [_status(status) for status in statuses]
     return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA)
 
@@ -221,56 +239,54 @@ def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> byte
 def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
     if not 0 <= status.level <= 3:
         raise OmnidError(
-            f"diagnostic level {status.level} of {status.name} is none of 0 ok, 1 warning, 2 error, 3 stale")
+            f"diagnostic level {status.level} of {status.name}: expected 0 (ok), 1 (warning), 2 (error) or 3 (stale)")
     pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
     return ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
 
 
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
-    """A geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
+    """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
     twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
     return _cdr(ros.geometry_msgs__msg__TwistStamped(_header(stamp_ns, frame), twist), TWIST_SCHEMA)
 
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
-    """A geometry_msgs/msg/Vector3Stamped in odom as command: x the speed, z the heading to hold."""
+    """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
     vector = _vector((velocity_mps, 0, heading_rad))
     return _cdr(ros.geometry_msgs__msg__Vector3Stamped(_header(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
 
 
-def twist_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
-    """Stamp [ns], frame, forward speed [m/s] and yaw rate [rad/s] of a TwistStamped, finite or not.
-
-    Any bytes may come: OmnidError unless they are one.
-    """
+def twist_from_cdr(payload: bytes) -> Twist:
+    """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, TWIST_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
-    return (_loose_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
-            message.twist.angular.z)
+    return Twist(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
+                 message.twist.angular.z)
 
 
-def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
-    """Stamp [ns], frame, speed [m/s] and heading [rad] of a Vector3Stamped, finite or not; OmnidError unless it is one.
-    """
+def heading_from_cdr(payload: bytes) -> HeadingCommand:
+    """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, VECTOR_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
-    return _loose_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
+    return HeadingCommand(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
+                          message.vector.z)
 
 
 def message_from_cdr(payload: bytes, schema: str) -> object:
+    """Decode a message of a schema into the type of rosbags. Raise OmnidError for any other bytes."""
     try:
         return _typestore().deserialize_cdr(bytes(payload), schema)
     except SerdeError as error:
-        raise OmnidError(f"{len(payload)} bytes are no {schema} in CDR ({error}); check the sender") from error
+        raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
-def _loose_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
-    """A stamp that may be senseless: whoever reads it knows how far to trust it."""
+def _unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    """Return a stamp that may be invalid; callers check it."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def odometry_from_cdr(payload: bytes) -> OdometryRecord:
-    """What an Odometry message says; any bytes may come: OmnidError unless they are one with a finite, rigid pose."""
+    """Decode an Odometry message. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
     message = message_from_cdr(payload, ODOMETRY_SCHEMA)
     assert isinstance(message, ros.nav_msgs__msg__Odometry)
     twist = message.twist.twist
@@ -286,7 +302,7 @@ def odometry_from_cdr(payload: bytes) -> OdometryRecord:
 
 def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
-        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns is no time since 1970; check the sender")
+        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
@@ -297,5 +313,6 @@ def _xyz(vector: Cartesian) -> tuple[float, float, float]:
 def _transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
     q, position = (*_xyz(pose.orientation), pose.orientation.w), _xyz(pose.position)
     if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
-        raise OmnidError(f"odometry pose {position} {q} is not finite with a unit quaternion; check the sender")
+        raise OmnidError(f"odometry pose {position} {q}: expected finite numbers and a unit quaternion; check the "
+                         "sender")
     return se3.transform(se3.rotation(q), position)

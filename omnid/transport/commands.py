@@ -1,7 +1,7 @@
-"""Commands from the network: `<robot>/cmd/twist`, `/cmd/heading` and `/cmd/stop`, judged before anybody obeys them.
+"""Commands from the network, validated: `<robot>/cmd/twist`, `/cmd/heading` and `/cmd/stop`.
 
 twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s. heading is a
-geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. stop is any payload at all.
+geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. stop may have any payload.
 """
 
 from __future__ import annotations
@@ -16,71 +16,75 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport.codec import heading_from_cdr, twist_from_cdr
 
-LONGEST_PAYLOAD: Final = 4096
-ANY_SPEED_MPS, ANY_RATE_RADPS, ANY_HEADING_RAD = 20.0, 50.0, 1000.0  # beyond these a number is no wish but a fault
-SAME_CLOCK_S = 60.0  # a stamp that far from now is of another clock, or of none: the arrival alone counts
+LONGEST_PAYLOAD: Final = 4096  # bytes
+MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
+SAME_CLOCK_S = 60.0  # a stamp further from now is of another clock, or of none: only the arrival counts then
 
 
-class RefusedCommand(OmnidError):  # noqa: N818 - it is what becomes of the command
-    """A command that nobody should obey; its first argument is the reason, for counting."""
+class RefusedCommand(OmnidError):  # noqa: N818 - named after what it reports
+    """A command that must not be executed; its first argument is the reason, which is counted."""
 
 
-class Wish(NamedTuple):
-    """A command and when it was sent, by the sender's clock [ns of Unix time]."""
+class CommandMessage(NamedTuple):
+    """A decoded command and the time it was sent, by the sender's clock [ns of Unix time]."""
 
     stamp_ns: int
     setpoint: Setpoint
 
 
-def twist_command(payload: bytes) -> Wish:
-    """A speed and a yaw rate; Refused where it is neither."""
+def twist_command(payload: bytes) -> CommandMessage:
+    """Decode a speed and a yaw rate. Raise RefusedCommand or OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, yaw_rate_radps = twist_from_cdr(payload)
-    _expect_frame(frame, "base_link")
-    setpoint = Setpoint(_within(velocity_mps, ANY_SPEED_MPS), None, _within(yaw_rate_radps, ANY_RATE_RADPS))
-    return Wish(stamp_ns, setpoint)
+    _check_frame(frame, "base_link")
+    setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
+    return CommandMessage(stamp_ns, setpoint)
 
 
-def heading_command(payload: bytes) -> Wish:
-    """A speed and a heading in odom; Refused where it is neither."""
+def heading_command(payload: bytes) -> CommandMessage:
+    """Decode a speed and a heading in odom. Raise RefusedCommand or OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, heading_rad = heading_from_cdr(payload)
-    _expect_frame(frame, "odom")
-    return Wish(stamp_ns, Setpoint(_within(velocity_mps, ANY_SPEED_MPS), _within(heading_rad, ANY_HEADING_RAD)))
+    _check_frame(frame, "odom")
+    setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
+    return CommandMessage(stamp_ns, setpoint)
 
 
-def _within(value: float, most: float) -> float:
+def _within(value: float, limit: float) -> float:
     if not math.isfinite(value):
         raise RefusedCommand("not finite")
-    if abs(value) > most:
+    if abs(value) > limit:
         raise RefusedCommand("out of range")
     return value
 
 
-def _expect_frame(frame: str, expected: str) -> None:
+def _check_frame(frame: str, expected: str) -> None:
     if frame not in ("", expected):
-        raise RefusedCommand("another frame")
+        raise RefusedCommand("wrong frame")
 
 
-class Commands:
-    """Hands good commands on, counts the others by reason; called from the bus's threads.
+class CommandReceiver:
+    """Passes valid commands on and counts the others by reason; called from threads of the bus.
 
-    obey gets the setpoint and its arrival, ns of CLOCK_MONOTONIC.
+    on_setpoint receives the setpoint and its arrival, ns of CLOCK_MONOTONIC.
     """
 
-    def __init__(self, obey: Callable[[Setpoint, int], None], stop: Callable[[], None], stale_s: float) -> None:
-        self._obey, self._stop, self._stale_s = obey, stop, stale_s
+    def __init__(
+        self, on_setpoint: Callable[[Setpoint, int], None], on_stop: Callable[[], None], stale_s: float
+    ) -> None:
+        """stale_s: age from which a command is refused."""
+        self._on_setpoint, self._on_stop, self._stale_s = on_setpoint, on_stop, stale_s
         self._parsers = {"cmd/twist": twist_command, "cmd/heading": heading_command}
         self.accepted = self.stops = 0
         self.refused: Counter[str] = Counter()
 
-    def take(self, key: str, payload: bytes) -> None:
-        """One command as it came; never raises."""
-        arrival_ns = time.monotonic_ns()  # before anything else: a stop that comes meanwhile voids it
+    def receive(self, key: str, payload: bytes) -> None:
+        """Handle one message; never raises."""
+        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
         if key == "cmd/stop":
             self.stops += 1
-            self._stop()
+            self._on_stop()
             return
         try:
-            wish = self._judged(key, payload)
+            command = self._parsed(key, payload)
         except RefusedCommand as refusal:
             self.refused[str(refusal)] += 1
             return
@@ -88,15 +92,15 @@ class Commands:
             self.refused["malformed"] += 1
             return
         self.accepted += 1
-        self._obey(wish.setpoint, arrival_ns)
+        self._on_setpoint(command.setpoint, arrival_ns)
 
-    def _judged(self, key: str, payload: bytes) -> Wish:
+    def _parsed(self, key: str, payload: bytes) -> CommandMessage:
         if key not in self._parsers:
-            raise RefusedCommand("unknown")
+            raise RefusedCommand("unknown topic")
         if len(payload) > LONGEST_PAYLOAD:
             raise RefusedCommand("too long")
-        wish = self._parsers[key](payload)
-        age_s = time.time() - wish.stamp_ns * 1e-9
+        command = self._parsers[key](payload)
+        age_s = time.time() - command.stamp_ns * 1e-9
         if self._stale_s < age_s < SAME_CLOCK_S:
-            raise RefusedCommand("sent long ago")
-        return wish
+            raise RefusedCommand("too old")
+        return command

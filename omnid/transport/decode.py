@@ -1,6 +1,6 @@
-"""Messages of a robot as those who listen to it want them; any bytes may come.
+"""Decoded messages of a robot, for subscribers and readers of recordings; the bytes may be anything.
 
-Arrays in SI units, read-only in spirit; p_a = T_a_b @ p_b.
+Arrays in SI units, not to be written to; p_a = T_a_b @ p_b.
 """
 
 from __future__ import annotations
@@ -16,42 +16,42 @@ from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import NS_PER_S, DiagnosticStatus
-from omnid.transport.pose_attachment import Note, note_from_bytes
+from omnid.transport.pose_attachment import PoseAttachment
 
-ALIGNED = 0.999_999  # w of a quaternion that hardly turns
+ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where the robot's base is, how it moves, and how sure that is."""
+    """Pose and velocity of the robot's base with their covariances."""
 
     stamp_ns: int  # of Unix time, when the images were taken
     T_odom_base: Array  # (4, 4) m
     covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
     velocity: Array  # (6,) m/s, rad/s in the base's axes
     velocity_covariance: Array  # (6, 6)
-    note: Note  # state, number, landmarks
-    received_ns: int  # of Unix time, by the clock in here
+    attachment: PoseAttachment  # state, sequence number, landmarks
+    received_ns: int  # of Unix time, by the receiver's clock
 
     @property
     def state(self) -> str:
-        """tracking, degraded or lost; unknown where it is not omnid that sends."""
-        return self.note.state
+        """tracking, degraded or lost; unknown where the sender is not omnid."""
+        return self.attachment.state
 
     @property
     def x_m(self) -> float:
-        """Forward of where the robot started."""
+        """Position in odom, forward of the start."""
         return float(self.T_odom_base[0, 3])
 
     @property
     def y_m(self) -> float:
-        """To the left of where the robot started."""
+        """Position in odom, to the left of the start."""
         return float(self.T_odom_base[1, 3])
 
     @property
     def z_m(self) -> float:
-        """Above where the robot started."""
+        """Position in odom, above the start."""
         return float(self.T_odom_base[2, 3])
 
     @property
@@ -61,21 +61,21 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Report:
-    """How the parts of a robot are: cameras, stages, wheels."""
+class Diagnostics:
+    """Status of the parts of a robot: odometry, cameras, stages, wheels."""
 
     stamp_ns: int
     statuses: tuple[DiagnosticStatus, ...]
 
     def value(self, name: str, key: str) -> str:
-        """What the part of that name, such as "omnid: odometry", says under a key; "" where it does not."""
+        """Return the value of a key of the entry with that name, such as "omnid: odometry"; "" where there is none."""
         found = (status.values[key] for status in self.statuses if status.name == name and key in status.values)
         return next(found, "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """The points of the map."""
+    """Points of the map."""
 
     stamp_ns: int
     frame: str
@@ -85,56 +85,57 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Map:
-    """The map from above."""
+    """Occupancy grid of the map."""
 
     stamp_ns: int
     frame: str
-    cells: NDArray[np.int8]  # (H, W) -1 unknown, 0 free, up to 100 taken; rows from low to high y, columns x
+    cells: NDArray[np.int8]  # (H, W) -1 unknown, 0 free, up to 100 occupied; rows from low to high y, columns x
     cell_m: float
     corner: tuple[float, float]  # x, y of cell (0, 0), m
 
 
-def pose_from(payload: bytes, note: bytes, received_ns: int | None = None) -> Pose:
-    """The pose in an Odometry message and what goes along with it; OmnidError unless it is one.
+def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = None) -> Pose:
+    """Decode an Odometry message and its attachment. Raise OmnidError for any other bytes.
 
-    received_ns: when it came, of Unix time; default: now.
+    received_ns: time of arrival, of Unix time; default: now.
     """
     received_ns = time.time_ns() if received_ns is None else received_ns
     record = codec.odometry_from_cdr(payload)
     return Pose(record.stamp_ns, record.T_odom_base, record.covariance, record.velocity, record.velocity_covariance,
-                note_from_bytes(note) if note else Note(), received_ns)
+                PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(), received_ns)
 
 
-def report_from(payload: bytes, _: bytes = b"") -> Report:
-    """The statuses in a DiagnosticArray; OmnidError unless it is one."""
+def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
+    """Decode a DiagnosticArray. Raise OmnidError for any other bytes."""
     message = codec.message_from_cdr(payload, codec.DIAGNOSTICS_SCHEMA)
     assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
     statuses = tuple(DiagnosticStatus(entry.name, int(entry.level), entry.message,
                             {pair.key: pair.value for pair in entry.values}) for entry in message.status)
-    return Report(_stamp_ns(message.header), statuses)
+    return Diagnostics(_stamp_ns(message.header), statuses)
 
 
-def cloud_from(payload: bytes, _: bytes = b"") -> Cloud:
-    """The points in a PointCloud2 of omnid's own layout; OmnidError unless it is one."""
+def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
+    """Decode a PointCloud2 with omnid's fields. Raise OmnidError for any other bytes."""
     message = codec.message_from_cdr(payload, codec.POINT_CLOUD_SCHEMA)
     assert isinstance(message, ros.sensor_msgs__msg__PointCloud2)
     step = 4 * len(codec.CLOUD_FIELDS)
     fields = [(entry.name, entry.offset) for entry in message.fields]
     own = fields == [(name, 4 * i) for i, name in enumerate(codec.CLOUD_FIELDS)] and not message.is_bigendian
     if not own or message.point_step != step or message.data.size % step:
-        raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point is none of omnid's")
+        raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
+                         f"expected the fields {', '.join(codec.CLOUD_FIELDS)} in {step} bytes")
     packed = message.data.view("<f4").reshape(-1, len(codec.CLOUD_FIELDS))
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
-def map_from(payload: bytes, _: bytes = b"") -> Map:
-    """The cells in an OccupancyGrid that lies along its frame's axes; OmnidError unless it is one."""
+def decode_map(payload: bytes, _: bytes = b"") -> Map:
+    """Decode an OccupancyGrid that is parallel to its frame's axes. Raise OmnidError for any other bytes."""
     message = codec.message_from_cdr(payload, codec.GRID_SCHEMA)
     assert isinstance(message, ros.nav_msgs__msg__OccupancyGrid)
     info, at = message.info, message.info.origin
     if message.data.size != info.width * info.height or not (info.resolution > 0 and abs(at.orientation.w) > ALIGNED):
-        raise OmnidError(f"a map of {message.data.size} cells, said to be {info.width} x {info.height} of "
-                         f"{info.resolution:g} m, is none of omnid's")
+        raise OmnidError(f"a map with {message.data.size} cells of {info.resolution:g} m was found; expected "
+                         f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes")
     return Map(_stamp_ns(message.header), message.header.frame_id, message.data.reshape(info.height, info.width),
                float(info.resolution), (at.position.x, at.position.y))
 

@@ -1,7 +1,7 @@
-"""Frames as the image messages of ROS 2, under names that its own tools and `omnid replay` know.
+"""Frames as image messages of ROS 2, on topics that ROS tools and `omnid replay` recognise.
 
-Written out in CDR (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), as
-drivers.logs.ros_image reads it: images are nearly all of a recording, and this copies each of them once.
+CDR is written here (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), not by rosbags: images are
+nearly all of a recording, and this copies each of them once. drivers.logs.ros_image reads it.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from omnid.errors import OmnidError
 from omnid.transport.codec import MAX_SECONDS, NS_PER_S
 
 COMPRESSED: Final = ("jpeg", "png")
-# drivers.frame's name -> that of sensor_msgs/image_encodings.hpp, where it is another
+# Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
 _ROS_NAMES: Final = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
 _PIXEL_BYTES: Final = {"mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2}
 
 
 def image_topic(frame: Frame) -> str:
-    """The frame's topic below the robot's, such as lower/image_raw/compressed."""
+    """Return the frame's topic below the robot's name, such as lower/image_raw/compressed."""
     return f"{frame.camera}/image_raw" + ("/compressed" if frame.encoding in COMPRESSED else "")
 
 
 def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
-    """Schema and CDR bytes of a frame, undecoded, with another stamp [ns of Unix time]; its frame_id is the camera.
+    """Return schema and CDR bytes of an undecoded frame with the given stamp [ns of Unix time]; frame_id is the camera.
 
-    OmnidError where the stamp is no time of ROS.
+    Raise OmnidError where the stamp does not fit a ROS time.
     """
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     if not 0 <= seconds <= MAX_SECONDS:
@@ -47,12 +47,12 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
 
 
 def _rows(frame: Frame) -> int:
-    """How many rows a whole image has; a driver's buffer may be longer, which ROS does not take."""
-    return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # colours in rows of their own
+    """Return the rows of a whole image; a driver's buffer may be longer, which ROS does not accept."""
+    return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
 
 
 def _message(head: bytes, data: NDArray[Any]) -> bytes:
-    """head is a multiple of 4 bytes long."""
+    """Join a message of its head, a multiple of 4 bytes, and the array of its data."""
     return b"".join((b"\0\1\0\0", head, pack("<I", data.size), data.data))
 
 

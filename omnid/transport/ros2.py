@@ -1,9 +1,9 @@
-"""How ROS 2 finds and reads the topics without ROS being here.
+"""Keys, attachments and liveliness tokens by which ROS 2 discovers and reads the topics; needs no ROS here.
 
 rmw_zenoh (attachment_helpers.cpp, liveliness_utils.cpp of ros2/rmw_zenoh): a data key with the type and its hash, an
 attachment to every sample, liveliness tokens for the node and each of its publishers and subscriptions.
-zenoh-bridge-ros2dds (liveliness_mgt.rs of zenoh-plugin-ros2dds): the plain name as the key and a token, as another
-bridge would declare it.
+zenoh-bridge-ros2dds (liveliness_mgt.rs of zenoh-plugin-ros2dds): the plain name as the key, and a token such as
+another bridge declares.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ GID_BYTES: Final = 16
 
 @cache
 def type_hash(schema: str) -> str:
-    """The hash of a message type such as nav_msgs/msg/Odometry (REP 2016), the same in Humble and what came later."""
+    """Return the hash of a message type such as nav_msgs/msg/Odometry (REP 2016), the same since Humble."""
     return str(get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(schema))
 
 
 def dds_type(schema: str) -> str:
-    """nav_msgs/msg/Odometry as DDS names it."""
+    """Return the DDS name of a type such as nav_msgs/msg/Odometry."""
     package, kind, name = schema.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 def data_key(domain: int, topic: str, schema: str) -> str:
-    """The key of a topic with rmw_zenoh; topic with its leading '/'."""
+    """Return the zenoh key of a topic with rmw_zenoh; topic with its leading '/'."""
     return f"{domain}{topic}/{dds_type(schema)}/{type_hash(schema)}"
 
 
 def attachment(seq: int, source_ns: int, gid: bytes) -> bytes:
-    """What rmw_zenoh expects with each sample: number, time of sending [ns of Unix time] and the publisher's id."""
+    """Return the attachment that rmw_zenoh expects: sequence number, time of sending [ns], the publisher's id."""
     return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid
 
 
 def gid_of(token: str) -> bytes:
-    """The id of the publisher with this token: 16 bytes that no other has."""
+    """Return the unique id (16 bytes) of the publisher with this token."""
     return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()
 
 
 @dataclass(frozen=True, slots=True)
 class RmwNode:
-    """A node of ROS 2 as rmw_zenoh's liveliness tokens describe it."""
+    """A node of ROS 2 in rmw_zenoh's liveliness tokens."""
 
     domain: int
     zid: str  # of the session
@@ -58,15 +58,15 @@ class RmwNode:
 
     @property
     def token(self) -> str:
-        """That of the node itself."""
+        """Token of the node itself."""
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/%/%/{self.name}"
 
     def publisher(self, entity: int, topic: str, schema: str) -> str:
-        """The token of a publisher; entity: a number of its own."""
+        """Return the token of a publisher; entity: a number unique in the node."""
         return self._endpoint("MP", entity, topic, schema)
 
     def subscription(self, entity: int, topic: str, schema: str) -> str:
-        """The token of a subscription; entity: a number of its own."""
+        """Return the token of a subscription; entity: a number unique in the node."""
         return self._endpoint("MS", entity, topic, schema)
 
     def _endpoint(self, kind: str, entity: int, topic: str, schema: str) -> str:
@@ -75,11 +75,11 @@ class RmwNode:
 
 
 def bridge_token(zid: str, kind: str, key: str, schema: str) -> str:
-    """The token by which a bridge learns of a publisher (kind MP) or a subscription (MS) beyond it."""
+    """Return the token that announces a publisher (kind MP) or a subscription (MS) to a bridge."""
     plain = (key.replace("/", "§"), schema.replace("/", "§"))
     return "/".join((f"@/{zid}/@ros2_lv/{kind}", *plain, BRIDGE_RELIABLE_LAST_10))
 
 
 def node_name(robot: str) -> str:
-    """The name of the node: the robot's, without what it is part of."""
+    """Return the name of the node: the last part of the robot's name."""
     return robot.rsplit("/", 1)[-1]

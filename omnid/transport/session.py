@@ -1,4 +1,4 @@
-"""Opens zenoh sessions as the configuration wants them."""
+"""zenoh sessions with the settings of the configuration."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
-_TRY_MS: Final = 1000  # a client's try to reach its router; it opens no session without
-_URGENT_BATCHES: Final = 16  # zenoh's own 2 are soon full on a busy host, and poses are dropped
+_CONNECT_TIMEOUT_MS: Final = 1000  # a client that cannot reach its router opens no session
+_REAL_TIME_BATCHES: Final = 16  # the default of 2 is soon full on a busy host, and poses are dropped
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
     "tls_listen_key": "listen_private_key",
@@ -25,14 +25,14 @@ _TLS: Final = {
 }
 
 
-class Unreachable(OmnidError):  # noqa: N818 - it may be there in a moment
-    """Nobody answers where a client is to connect to, or not to us."""
+class Unreachable(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
+    """No endpoint answers a client, or the answer refuses it."""
 
 
 def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
-    """A session; OmnidError where an endpoint cannot be listened on, or nobody answers a client (Unreachable).
+    """Open a session. Raise OmnidError where an endpoint cannot be listened on, Unreachable for a client.
 
-    guarded: only commands may come in.
+    guarded: other programs may write commands only.
     """
     prepared = zenoh_config(config, guarded=guarded)
     try:
@@ -41,25 +41,26 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
         raise _failure(config, reason(error)) from error
 
 
-def _failure(config: BusConfig, why: str) -> OmnidError:
+def _failure(config: BusConfig, cause: str) -> OmnidError:
     if config.mode == "client":
-        asked = ", ".join(config.connect)
-        return Unreachable(f"bus cannot reach {asked}: {why}; start what listens there or change bus.connect")
-    asked = ", ".join(config.listen)
-    return OmnidError(f"bus cannot listen on {asked}: {why}; stop the other program there or change bus.listen")
+        endpoints = ", ".join(config.connect)
+        return Unreachable(f"bus cannot reach {endpoints}: {cause}; start the robot or router there, or change "
+                           "bus.connect")
+    endpoints = ", ".join(config.listen)
+    return OmnidError(f"bus cannot listen on {endpoints}: {cause}; stop the other program there or change bus.listen")
 
 
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
-    """zenoh's own configuration: its file, where there is one, ours where it says nothing, and all that is asked for.
+    """Return zenoh's configuration: its own file first, omnid's defaults where that leaves zenoh's, then set knobs.
 
-    Not zenoh's defaults: those listen on all interfaces and shout for others. Shared memory only pays above 100 kB and
-    leaves files behind.
+    zenoh's defaults are replaced because they listen on all interfaces and use multicast. Shared memory is off: it is
+    faster above 100 kB only, and leaves files behind.
     """
-    answer, untouched, asked = _of_file(config), zenoh.Config(), set_knobs(config)
+    result, untouched, explicit = _of_file(config), zenoh.Config(), set_knobs(config)
     for key, value, knob in _settings(config, guarded):
-        if knob == "mode" or knob in asked or answer.get_json(key) == untouched.get_json(key):
-            answer.insert_json5(key, json.dumps(value))
-    return answer
+        if knob == "mode" or knob in explicit or result.get_json(key) == untouched.get_json(key):
+            result.insert_json5(key, json.dumps(value))
+    return result
 
 
 def _of_file(config: BusConfig) -> zenoh.Config:
@@ -68,12 +69,12 @@ def _of_file(config: BusConfig) -> zenoh.Config:
     try:
         return zenoh.Config.from_json5(text_of(config, "config"))
     except zenoh.ZError as error:
-        told = f"bus.config: {config.config!r} is no zenoh configuration: {reason(error)}; mend it"
-        raise OmnidError(told) from error
+        message = f"bus.config: {config.config!r} is not a zenoh configuration: {reason(error)}; correct the file"
+        raise OmnidError(message) from error
 
 
 def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]]:
-    """zenoh's key, the value, and the knob that asks for it."""
+    """Yield zenoh's key, its value, and the knob that sets it."""
     client = config.mode == "client"
     yield "mode", config.mode, "mode"
     yield "listen/endpoints", [] if client else list(config.listen), "listen"
@@ -82,14 +83,14 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
     yield "connect/retry", {"period_init_ms": min(500, round(1e3 * config.retry_s)),
                             "period_max_ms": round(1e3 * config.retry_s), "period_increase_factor": 2}, "retry_s"
     if client:
-        yield "connect/timeout_ms", _TRY_MS, ""
+        yield "connect/timeout_ms", _CONNECT_TIMEOUT_MS, ""
     yield "scouting/multicast/enabled", False, ""
     yield "transport/shared_memory/enabled", False, ""
-    yield "transport/link/tx/queue/size/real_time", _URGENT_BATCHES, ""
+    yield "transport/link/tx/queue/size/real_time", _REAL_TIME_BATCHES, ""
     for knob, key in _TLS.items():
         if getattr(config, knob):
             yield f"transport/link/tls/{key}", getattr(config, knob), knob
-    if config.tls_mutual or config.tls_connect_certificate:  # zenoh shows no certificate unless it asks for one as well
+    if config.tls_mutual or config.tls_connect_certificate:  # zenoh sends no certificate unless it requires one, too
         yield "transport/link/tls/enable_mtls", True, "tls_mutual"
     yield from _users(config)
     if guarded:
@@ -105,5 +106,5 @@ def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:
 
 
 def reason(error: zenoh.ZError) -> str:
-    """zenoh's own words in one line, without the places in its source."""
+    """Return zenoh's message in one line, without references to its source files."""
     return " ".join(_SOURCE_LINE.sub("", str(error)).split())

@@ -1,5 +1,4 @@
-"""What is said on the bus: names, types, and how urgent each is. A name with a leading '/' is the same for all robots.
-"""
+"""Topics of the bus: name, type and delivery of each. A name with a leading '/' is the same for all robots."""
 
 from __future__ import annotations
 
@@ -12,25 +11,30 @@ EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 
 
 class Topic(NamedTuple):
-    """A topic and how it travels."""
+    """A published topic and how it is delivered."""
 
-    schema: str  # the type of ROS 2
-    realtime: bool = False  # it overtakes all others
-    late: bool = False  # whoever comes late gets the newest at once
+    schema: str  # ROS 2 message type
+    realtime: bool = False  # sent before messages of all other topics
+    latched: bool = False  # late subscribers can query the newest message
 
 
-SAID: Final = {
-    "odom": Topic(codec.ODOMETRY_SCHEMA, realtime=True, late=True),
-    "pose": Topic(codec.POSE_SCHEMA, realtime=True, late=True),
+PUBLISHED: Final = {
+    "odom": Topic(codec.ODOMETRY_SCHEMA, realtime=True, latched=True),
+    "pose": Topic(codec.POSE_SCHEMA, realtime=True, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
-    "status": Topic(codec.DIAGNOSTICS_SCHEMA, late=True),
-    "cloud": Topic(codec.POINT_CLOUD_SCHEMA, late=True),
-    "map": Topic(codec.GRID_SCHEMA, late=True),
+    "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
+    "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
+    "map": Topic(codec.GRID_SCHEMA, latched=True),
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(IMAGE_SCHEMA),
 }
-HEARD: Final = {
+SUBSCRIBED: Final = {
     "cmd/twist": codec.TWIST_SCHEMA,
     "cmd/heading": codec.VECTOR_SCHEMA,
     "cmd/stop": EMPTY_SCHEMA,
 }
+
+
+def ros_name(robot: str, topic: str) -> str:
+    """Return the ROS 2 name of a robot's topic, which is also its name in recordings: "odom" -> "/<robot>/odom"."""
+    return topic if topic.startswith("/") else f"/{robot}/{topic}"

@@ -15,7 +15,7 @@ from drivers.logs.mcap_records import LogFile, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DIAGNOSTICS_SCHEMA, ODOMETRY_SCHEMA, POINT_CLOUD_SCHEMA
-from omnid.transport.decode import Pose, Report, cloud_from, pose_from, report_from
+from omnid.transport.decode import Diagnostics, Pose, decode_cloud, decode_diagnostics, decode_pose
 from omnid.viewer import status_plots as reports
 from omnid.viewer.image_encoding import compressed
 from omnid.viewer.rerun_scene import RerunScene
@@ -54,7 +54,7 @@ class RecordedRunView:
         self._found, self._board = found, board
         self._ways = self._by_topic(topic)
         self._pending: Pose | None = None  # until its state is known, which is written after it
-        self._state, self._changes = "unknown", reports.Changes()
+        self._state, self._changes = "unknown", reports.StatusChanges()
         self.broken = self.damaged = 0
 
     @staticmethod
@@ -78,9 +78,9 @@ class RecordedRunView:
         """What becomes of a message, by its topic and type."""
         robot, images = poses.removesuffix("odom"), self.images(self._found, poses)
         return {
-            poses: {ODOMETRY_SCHEMA: Way(lambda data: pose_from(bytes(data), b"", 0), self._pose)},
-            f"{robot}cloud": {POINT_CLOUD_SCHEMA: Way(lambda data: cloud_from(bytes(data)), self._board.cloud)},
-            f"{robot}status": {DIAGNOSTICS_SCHEMA: Way(lambda data: report_from(bytes(data)), self._report)},
+            poses: {ODOMETRY_SCHEMA: Way(lambda data: decode_pose(bytes(data), b"", 0), self._pose)},
+            f"{robot}cloud": {POINT_CLOUD_SCHEMA: Way(lambda data: decode_cloud(bytes(data)), self._board.cloud)},
+            f"{robot}status": {DIAGNOSTICS_SCHEMA: Way(lambda data: decode_diagnostics(bytes(data)), self._report)},
             images: {kind: Way(partial(self._image, kind), self._show) for kind in (IMAGE, COMPRESSED_IMAGE)},
         }
 
@@ -105,11 +105,11 @@ class RecordedRunView:
     def _settle(self) -> None:
         """Draws the pose that waits, in the state that was told by now."""
         if self._pending is not None:
-            note = replace(self._pending.note, state=self._state)
-            self._board.pose(replace(self._pending, note=note))
+            attachment = replace(self._pending.attachment, state=self._state)
+            self._board.pose(replace(self._pending, attachment=attachment))
         self._pending = None
 
-    def _report(self, report: Report) -> None:
+    def _report(self, report: Diagnostics) -> None:
         self._state = reports.state(report) or self._state
         counts = reports.landmarks(report)
         if counts is not None:

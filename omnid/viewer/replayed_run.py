@@ -14,7 +14,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
 from omnid.transport.decode import Cloud, Pose
-from omnid.transport.pose_attachment import Note
+from omnid.transport.pose_attachment import PoseAttachment
 from omnid.viewer.image_encoding import jpeg
 from omnid.viewer.rerun_scene import RerunScene
 from omnid.viewer.status_plots import STAGES
@@ -61,8 +61,8 @@ class ReplayedRunView:
 
 def pose_of(odometry: OdometryUpdate, place: Geometry) -> Pose:
     """The pose of the base, as the bus has it."""
-    note = Note(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks)
-    return Pose(odometry.stamp_ns, *of_base(odometry, place.rig.T_base_rig), note, odometry.stamp_ns)
+    attachment = PoseAttachment(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks)
+    return Pose(odometry.stamp_ns, *of_base(odometry, place.rig.T_base_rig), attachment, odometry.stamp_ns)
 
 
 class Latencies:

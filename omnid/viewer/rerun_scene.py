@@ -84,8 +84,8 @@ class RerunScene:
         self._deviation(pose)
         self._plot("speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
         self._plot("turn", "deg/s", float(np.rad2deg(pose.velocity[5])))
-        if pose.note.seq >= 0:
-            self.landmarks(pose.stamp_ns, pose.note.inliers, pose.note.tracks)
+        if pose.attachment.seq >= 0:
+            self.landmarks(pose.stamp_ns, pose.attachment.inliers, pose.attachment.tracked)
         self.poses += 1
         if self.poses % KEPT_EVERY == 0:
             self._place.keep()

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from omnid.monitor.robot_state import plain
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Report
+from omnid.transport.decode import Diagnostics
 from omnid.viewer.style import STATES
 
 STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")
@@ -19,7 +19,7 @@ _TIME: Final = re.compile(r"(?P<what>\w+?)_(?P<which>p50|p99)_ms")
 _LANDMARKS: Final = re.compile(r"(\d{1,9}) of (\d{1,9})")
 
 
-def latencies(report: Report) -> Iterator[tuple[tuple[str, ...], float]]:
+def latencies(report: Diagnostics) -> Iterator[tuple[tuple[str, ...], float]]:
     """Names and ms of what took its time: of the stages that make a pose the medians, of all that is no stage p99 too.
     """
     for status in report.statuses:
@@ -34,26 +34,26 @@ def latencies(report: Report) -> Iterator[tuple[tuple[str, ...], float]]:
                 yield (part.removeprefix("stage "),), value_ms
 
 
-def state(report: Report) -> str | None:
+def state(report: Diagnostics) -> str | None:
     """The state of the odometry, where the report tells one."""
     found = (status.message for status in report.statuses if status.name == ODOMETRY)
     return next((message for message in found if message in STATES), None)
 
 
-def landmarks(report: Report) -> tuple[int, int] | None:
+def landmarks(report: Diagnostics) -> tuple[int, int] | None:
     """How many landmarks agree, and how many were found."""
     found = _LANDMARKS.fullmatch(report.value(ODOMETRY, "landmarks"))
     return (int(found[1]), int(found[2])) if found else None
 
 
-class Changes:
+class StatusChanges:
     """What parts say of themselves, where it is not what they said before; in constant memory."""
 
     def __init__(self, most_parts: int = 100) -> None:
         self._most_parts = most_parts
         self._said: dict[str, tuple[int, str]] = {}
 
-    def __call__(self, report: Report) -> Iterator[tuple[str, str]]:
+    def __call__(self, report: Diagnostics) -> Iterator[tuple[str, str]]:
         """Lines and their levels; the odometry's state is told elsewhere."""
         for status in report.statuses:
             if status.name != ODOMETRY and self._is_new(status):
@@ -77,7 +77,7 @@ class Canvas(Protocol):
         """A line of the log."""
 
 
-def draw(report: Report, changes: Changes, canvas: Canvas) -> None:
+def draw(report: Diagnostics, changes: StatusChanges, canvas: Canvas) -> None:
     """Draws how long things took, and what has changed."""
     for name, value_ms in latencies(report):
         canvas.latency(report.stamp_ns, name, value_ms)

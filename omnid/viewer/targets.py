@@ -46,7 +46,7 @@ class ViewerTarget(Protocol):
         """Waits until all that is drawn has arrived, so that little is in hand; OmnidError where it cannot."""
 
     @property
-    def left(self) -> bool:
+    def closed(self) -> bool:
         """Whether nobody looks any more."""
 
     def leave(self) -> str:
@@ -59,7 +59,7 @@ class ViewerTarget(Protocol):
 class RrdFile:
     """A file that `rerun` opens."""
 
-    left = False
+    closed = False
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -136,7 +136,7 @@ class Viewer:
             _flush(self._stream, "rerun's viewer takes nothing any more")
 
     @property
-    def left(self) -> bool:
+    def closed(self) -> bool:
         """Whether the viewer has ended."""
         return self._process is not None and self._process.poll() is not None
 
@@ -151,7 +151,7 @@ class Viewer:
 
     def _require_viewer(self) -> None:
         """ClosedError where it was closed, OmnidError where it failed: without a screen some do so after a while."""
-        if self._process is not None and self.left:
+        if self._process is not None and self.closed:
             if self._process.returncode:
                 raise OmnidError(f"rerun's viewer has failed ({_last_line(self._said)}): {INSTEAD}")
             raise ClosedError("rerun's viewer was closed")

@@ -117,6 +117,6 @@ def _ended(board: RerunScene, place: ViewerTarget, code: int) -> int:
     if board.poses:
         of_all = f" of {board.offered}" if board.offered > board.poses else ""
         print(f"{board.poses} poses{of_all} and {board.images} images shown")
-    if board.poses and not place.left:
+    if board.poses and not place.closed:
         print(place.leave(), flush=True)
     return code

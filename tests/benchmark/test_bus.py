@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.client import Report, Robot, Subscription
+from omnid.client import Diagnostics, Robot, Subscription
 from omnid.engine.telemetry import Histogram
 from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.decode import pose_from
+from omnid.transport.decode import decode_pose
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wait_until
 
 pytestmark = pytest.mark.benchmark
@@ -171,7 +171,7 @@ def test_a_slow_subscriber_slows_nobody_else(scene: Path) -> None:
              "--set", f"bus.listen=['{endpoint}']", "--set", "bus.panorama_hz=10", "--set", "live.cloud_s=0.5"]
     with subprocess.Popen(words, stderr=subprocess.DEVNULL) as daemon:
         try:
-            with Robot(connect=(endpoint,), patience_s=30.0) as robot, robot.subscribe(Report) as reports:
+            with Robot(connect=(endpoint,), timeout_s=30.0) as robot, robot.subscribe(Diagnostics) as reports:
                 rates = {"alone": measured(robot)}
                 with script(SLOW, endpoint):
                     rates["with a slow subscriber"] = measured(robot)
@@ -194,19 +194,19 @@ def measured(robot: Robot) -> tuple[float, float, float]:
 
     def take(topic: str, payload: bytes, note: bytes) -> None:
         if topic == "odom":
-            pose = pose_from(payload, note)
-            ages_ms.append((pose.note.sent_ns - pose.stamp_ns) * 1e-6)
+            pose = decode_pose(payload, note)
+            ages_ms.append((pose.attachment.sent_ns - pose.stamp_ns) * 1e-6)
 
-    robot.each(take)
+    robot.on_message(take)
     wait_until(lambda: bool(ages_ms))
     time.sleep(3.0)
     ages_ms.clear()
-    with robot.subscribe(Report) as reports:
+    with robot.subscribe(Diagnostics) as reports:
         rates_hz = [float(full(reports).value("omnid: odometry", "rate_hz")) for _ in range(10)]
     return float(np.mean(rates_hz)), float(np.percentile(ages_ms, 50)), float(np.percentile(ages_ms, 99))
 
 
-def full(reports: Subscription[Report]) -> Report:
+def full(reports: Subscription[Diagnostics]) -> Diagnostics:
     """The next report of all parts."""
     while (report := reports.wait(5.0)) is None or not report.value("omnid: odometry", "rate_hz"):
         pass
@@ -225,7 +225,7 @@ def test_a_fleet_on_one_router_loses_no_pose() -> None:
         for number in range(FLEET):
             bus = Bus(BusConfig(robot=f"robot{number}", mode="client", listen=(), connect=(endpoint,)))
             ends.callback(bus.close)
-            wait_until(lambda bus=bus: bus.join() is None and bus._session is not None)
+            wait_until(lambda bus=bus: bus.connect() is None and bus._session is not None)
             sinks.append(sink_on(bus))
         publish(sinks, 0, 30)
         told(listener)

@@ -17,13 +17,13 @@ import pytest
 
 import omnid.client
 from calib import se3
-from omnid.client import Cloud, Driver, Map, Pose, Report, Robot, subscribe
+from omnid.client import Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import cloud_from, map_from, pose_from, report_from
-from omnid.transport.pose_attachment import Note, note_bytes, note_from_bytes
+from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
+from omnid.transport.pose_attachment import PoseAttachment
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
 
 
@@ -34,7 +34,7 @@ def robot() -> Iterator[tuple[Bus, str]]:
         yield bus, endpoint
 
 
-def test_only_the_newest_pose_is_kept() -> None:
+def test_keeps_only_the_newest_pose() -> None:
     with robot() as (bus, endpoint), subscribe(connect=(endpoint,)) as poses:
         assert poses.newest() is None and poses.wait(0.05) is None
         numbers = count()
@@ -46,50 +46,51 @@ def test_only_the_newest_pose_is_kept() -> None:
         assert pose is not None and pose.stamp_ns == 10**9 + 1009 and poses.newest() is None
 
 
-def test_a_pose_says_where_the_robot_is_and_how_sure_that_is() -> None:
+def test_decodes_a_pose_with_its_attachment() -> None:
     T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [1.0, 2.0, 3.0])
     payload = codec.odometry_cdr(5, T, 2.0 * np.eye(6), np.arange(6.0), np.eye(6))
-    pose = pose_from(payload, note_bytes(Note(7, "degraded", 2, 30, 40, 9)), received_ns=11)
+    pose = decode_pose(payload, PoseAttachment(7, "degraded", 2, 30, 40, 9).to_bytes(), received_ns=11)
     assert (pose.x_m, pose.y_m, pose.z_m, pose.state) == (1.0, 2.0, 3.0, "degraded")
     assert pose.yaw_rad == pytest.approx(0.5) and pose.received_ns == 11
-    assert pose.note == Note(7, "degraded", 2, 30, 40, 9)
+    assert pose.attachment == PoseAttachment(7, "degraded", 2, 30, 40, 9)
     np.testing.assert_array_equal(pose.covariance, 2.0 * np.eye(6))
     np.testing.assert_array_equal(pose.velocity, np.arange(6.0))
-    assert pose_from(payload, b"").state == "unknown"
+    assert decode_pose(payload, b"").state == "unknown"
 
 
-def test_reports_and_clouds_come_back_as_they_were_said() -> None:
-    report = report_from(
+def test_decodes_diagnostics_clouds_and_maps() -> None:
+    report = decode_diagnostics(
         codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"}), DiagnosticStatus("b", 0, "", {})])
     )
     assert report.stamp_ns == 5 and [status.name for status in report.statuses] == ["a", "b"]
     assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
     points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
-    cloud = cloud_from(codec.point_cloud_cdr(6, "odom", points, np.arange(50.0)))
+    cloud = decode_cloud(codec.point_cloud_cdr(6, "odom", points, np.arange(50.0)))
     assert (cloud.stamp_ns, cloud.frame) == (6, "odom")
     np.testing.assert_array_equal(cloud.points, points)
     np.testing.assert_array_equal(cloud.confidence, np.arange(50.0))
     cells = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
-    grid = map_from(codec.grid_cdr(7, "odom", cells, 0.5, (-2.0, 1.0)))
+    grid = decode_map(codec.grid_cdr(7, "odom", cells, 0.5, (-2.0, 1.0)))
     assert (grid.stamp_ns, grid.frame, grid.cell_m, grid.corner) == (7, "odom", 0.5, (-2.0, 1.0))
     np.testing.assert_array_equal(grid.cells, cells)
 
 
 @pytest.mark.parametrize(("kind", "topic", "payload", "decode"), [
-    (Pose, "odom", odometry(3), lambda data: pose_from(data, b"")),
-    (Report, "status", codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]), report_from),
-    (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), cloud_from),
-    (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), map_from),
+    (Pose, "odom", odometry(3), lambda data: decode_pose(data, b"")),
+    (Diagnostics, "status", codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
+     decode_diagnostics),
+    (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
+    (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
 ])
-def test_whatever_comes_is_read_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
+def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
     rng = random.Random(2)
     for _ in range(1500):
-        spoiled = bytearray(payload)
+        damaged = bytearray(payload)
         for _ in range(rng.randint(1, 6)):
-            spoiled[rng.randrange(len(spoiled))] = rng.randrange(256)
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         with contextlib.suppress(OmnidError):
-            assert isinstance(decode(bytes(spoiled[: rng.randint(0, len(spoiled))])), kind)
-            assert isinstance(decode(bytes(spoiled)), kind)
+            assert isinstance(decode(bytes(damaged[: rng.randint(0, len(damaged))])), kind)
+            assert isinstance(decode(bytes(damaged)), kind)
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         messages = connection.subscribe(kind)
         wait_until(lambda: bus.publish(topic, payload[:9]) is None and messages.newest() is None
@@ -97,42 +98,43 @@ def test_whatever_comes_is_read_or_refused(kind: type, topic: str, payload: byte
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{", b"[" * 3000, b"1", bytes(5000)])
-def test_a_note_is_one_or_is_refused(data: bytes) -> None:
+def test_pose_attachment_refuses_anything_but_a_json_object(data: bytes) -> None:
     with pytest.raises(OmnidError):
-        note_from_bytes(data)
-    assert note_from_bytes(b'{"state": 3, "seq": true, "resets": 4, "new": 1}') == Note(resets=4)
+        PoseAttachment.from_bytes(data)
+    assert PoseAttachment.from_bytes(b'{"state": 3, "seq": true, "resets": 4, "new": 1}') == PoseAttachment(resets=4)
 
 
-def test_it_needs_neither_opencv_nor_what_the_daemon_needs() -> None:
-    said = subprocess.run([sys.executable, "-c", "import omnid.client, sys; print(*sys.modules)"], capture_output=True,
-                          text=True, check=True).stdout.split()
-    assert not {"cv2", "serial", "filterpy", "mcap", "scipy"} & set(said) and "zenoh" in said
+def test_imports_nothing_that_only_the_daemon_needs() -> None:
+    words = [sys.executable, "-c", "import omnid.client, sys; print(*sys.modules)"]
+    modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
+    assert not {"cv2", "serial", "filterpy", "mcap", "scipy"} & set(modules) and "zenoh" in modules
 
 
 def example(text: str | None) -> str:
-    """The code in a docstring: its indented part."""
+    """Return the code in a docstring: its indented part."""
     lines = textwrap.dedent((text or "").split("\n", 1)[1]).splitlines()
     return textwrap.dedent("\n".join(line for line in lines if line.startswith("    "))) + "\n"
 
 
-def test_the_example_of_ten_lines_prints_poses() -> None:
+def test_the_subscriber_example_prints_poses() -> None:
     with robot() as (bus, endpoint):
         code = example(omnid.client.__doc__).replace('("omnid")', f'("omnid", connect=("{endpoint}",))')
         assert 5 <= len(code.strip().splitlines()) <= 10
         with script(f"print('ready', flush=True)\n{code}") as process:
             numbers = count()
-            wait_until(lambda: bus.publish("odom", odometry(next(numbers)), note_bytes(Note(1, "tracking"))) is None
+            attachment = PoseAttachment(1, "tracking").to_bytes()
+            wait_until(lambda: bus.publish("odom", odometry(next(numbers)), attachment) is None
                        and process.poll() is not None)
             assert process.returncode == 0 and process.stdout is not None
             assert process.stdout.read().startswith("tracking: ")
 
 
-def test_the_waypoint_example_drives_a_robot_to_its_last_point() -> None:
-    """A robot of nothing but its odometry: it goes where it is told."""
+def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
+    """The robot is simulated: its odometry follows the commands."""
     state = {"x": 0.0, "y": 0.0}
     stops: list[str] = []
 
-    def obey(key: str, payload: bytes) -> None:
+    def execute(key: str, payload: bytes) -> None:
         if key == "cmd/heading":
             _, _, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
@@ -141,13 +143,13 @@ def test_the_waypoint_example_drives_a_robot_to_its_last_point() -> None:
             stops.append(key)
 
     with robot() as (bus, endpoint):
-        bus.hear(obey)
+        bus.subscribe_commands(execute)
         code = example(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
         with script(f"print('ready', flush=True)\n{code}") as process:
             def run() -> bool:
                 T = se3.transform(np.eye(3), [state["x"], state["y"], 0.0])
                 bus.publish("odom", codec.odometry_cdr(time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6)),
-                            note_bytes(Note(1, "tracking")))
+                            PoseAttachment(1, "tracking").to_bytes())
                 return process.poll() is not None
             wait_until(run, pause_s=0.005)
             assert process.returncode == 0
@@ -155,18 +157,18 @@ def test_the_waypoint_example_drives_a_robot_to_its_last_point() -> None:
     assert math.hypot(state["x"] - 1.0, state["y"] - 1.0) < 0.15
 
 
-def test_commands_arrive_as_they_were_meant() -> None:
-    heard: list[tuple[str, bytes]] = []
+def test_sends_commands() -> None:
+    received: list[tuple[str, bytes]] = []
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         driver = connection.driver()
-        assert not driver.heard
-        bus.hear(lambda key, payload: heard.append((key, payload)))
-        wait_until(lambda: driver.heard)
+        assert not driver.connected
+        bus.subscribe_commands(lambda key, payload: received.append((key, payload)))
+        wait_until(lambda: driver.connected)
         driver.twist(0.5, -0.25)
         driver.heading(0.75, 1.5)
         driver.stop()
-        wait_until(lambda: len(heard) == 3)
-    (twist, a), (heading, b), (stop, _) = heard
+        wait_until(lambda: len(received) == 3)
+    (twist, a), (heading, b), (stop, _) = received
     assert (twist, heading, stop) == ("cmd/twist", "cmd/heading", "cmd/stop")
     assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
     assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)

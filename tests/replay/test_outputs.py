@@ -20,7 +20,7 @@ from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import Options, ReplayRun
 from omnid.settings import parse
 from omnid.transport.codec import odometry_from_cdr
-from omnid.transport.decode import map_from, report_from
+from omnid.transport.decode import decode_diagnostics, decode_map
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
@@ -81,7 +81,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
         reader = make_reader(file)
         found = [odometry_from_cdr(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
         (cloud,) = [STORE.deserialize_cdr(m.data, s.name) for s, _, m in reader.iter_messages(["/omnid/cloud"])]
-        (grid,) = [map_from(m.data) for _, _, m in reader.iter_messages(["/omnid/map"])]
+        (grid,) = [decode_map(m.data) for _, _, m in reader.iter_messages(["/omnid/map"])]
     assert cloud.header.frame_id == "odom"
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
     np.testing.assert_allclose(points, se3.apply(T_base_rig, read_ply(ply).xyz.astype(float)), atol=1e-5)
@@ -104,7 +104,7 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
-        told = [report_from(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
+        told = [decode_diagnostics(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
                 for chunk in summary.chunk_indexes[:1]] == [True, True]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Camera
-from omnid.client import Pose, Report, Robot
-from omnid.transport.decode import pose_from, report_from
+from omnid.client import Diagnostics, Pose, Robot
+from omnid.transport.decode import decode_diagnostics, decode_pose
 from tests.hardware.guest.loopback import DEVICES, Loopback
 from tests.hardware.guest.unit import until
 
@@ -88,9 +88,9 @@ class Operator:
         self._world = world
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.poses: list[Pose] = []
-        self.report: Report | None = None
+        self.report: Diagnostics | None = None
         self.driving = False
-        self._robot = Robot(patience_s=60.0)
+        self._robot = Robot(timeout_s=60.0)
         self._robot.each(self._take)
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._drive, daemon=True)
@@ -119,9 +119,9 @@ class Operator:
 
     def _take(self, topic: str, payload: bytes, note: bytes) -> None:
         if topic == "odom":
-            self.poses.append(pose_from(payload, note))
+            self.poses.append(decode_pose(payload, note))
             self._world.heed(self.poses[-1].stamp_ns - self._offset_ns)
-        elif topic == "status" and len((report := report_from(payload)).statuses) > 1:  # else of a change alone
+        elif topic == "status" and len((report := decode_diagnostics(payload)).statuses) > 1:  # else of a change alone
             self.report = report
 
     def _drive(self) -> None:

@@ -27,7 +27,7 @@ from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
-from omnid.transport.commands import Commands
+from omnid.transport.commands import CommandReceiver
 from tests.simulation import build
 
 SIZE = 256
@@ -58,8 +58,9 @@ class Daemon:
         self.wheels = Wheels()
         self.helm = Controller(self.wheels, ControllerSettings(0.05))
         self.logbook = ControllerStatistics(self.stages[1])
-        self.commands = Commands(lambda setpoint, arrival_ns: self.helm.command(TimedSetpoint(arrival_ns, setpoint)),
-                                 lambda: self.helm.stop(time.monotonic_ns()), 0.5)
+        self.commands = CommandReceiver(
+            lambda setpoint, arrival_ns: self.helm.command(TimedSetpoint(arrival_ns, setpoint)),
+            lambda: self.helm.stop(time.monotonic_ns()), 0.5)
         self.report = StatusReport(
             StatusSources(
                 self.telemetry,
@@ -190,7 +191,7 @@ def test_wheels(daemon: Daemon) -> None:
 
 def test_refused_commands_are_told_by_reason(daemon: Daemon) -> None:
     for payload in (b"", b"x" * 5000):
-        daemon.commands.take("cmd/twist", payload)
+        daemon.commands.receive("cmd/twist", payload)
     values = daemon.asked()["wheels"].values
     assert values["refused, malformed"] == values["refused, too long"] == "1" and values["commands"] == "0"
 

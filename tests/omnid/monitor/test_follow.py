@@ -1,4 +1,4 @@
-"""`omnid listen` in a process of its own, and what it keeps."""
+"""`omnid listen` in a process of its own, and the files it writes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from omnid.monitor.screen import Screen, line, table
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.pose_attachment import Note, note_bytes
+from omnid.transport.pose_attachment import PoseAttachment
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
 
@@ -43,18 +43,18 @@ def odometry_at(number: int) -> bytes:
     return codec.odometry_cdr(10**18 + number, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
 
 
-def say(bus: Bus, number: int) -> None:
-    bus.publish("odom", odometry_at(number), note_bytes(Note(number, "tracking", 0, 50, 60, time.time_ns())))
+def publish(bus: Bus, number: int) -> None:
+    bus.publish("odom", odometry_at(number), PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("/tf", codec.transform_cdr(10**18, []))
     bus.publish(
         "status", codec.diagnostics_cdr(10**18, [DiagnosticStatus("omnid: wheels", 1, "no command", {"sent": "4"})])
     )
 
 
-def say_until_it_ends(bus: Bus, process: subprocess.Popen[str]) -> tuple[str, str]:
+def publish_until_it_ends(bus: Bus, process: subprocess.Popen[str]) -> tuple[str, str]:
     deadline_s = time.monotonic() + DEADLINE_S
     for number in count():
-        say(bus, number)
+        publish(bus, number)
         time.sleep(0.01)
         if process.poll() is not None:
             break
@@ -62,16 +62,16 @@ def say_until_it_ends(bus: Bus, process: subprocess.Popen[str]) -> tuple[str, st
     return process.communicate()
 
 
-def test_a_line_a_second_and_the_files(tmp_path: Path) -> None:
-    endpoint, tum, log = free_endpoint(), tmp_path / "path.txt", tmp_path / "heard.mcap"
+def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
+    endpoint, tum, log = free_endpoint(), tmp_path / "path.txt", tmp_path / "received.mcap"
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
-        bus.tell("rig", "name = 'rig'")
+        bus.serve("rig", "name = 'rig'")
         with listening("--robot", "rover", "--connect", endpoint, "--seconds", 2.2, "--tum", tum, "--mcap", log) as it:
-            out, err = say_until_it_ends(bus, it)
+            out, err = publish_until_it_ends(bus, it)
     assert it.returncode == 0 and err == ""
     lines = out.splitlines()
-    assert 2 <= len(lines) <= 3 and all(said.startswith("rover: tracking  x +0.500 y +0.250") for said in lines)
-    assert "missed " in lines[-1] and "way " in lines[-1] and "\x1b" not in out
+    assert 2 <= len(lines) <= 3 and all(text.startswith("rover: tracking  x +0.500 y +0.250") for text in lines)
+    assert "missed " in lines[-1] and "network " in lines[-1] and "\x1b" not in out
     assert len(rows(tum)) > 20 and np.allclose(read_tum(tum).T[:, 0, 3], 0.5)
     with AnyReader([log]) as reader:
         kinds = {connection.topic: connection.msgtype for connection in reader.connections}
@@ -82,14 +82,14 @@ def test_a_line_a_second_and_the_files(tmp_path: Path) -> None:
     assert b"name = 'rig'" in log.read_bytes()
 
 
-def test_it_waits_for_a_robot_that_is_not_there_and_ends_with_ctrl_c() -> None:
+def test_waits_for_the_robot_and_ends_with_ctrl_c() -> None:
     endpoint = free_endpoint()
     with listening("--connect", endpoint) as it:
         assert it.stderr is not None and endpoint in it.stderr.readline()
         with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
             deadline_s = time.monotonic() + DEADLINE_S
             for number in count():
-                say(bus, number)
+                publish(bus, number)
                 time.sleep(0.01)
                 if number == 150:
                     it.send_signal(signal.SIGINT)
@@ -100,37 +100,37 @@ def test_it_waits_for_a_robot_that_is_not_there_and_ends_with_ctrl_c() -> None:
     assert it.returncode == 0 and "tracking" in out.splitlines()[-1] and err == ""
 
 
-def test_a_robot_that_says_nothing_is_told_by_the_exit_code() -> None:
+def test_exit_code_is_1_without_a_pose() -> None:
     endpoint = free_endpoint()
-    silent = contextlib.closing(Bus(BusConfig(listen=(endpoint,))))
-    with silent, listening("--connect", endpoint, "--seconds", 0.5) as it:
+    idle = contextlib.closing(Bus(BusConfig(listen=(endpoint,))))
+    with idle, listening("--connect", endpoint, "--seconds", 0.5) as it:
         out, _ = it.communicate(timeout=DEADLINE_S)
     assert it.returncode == 1 and out == "omnid: no pose yet\n"
 
 
-@pytest.mark.parametrize(("words", "told"), [
+@pytest.mark.parametrize(("words", "expected"), [
     (("--seconds", "-1"), "--seconds"),
     (("--connect", "nonsense"), "bus.connect"),
     (("--tum", "/nowhere/x"), "--tum"),
     (("--robot", "a b"), "bus.robot"),
 ])
-def test_wrong_words_are_refused(words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert told in Command(capsys).refused("listen", *words)
+def test_refuses_invalid_options(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert expected in Command(capsys).refused("listen", *words)
 
 
-def heard(*numbers: int) -> RobotState:
-    found = RobotState()
+def received(*numbers: int) -> RobotState:
+    state = RobotState()
     for number in numbers:
-        note = note_bytes(Note(number, "tracking", 0, 50, 60, time.time_ns()))
-        found.take(ReceivedMessage(time.time_ns(), "odom", odometry_at(number), note))
-    return found
+        attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
+        state.process(ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment))
+    return state
 
 
-def test_what_was_left_out_is_counted_and_a_new_start_is_none() -> None:
-    assert heard(1, 2, 5, 6).missed == 2
-    assert heard(5, 6, 1, 2).missed == 0
-    broken = heard(1)
-    assert broken.take(ReceivedMessage(1, "odom", b"nonsense", b"")) is None and broken.broken == 1
+def test_counts_missed_poses_but_not_those_of_a_restart() -> None:
+    assert received(1, 2, 5, 6).missed == 2
+    assert received(5, 6, 1, 2).missed == 0
+    broken = received(1)
+    assert broken.process(ReceivedMessage(1, "odom", b"nonsense", b"")) is None and broken.broken == 1
 
 
 class Terminal(io.StringIO):
@@ -138,15 +138,15 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_gets_a_table_that_nobody_can_talk_through() -> None:
-    found = heard(1, 2)
+def test_the_table_holds_no_control_characters_of_messages() -> None:
+    state = received(1, 2)
     evil = [
         DiagnosticStatus("omnid: wheels", 2, "\x1b[2J\nhello", {"sent": "4"}),
         DiagnosticStatus("omnid: bus", 0, "", {}),
     ]
-    found.take(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
+    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
     terminal = Terminal()
-    Screen("omnid", terminal).show(found)
+    Screen("omnid", terminal).show(state)
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
     assert len(shown.splitlines()) == 4 and "1 sigma 1.0 mm" in shown
@@ -155,9 +155,9 @@ def test_a_terminal_gets_a_table_that_nobody_can_talk_through() -> None:
     ]
 
 
-def test_a_mailbox_forgets_the_oldest() -> None:
-    box = Inbox()
+def test_the_inbox_drops_the_oldest_when_full() -> None:
+    inbox = Inbox()
     for number in range(2010):
-        box.take(str(number), b"", b"")
-    first = box.next(0.0)
-    assert box.forgotten == 10 and first is not None and first.topic == "10"
+        inbox.put(str(number), b"", b"")
+    first = inbox.get(0.0)
+    assert inbox.dropped == 10 and first is not None and first.topic == "10"

@@ -21,8 +21,8 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Clouds, Encoder
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.decode import pose_from
-from omnid.transport.features_attachment import MOST, features_bytes, features_from_bytes
+from omnid.transport.decode import decode_pose
+from omnid.transport.features_attachment import MOST, features_from_bytes, features_to_bytes
 from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 
 OFFSET_NS = 10**18
@@ -40,12 +40,12 @@ def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
         sink = BusSink(bus, Encoder(np.eye(4), Clouds(10), OFFSET_NS))
-        robot.each(lambda topic, payload, note: came.update({topic: (payload, note)}))
+        robot.on_message(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
-    pose = pose_from(*came["odom"])
+    pose = decode_pose(*came["odom"])
     assert pose.stamp_ns == OFFSET_NS + 2 * 10**9 and pose.x_m == 1.0
-    note = pose.note
-    assert (note.seq, note.state, note.resets, note.inliers, note.tracks) == (2, "degraded", 3, 5, 9)
+    note = pose.attachment
+    assert (note.seq, note.state, note.resets, note.inliers, note.tracked) == (2, "degraded", 3, 5, 9)
     assert 0 <= time.time_ns() - note.sent_ns < 60 * 10**9
     tf = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(came["tf"][0], "tf2_msgs/msg/TFMessage")
     frames = [(edge.header.frame_id, edge.child_frame_id) for edge in cast("Any", tf).transforms]
@@ -55,7 +55,7 @@ def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
 def test_panoramas_are_sent_as_often_as_wanted() -> None:
     endpoint, came = free_endpoint(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        robot.each(lambda topic, payload, note: came.append((payload, note)))
+        robot.on_message(lambda topic, payload, note: came.append((payload, note)))
         wait_until(lambda: PanoramaSink(bus, 0.5, OFFSET_NS).process(odometry(0)) is None and bool(came))
         time.sleep(0.2)
         came.clear()
@@ -67,21 +67,21 @@ def test_panoramas_are_sent_as_often_as_wanted() -> None:
                                                                              "sensor_msgs/msg/CompressedImage"))
                 for payload, _ in came]
     pixels = {kind: found.tolist() for kind, found in features_from_bytes(came[0][1]).items()}
-    assert pixels == {"agreeing": [[3, 5], [7, 9]], "rejected": [[1, 2]], "new": []}
+    assert pixels == {"inliers": [[3, 5], [7, 9]], "rejected": [[1, 2]], "new": []}
     assert [message.header.stamp.sec for message in messages] == [10**9, 10**9 + 2, 10**9 + 4, 10**9 + 6]
     shown = cv2.imdecode(messages[0].data, cv2.IMREAD_GRAYSCALE)
     assert shown.shape == (64, 128) and np.abs(shown.astype(int) - IMAGE[:, 16:-16]).max() < 20
 
 
-@pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"agreeing":3,"rejected":[],"new":[]}',
-                                  b'{"agreeing":[[1]],"rejected":[],"new":[]}', bytes(1 << 18)])
+@pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"inliers":3,"rejected":[],"new":[]}',
+                                  b'{"inliers":[[1]],"rejected":[],"new":[]}', bytes(1 << 18)])
 def test_features_are_some_or_are_refused(data: bytes) -> None:
-    with pytest.raises(OmnidError, match="beside a panorama"):
+    with pytest.raises(OmnidError, match="attached to a panorama"):
         features_from_bytes(data)
 
 
 def test_features_are_bounded_and_somewhere() -> None:
     many = np.zeros((3 * MOST, 2))
-    assert len(features_from_bytes(features_bytes({"agreeing": many, "rejected": many, "new": many}))["new"]) == MOST
-    wild = b'{"agreeing":[[NaN,1],[1e300,2],[3,4]],"rejected":[],"new":[]}'
-    assert features_from_bytes(wild)["agreeing"].tolist() == [[3.0, 4.0]]
+    assert len(features_from_bytes(features_to_bytes({"inliers": many, "rejected": many, "new": many}))["new"]) == MOST
+    wild = b'{"inliers":[[NaN,1],[1e300,2],[3,4]],"rejected":[],"new":[]}'
+    assert features_from_bytes(wild)["inliers"].tolist() == [[3.0, 4.0]]

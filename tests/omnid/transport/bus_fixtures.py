@@ -1,4 +1,4 @@
-"""Parts of the tests of the bus: places to listen on, messages, a router and subscribers that know nothing of omnid."""
+"""Fixtures for tests of the bus: free endpoints, messages, a router and subscribers that do not import omnid."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def free_endpoint(protocol: str = "tcp") -> str:
 
 
 def odometry(i: int) -> bytes:
-    """A pose of its own for each i; i is in the stamp's nanoseconds."""
+    """Encode a different pose for each i, with i in the nanoseconds of its stamp."""
     T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1 * i]), [0.25 * i, -1.0, 0.0])
     return codec.odometry_cdr(10**9 + i, T, np.eye(6) * i, np.arange(6.0), np.eye(6))
 
 
 @contextlib.contextmanager
 def script(text: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python program in a process of its own, once it says that it is ready."""
+    """Run a Python program in another process; yield when it has printed that it is ready."""
     with subprocess.Popen([sys.executable, "-c", text, *arguments], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
@@ -67,14 +67,14 @@ def script(text: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def numbers(path: Path) -> list[int]:
-    """What a subscriber has written there, so far."""
+    """Return the numbers that a subscriber has written so far."""
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     return [int(line) for line in lines if line.endswith("\n")]
 
 
-def wait_until(happens: Callable[[], bool], pause_s: float = 0.02) -> None:
-    """Until it has happened; fails after long."""
+def wait_until(condition: Callable[[], bool], pause_s: float = 0.02) -> None:
+    """Wait for a condition; fail after DEADLINE_S."""
     deadline_s = time.monotonic() + DEADLINE_S
-    while not happens():
-        assert time.monotonic() < deadline_s, "it did not happen"
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not within {DEADLINE_S:g} s"
         time.sleep(pause_s)

@@ -1,4 +1,4 @@
-"""Who gets in and who is obeyed: certificates made with openssl, users with passwords, real sessions."""
+"""Permissions on the bus: certificates made with openssl, users with passwords, real sessions."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def certificate(folder: Path, name: str, signer: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys and certificates: of the robot, a driver and a guest, and of a stranger whom somebody else vouches for."""
-    folder = tmp_path_factory.mktemp("papers")
+def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys and certificates of the robot, a driver and a guest, and of a stranger with another authority."""
+    folder = tmp_path_factory.mktemp("credentials")
     for name in ("ca", "other"):
         authority(folder, name)
     for name, signer in (("robot", "ca"), ("driver", "ca"), ("guest", "ca"), ("stranger", "other")):
@@ -50,100 +50,100 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def robot(papers: Path, **more: object) -> BusConfig:
-    own = {"tls_ca": papers / "ca.pem", "tls_listen_key": papers / "robot.key",
-           "tls_listen_certificate": papers / "robot.pem"}
+def robot(credentials: Path, **more: object) -> BusConfig:
+    own = {"tls_ca": credentials / "ca.pem", "tls_listen_key": credentials / "robot.key",
+           "tls_listen_certificate": credentials / "robot.pem"}
     return BusConfig(listen=(free_endpoint("tls"),), tls_mutual=True, **{k: str(v) for k, v in own.items()}, **more)
 
 
-def visitor(papers: Path, endpoint: str, name: str | None) -> BusConfig:
-    own = {} if name is None else {"tls_connect_key": str(papers / f"{name}.key"),
-                                   "tls_connect_certificate": str(papers / f"{name}.pem")}
-    return BusConfig(connect=(endpoint,), tls_ca=str(papers / "ca.pem"), **own)
+def visitor(credentials: Path, endpoint: str, name: str | None) -> BusConfig:
+    own = {} if name is None else {"tls_connect_key": str(credentials / f"{name}.key"),
+                                   "tls_connect_certificate": str(credentials / f"{name}.pem")}
+    return BusConfig(connect=(endpoint,), tls_ca=str(credentials / "ca.pem"), **own)
 
 
 @needs_openssl
 @pytest.mark.parametrize("name", ["stranger", None], ids=["wrong certificate", "no certificate"])
-def test_without_a_certificate_that_counts_nobody_gets_in(papers: Path, name: str | None) -> None:
-    config = robot(papers)
+def test_refuses_connections_without_a_valid_certificate(credentials: Path, name: str | None) -> None:
+    config = robot(credentials)
     with contextlib.closing(Bus(config)) as bus:
         bus.publish("odom", odometry(1))
-        with Robot(settings=visitor(papers, config.listen[0], "guest")) as guest:
+        with Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest:
             assert guest.alive
-        with pytest.raises(Unreachable), Robot(settings=visitor(papers, config.listen[0], name)) as intruder:
+        with pytest.raises(Unreachable), Robot(settings=visitor(credentials, config.listen[0], name)) as intruder:
             assert not intruder.alive  # a client of TLS 1.3 may learn of it a moment later only
-            raise Unreachable("let in, but hears nothing")
+            raise Unreachable("connected, but receives nothing")
 
 
 @contextlib.contextmanager
 def commands_to(config: BusConfig) -> Iterator[list[str]]:
-    heard: list[str] = []
+    received: list[str] = []
     with contextlib.closing(Bus(config)) as bus:
-        bus.hear(lambda key, _: heard.append(key))
-        yield heard
+        bus.subscribe_commands(lambda key, _: received.append(key))
+        yield received
 
 
 @needs_openssl
-def test_only_whom_the_rules_name_is_obeyed(papers: Path) -> None:
-    config = robot(papers, command_names=("driver",))
-    with (commands_to(config) as heard, Robot(settings=visitor(papers, config.listen[0], "guest")) as guest,
-          Robot(settings=visitor(papers, config.listen[0], "driver")) as driver):
-        refused, obeyed = guest.driver(), driver.driver()
+def test_accepts_commands_of_named_certificates_only(credentials: Path) -> None:
+    config = robot(credentials, command_names=("driver",))
+    with (commands_to(config) as received, Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest,
+          Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver):
+        refused, accepted = guest.driver(), driver.driver()
         for _ in range(5):
             refused.stop()
-        wait_until(lambda: obeyed.stop() is None and bool(heard))
+        wait_until(lambda: accepted.stop() is None and bool(received))
         time.sleep(0.2)
-        count = len(heard)
+        count = len(received)
         refused.twist(1.0, 0.0)
         time.sleep(0.2)
-        assert set(heard) == {"cmd/stop"} and len(heard) == count
-        assert guest.alive, "whoever may not drive may still listen"
+        assert set(received) == {"cmd/stop"} and len(received) == count
+        assert guest.alive, "a client without the permission to drive can still subscribe"
 
 
-def test_users_need_their_password_and_the_right_to_drive(tmp_path: Path) -> None:
+def test_users_need_their_password_and_the_permission_to_drive(tmp_path: Path) -> None:
     (tmp_path / "users").write_text("ada:countess\nbob:builder\n")
     for name, password in (("ada", "countess"), ("bob", "builder"), ("eve", "builder")):
         (tmp_path / name).write_text(f"{password}\n")
     endpoint = free_endpoint()
     config = BusConfig(listen=(endpoint,), users_file=str(tmp_path / "users"), command_users=("ada",))
 
-    def called(name: str) -> Robot:
+    def connected(name: str) -> Robot:
         return Robot(settings=BusConfig(connect=(endpoint,), user=name, password_file=str(tmp_path / name)))
 
-    with commands_to(config) as heard, called("ada") as ada, called("bob") as bob:
+    with commands_to(config) as received, connected("ada") as ada, connected("bob") as bob:
         drivers = bob.driver(), ada.driver()
-        wait_until(lambda: not any(driver.twist(0.1, 0.0) for driver in drivers) and len(heard) >= 3)
+        wait_until(lambda: not any(driver.twist(0.1, 0.0) for driver in drivers) and len(received) >= 3)
         time.sleep(0.2)
-        count = len(heard)
+        count = len(received)
         for _ in range(5):
             drivers[0].stop()
         time.sleep(0.3)
-        assert len(heard) == count
+        assert len(received) == count
         with pytest.raises(Unreachable):
-            called("eve")
+            connected("eve")
         with pytest.raises(Unreachable):
             Robot(connect=(endpoint,))
 
 
-def test_nobody_speaks_for_the_robot() -> None:
-    """A pose that another sends to the robot under its name goes no further."""
+def test_drops_messages_that_others_publish_under_the_robots_name() -> None:
+    """A forged pose that is sent to the robot is not forwarded to its subscribers."""
     config = BusConfig(listen=(free_endpoint(),))
     with contextlib.closing(Bus(config)) as bus, Robot(connect=config.listen) as listener:
-        heard: list[bytes] = []
-        listener.each(lambda topic, payload, _: heard.append(payload))
+        received: list[bytes] = []
+        listener.on_message(lambda topic, payload, _: received.append(payload))
         with plain_client(config.listen[0]) as forger:
-            def forge_and_speak() -> bool:
+            def forge_and_publish() -> bool:
                 forger.put("omnid/odom", b"forged")
                 bus.publish("odom", odometry(1))
-                return len(heard) > 5
-            wait_until(forge_and_speak)
-    assert set(heard) == {odometry(1)}
+                return len(received) > 5
+            wait_until(forge_and_publish)
+    assert set(received) == {odometry(1)}
 
 
-def test_unknown_commands_are_handed_on_to_be_counted() -> None:
+def test_passes_unknown_commands_on_to_be_counted() -> None:
     config = BusConfig(listen=(free_endpoint(),))
-    with commands_to(config) as heard, plain_client(config.listen[0]) as sender:
-        wait_until(lambda: sender.put("omnid/cmd/dance", b"") is None and "cmd/dance" in heard)
+    with commands_to(config) as received, plain_client(config.listen[0]) as sender:
+        wait_until(lambda: sender.put("omnid/cmd/dance", b"") is None and "cmd/dance" in received)
 
 
 def plain_client(endpoint: str) -> zenoh.Session:

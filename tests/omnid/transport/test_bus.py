@@ -20,9 +20,9 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK, WARN
-from omnid.transport.pose_attachment import Note, note_bytes
+from omnid.transport.pose_attachment import PoseAttachment
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
-from tests.omnid.transport.bus_fixtures import SUBSCRIBER as LISTENER
+from tests.omnid.transport.bus_fixtures import SUBSCRIBER as STAMP_SUBSCRIBER
 
 SUBSCRIBER = """
 import json, sys, zenoh
@@ -52,7 +52,7 @@ def subscriber(endpoint: str, key: str, count: int) -> Iterator[subprocess.Popen
 
 
 def publish_until_done(bus: Bus, key: str, process: subprocess.Popen[str]) -> list[str]:
-    """The subscriber's lines; its subscription takes a moment to arrive here, so messages go on until it has enough."""
+    """Publish until the subscriber, whose subscription takes a moment to arrive, has all messages; return its lines."""
     deadline = time.monotonic() + DEADLINE_S
     for i in range(10_000):
         bus.publish(key, odometry(i))
@@ -78,7 +78,7 @@ def test_another_process_reads_the_same_odometry() -> None:
 
 
 def listening() -> set[str]:
-    """Sockets this process listens on or has bound, as `address:port` in the kernel's hex."""
+    """Return the sockets that this process listens on or has bound, as `address:port` in the kernel's hex."""
     inodes = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
     rows = [line.split() for table in ("tcp", "tcp6", "udp", "udp6") for line in _table(table)]
     return {row[1] for row in rows if f"socket:[{row[9]}]" in inodes and row[3] in ("0A", "07")}
@@ -90,7 +90,7 @@ def _table(name: str) -> list[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux's /proc")
-def test_nothing_but_the_given_endpoint_is_open() -> None:
+def test_opens_the_given_endpoint_only() -> None:
     before, endpoint = listening(), free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))):
         assert listening() - before == {f"0100007F:{int(endpoint.rsplit(':')[-1]):04X}"}
@@ -102,7 +102,7 @@ def test_default_is_this_machine_only() -> None:
     assert (BusConfig().listen, BusConfig().connect) == (("tcp/127.0.0.1:7447",), ())
 
 
-def test_missing_router_does_not_matter() -> None:
+def test_a_peer_publishes_without_its_router() -> None:
     with contextlib.closing(Bus(BusConfig(listen=(free_endpoint(),), connect=(free_endpoint(),)))) as bus:
         bus.publish("odom", odometry(1))
 
@@ -113,15 +113,15 @@ config = zenoh.Config()
 config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
 config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
-    heard = session.declare_subscriber("omnid/**", lambda sample: None)
+    received = session.declare_subscriber("omnid/**", lambda sample: None)
     print("ready", flush=True)
     time.sleep(100)
 """
 
 
 @pytest.mark.slow
-def test_a_listener_that_hangs_does_not_fail_the_end() -> None:
-    """Its process is stopped in the middle of a run: zenoh waits 10 s for it at the end, then gives up."""
+def test_closes_although_a_subscriber_is_stopped() -> None:
+    """The subscriber's process is stopped in the middle of a run: zenoh waits 10 s for it at the end, then gives up."""
     endpoint = free_endpoint()
     with subprocess.Popen([sys.executable, "-c", PEER, endpoint], stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -140,72 +140,72 @@ def test_a_listener_that_hangs_does_not_fail_the_end() -> None:
             process.kill()
 
 
-def test_a_router_that_is_killed_costs_those_nothing_who_listen_directly(tmp_path: Path) -> None:
-    """And those behind it hear again once another has taken its place."""
+def test_direct_subscribers_lose_nothing_when_a_router_is_killed(tmp_path: Path) -> None:
+    """Subscribers behind the router receive again once another has taken its place."""
     here, there = free_endpoint(), free_endpoint()
     direct, behind = tmp_path / "direct", tmp_path / "behind"
-    said = count()
-    with contextlib.ExitStack() as ends:
-        router = ends.enter_context(script(ROUTER, there))
-        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,), retry_s=0.5))))
-        ends.enter_context(script(LISTENER, here, "omnid/odom", str(direct)))
-        ends.enter_context(script(LISTENER, there, "omnid/odom", str(behind)))
+    sequence = count()
+    with contextlib.ExitStack() as stack:
+        router = stack.enter_context(script(ROUTER, there))
+        bus = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,), retry_s=0.5))))
+        stack.enter_context(script(STAMP_SUBSCRIBER, here, "omnid/odom", str(direct)))
+        stack.enter_context(script(STAMP_SUBSCRIBER, there, "omnid/odom", str(behind)))
 
-        def say() -> int:
-            number = next(said)
+        def publish() -> int:
+            number = next(sequence)
             bus.publish("odom", odometry(number))
             return number
 
-        wait_until(lambda: say() >= 0 and bool(numbers(direct) and numbers(behind)))
+        wait_until(lambda: publish() >= 0 and bool(numbers(direct) and numbers(behind)))
         router.kill()
         router.wait()
-        last = [say() for _ in range(100) if time.sleep(0.005) is None][-1]
-        ends.enter_context(script(ROUTER, there))
-        wait_until(lambda: say() >= 0 and numbers(behind)[-1] > last)
+        last = [publish() for _ in range(100) if time.sleep(0.005) is None][-1]
+        stack.enter_context(script(ROUTER, there))
+        wait_until(lambda: publish() >= 0 and numbers(behind)[-1] > last)
         wait_until(lambda: numbers(direct)[-1] >= last)
-        heard = numbers(direct)
-    assert heard == list(range(heard[0], heard[0] + len(heard)))
+        received = numbers(direct)
+    assert received == list(range(received[0], received[0] + len(received)))
     assert max(np.diff(numbers(behind))) > 50, "the router was away"
 
 
 def test_a_client_waits_for_its_router() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(mode="client", listen=(), connect=(endpoint,)))) as bus:
-        heard: list[str] = []
-        bus.hear(lambda key, _: heard.append(key))
-        bus.tell("config", "robot = 1")
-        bus.join()
+        received: list[str] = []
+        bus.subscribe_commands(lambda key, _: received.append(key))
+        bus.serve("config", "robot = 1")
+        bus.connect()
         bus.publish("odom", odometry(1))
         assert bus.status().level == WARN and bus.status().values["lost"] == "1"
         assert bus.status().message == f"no router yet at {endpoint}"
         with script(ROUTER, endpoint):
-            wait_until(lambda: bus.join() is None and bus.publish("odom", odometry(2)) is None and bus.lost < 20
+            wait_until(lambda: bus.connect() is None and bus.publish("odom", odometry(2)) is None and bus.lost < 20
                        and bus._session is not None)
             with Robot(connect=(endpoint,)) as robot:
-                assert robot.ask("config") == "robot = 1"
+                assert robot.query("config") == "robot = 1"
                 driver = robot.driver()
-                wait_until(lambda: driver.stop() is None and "cmd/stop" in heard)
+                wait_until(lambda: driver.stop() is None and "cmd/stop" in received)
                 pose = robot.subscribe(Pose).newest()
                 assert pose is not None and pose.stamp_ns == 10**9 + 2
             assert (bus.status().level, bus.status().message) == (OK, "open")
 
 
-def test_who_comes_late_is_told_the_newest_at_once() -> None:
+def test_late_subscribers_receive_the_newest_message_at_once() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         for i in range(3):
-            bus.publish("odom", odometry(i), note_bytes(Note(i, "degraded", 4)))
-        bus.tell("rig", "name = 'rig'")
+            bus.publish("odom", odometry(i), PoseAttachment(i, "degraded", 4).to_bytes())
+        bus.serve("rig", "name = 'rig'")
         with subscribe(connect=(endpoint,)) as poses, Robot(connect=(endpoint,)) as robot:
             pose = poses.newest()
             assert pose is not None and pose.stamp_ns == 10**9 + 2
-            assert (pose.state, pose.note.seq, pose.note.resets) == ("degraded", 2, 4)
-            assert robot.ask("rig") == "name = 'rig'" and robot.ask("nothing") == "" and robot.alive
+            assert (pose.state, pose.attachment.seq, pose.attachment.resets) == ("degraded", 2, 4)
+            assert robot.query("rig") == "name = 'rig'" and robot.query("nothing") == "" and robot.alive
     with pytest.raises(Unreachable):
         Robot(connect=(endpoint,))
 
 
-def test_second_instance_is_told_which_knob() -> None:
+def test_a_second_instance_is_refused_with_the_knob_to_change() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), pytest.raises(OmnidError) as caught:
         Bus(BusConfig(listen=(endpoint,)))
@@ -221,14 +221,14 @@ def test_robot_name_must_be_plain(robot: str) -> None:
 
 
 @pytest.mark.parametrize("endpoint", ["", "nonsense", "127.0.0.1:7447", "tcp/127.0.0.1", "foo/127.0.0.1:1"])
-def test_endpoints_must_be_endpoints(endpoint: str) -> None:
+def test_endpoints_must_have_protocol_and_port(endpoint: str) -> None:
     with pytest.raises(OmnidError, match=r"bus\.listen"):
         Bus(BusConfig(listen=(endpoint,)))
     with pytest.raises(OmnidError, match=r"bus\.connect"):
         Bus(BusConfig(listen=(), connect=(endpoint,)))
 
 
-def test_keys_must_be_plain_and_the_bus_open() -> None:
+def test_publish_refuses_unknown_topics_and_a_closed_bus() -> None:
     bus = Bus(BusConfig(listen=()))
     with pytest.raises(OmnidError, match="key"):
         bus.publish("a/*", b"")

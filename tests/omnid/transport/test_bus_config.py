@@ -1,4 +1,4 @@
-"""The knobs of the bus: what cannot work is told before anything is opened, in one line that names the knob."""
+"""Settings of the bus: errors are reported before a session is opened, in one line that names the knob."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_missing_file_is_named(knob: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("knob", ["config", "tls_ca", "users_file"])
-def test_a_file_of_anything_is_told(knob: str, tmp_path: Path) -> None:
+def test_a_binary_file_is_refused(knob: str, tmp_path: Path) -> None:
     path = tmp_path / "binary"
     path.write_bytes(bytes(range(256)))
     assert f"bus.{knob}" in refused(**{knob: str(path)})
@@ -49,7 +49,7 @@ def test_a_key_must_be_pem_and_users_have_passwords(tmp_path: Path) -> None:
     ({"command_names": ("driver",)}, "bus.tls_mutual"),
     ({"command_users": ("ada",)}, "bus.users_file"),
 ])
-def test_what_one_knob_needs_of_another_is_asked_for(knobs: dict[str, Any], other: str) -> None:
+def test_a_missing_knob_is_named(knobs: dict[str, Any], other: str) -> None:
     assert other in refused(**knobs)
 
 
@@ -57,13 +57,13 @@ def setting(config: BusConfig, key: str) -> Any:
     return json.loads(zenoh_config(config).get_json(key))
 
 
-def test_without_a_word_nobody_beyond_this_machine_is_heard_or_told() -> None:
+def test_default_is_local_without_multicast_and_denies_writing() -> None:
     assert setting(BusConfig(), "listen/endpoints") == ["tcp/127.0.0.1:7447"]
     assert setting(BusConfig(), "scouting/multicast/enabled") is False
     assert setting(BusConfig(), "access_control")["default_permission"] == "deny"
 
 
-def test_zenoh_s_own_file_comes_first_and_what_is_set_here_goes_over_it(tmp_path: Path) -> None:
+def test_settings_override_zenohs_own_file(tmp_path: Path) -> None:
     path = tmp_path / "zenoh.json5"
     path.write_text("""{ // as zenohd reads it
         listen: {endpoints: ["tcp/127.0.0.1:1"]}, connect: {endpoints: ["tcp/127.0.0.1:2"]},
@@ -75,7 +75,7 @@ def test_zenoh_s_own_file_comes_first_and_what_is_set_here_goes_over_it(tmp_path
     assert setting(config, "scouting/multicast/enabled") is False
 
 
-def test_a_file_that_zenoh_cannot_read_is_told_in_one_line(tmp_path: Path) -> None:
+def test_an_invalid_zenoh_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "zenoh.json5"
     path.write_text("{ mode: 'emperor' }")
     with pytest.raises(OmnidError, match=r"bus\.config") as caught:

@@ -1,4 +1,4 @@
-"""The CDR messages, read back with rosbags and byte by byte."""
+"""CDR messages, decoded with rosbags and compared byte by byte."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def odometry() -> bytes:
     return codec.odometry_cdr(STAMP_NS, T_ODOM_BASE, COVARIANCE, VELOCITY, 2.0 * COVARIANCE)
 
 
-def test_odometry_comes_back() -> None:
+def test_odometry_round_trip() -> None:
     record = codec.odometry_from_cdr(odometry())
     assert record.stamp_ns == STAMP_NS
     assert record.frames == ("odom", "base_link")
@@ -58,14 +58,14 @@ def test_odometry_frames_can_be_named() -> None:
     assert codec.odometry_from_cdr(payload).frames == ("map", "rig")
 
 
-def test_decoder_survives_any_bytes() -> None:
+def test_decoder_raises_no_other_error_for_any_bytes() -> None:
     rng = random.Random(1)
     good = odometry()
     for _ in range(4000):
-        spoiled = bytearray(good)
+        damaged = bytearray(good)
         for _ in range(rng.randint(1, 6)):
-            spoiled[rng.randrange(len(spoiled))] = rng.randrange(256)
-        payload = bytes(spoiled[: rng.randint(0, len(spoiled))]) if rng.random() < 0.5 else bytes(spoiled)
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        payload = bytes(damaged[: rng.randint(0, len(damaged))]) if rng.random() < 0.5 else bytes(damaged)
         expect_record_or_refusal(payload)
     for _ in range(2000):
         expect_record_or_refusal(b"\x00\x01\x00\x00" + rng.randbytes(rng.randint(0, 900)))
@@ -88,7 +88,7 @@ def test_decoder_refuses(payload: bytes) -> None:
 
 @pytest.mark.parametrize(("offset", "value"), [(4, struct.pack("<i", -1)), (8, struct.pack("<I", 10**9)),
                                                (68, bytes(32)), (92, struct.pack("<d", 3.0))])  # fmt: skip
-def test_decoder_refuses_odd_times_and_rotations(offset: int, value: bytes) -> None:
+def test_decoder_refuses_invalid_stamps_and_rotations(offset: int, value: bytes) -> None:
     payload = bytearray(odometry())
     payload[offset : offset + len(value)] = value
     with pytest.raises(OmnidError, match=r"stamp|quaternion"):
@@ -98,7 +98,7 @@ def test_decoder_refuses_odd_times_and_rotations(offset: int, value: bytes) -> N
 def test_decoder_refuses_a_pose_that_is_not_finite() -> None:
     T = T_ODOM_BASE.copy()
     T[0, 3] = np.nan
-    with pytest.raises(OmnidError, match="not finite"):
+    with pytest.raises(OmnidError, match="expected finite"):
         codec.odometry_from_cdr(codec.odometry_cdr(STAMP_NS, T, COVARIANCE, VELOCITY, COVARIANCE))
 
 
@@ -145,8 +145,8 @@ def test_point_cloud() -> None:
     np.testing.assert_array_equal(rows, np.column_stack([points, confidence]))
 
 
-def test_a_point_cloud_is_moved_into_its_frame_and_takes_little_more_than_it_gives() -> None:
-    """The map's cloud goes out every two seconds and grows for hours; what it takes in passing stays with the process.
+def test_a_point_cloud_is_transformed_with_little_extra_memory() -> None:
+    """The map's cloud is published every two seconds and grows for hours; memory once taken stays with the process.
     """
     rng = np.random.default_rng(2)
     points, confidence = rng.normal(size=(50_000, 3)).astype(np.float32), rng.random(50_000, np.float32)
@@ -157,7 +157,7 @@ def test_a_point_cloud_is_moved_into_its_frame_and_takes_little_more_than_it_giv
     rows = read(cloud(), codec.POINT_CLOUD_SCHEMA).data.view("<f4").reshape(-1, 4)
     moved = se3.apply(T_ODOM_BASE, points).astype(np.float32)
     np.testing.assert_array_equal(rows, np.column_stack([moved, confidence]))
-    assert taken(cloud).most < 3.5 * len(cloud())  # the points, what rosbags makes of them, and a copy that is bytes
+    assert taken(cloud).most < 3.5 * len(cloud())  # the points, the message of rosbags, and its copy as bytes
 
 
 def test_grid() -> None:
@@ -175,8 +175,8 @@ def test_empty_point_cloud() -> None:
     assert message.width == 0 and len(message.data) == 0
 
 
-def test_point_cloud_needs_a_confidence_a_point() -> None:
-    with pytest.raises(OmnidError, match="3 points but 2"):
+def test_point_cloud_needs_a_confidence_for_each_point() -> None:
+    with pytest.raises(OmnidError, match="2 confidences for 3 points"):
         codec.point_cloud_cdr(STAMP_NS, "rig", np.zeros((3, 3)), np.zeros(2))
 
 

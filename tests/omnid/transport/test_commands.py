@@ -1,4 +1,4 @@
-"""Commands from the network: what is obeyed, and how everything else is refused and counted."""
+"""Commands from the network: valid ones are accepted, all others are refused and counted."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import pytest
 
 from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
-from omnid.transport.commands import LONGEST_PAYLOAD, Commands
+from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
 
 STALE_S = 0.5
 
 
-class Obeyed:
-    """What came through."""
+class AcceptedCommands:
+    """Collects the commands that were accepted."""
 
     def __init__(self) -> None:
         self.setpoints: list[Setpoint] = []
         self.arrivals_ns: list[int] = []
         self.stops = 0
-        self.commands = Commands(self._obey, self._stop, STALE_S)
+        self.receiver = CommandReceiver(self._add, self._stop, STALE_S)
 
-    def _obey(self, setpoint: Setpoint, arrival_ns: int) -> None:
+    def _add(self, setpoint: Setpoint, arrival_ns: int) -> None:
         self.setpoints.append(setpoint)
         self.arrivals_ns.append(arrival_ns)
 
@@ -35,8 +35,8 @@ class Obeyed:
 
 
 @pytest.fixture
-def obeyed() -> Obeyed:
-    return Obeyed()
+def accepted() -> AcceptedCommands:
+    return AcceptedCommands()
 
 
 def now_ns(later_s: float = 0.0) -> int:
@@ -47,74 +47,74 @@ def twist(velocity_mps: float = 0.3, rate_radps: float = -0.2, frame: str = "bas
     return codec.twist_stamped_cdr(now_ns(later_s), frame, velocity_mps, rate_radps)
 
 
-def test_good_commands_are_obeyed(obeyed: Obeyed) -> None:
+def test_valid_commands_are_accepted(accepted: AcceptedCommands) -> None:
     before_ns = time.monotonic_ns()
-    obeyed.commands.take("cmd/twist", twist())
-    obeyed.commands.take("cmd/heading", codec.heading_cdr(now_ns(), 0.4, 1.5))
-    assert obeyed.setpoints == [Setpoint(0.3, None, -0.2), Setpoint(0.4, 1.5)]
-    assert before_ns <= obeyed.arrivals_ns[0] <= obeyed.arrivals_ns[1] <= time.monotonic_ns()
-    assert obeyed.commands.accepted == 2 and obeyed.commands.refused == {}
+    accepted.receiver.receive("cmd/twist", twist())
+    accepted.receiver.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.4, 1.5))
+    assert accepted.setpoints == [Setpoint(0.3, None, -0.2), Setpoint(0.4, 1.5)]
+    assert before_ns <= accepted.arrivals_ns[0] <= accepted.arrivals_ns[1] <= time.monotonic_ns()
+    assert accepted.receiver.accepted == 2 and accepted.receiver.refused == {}
 
 
-def test_a_stop_is_any_payload_at_all(obeyed: Obeyed) -> None:
+def test_a_stop_may_have_any_payload(accepted: AcceptedCommands) -> None:
     for payload in (b"", b"\xff" * 100_000, twist()):
-        obeyed.commands.take("cmd/stop", payload)
-    assert obeyed.stops == obeyed.commands.stops == 3 and obeyed.setpoints == []
+        accepted.receiver.receive("cmd/stop", payload)
+    assert accepted.stops == accepted.receiver.stops == 3 and accepted.setpoints == []
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_refused(obeyed: Obeyed, value: float) -> None:
-    obeyed.commands.take("cmd/twist", twist(velocity_mps=value))
-    obeyed.commands.take("cmd/twist", twist(rate_radps=value))
-    obeyed.commands.take("cmd/heading", codec.heading_cdr(now_ns(), value, 0.0))
-    obeyed.commands.take("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
-    assert obeyed.setpoints == [] and obeyed.commands.refused == {"not finite": 4}
+def test_refuses_numbers_that_are_not_finite(accepted: AcceptedCommands, value: float) -> None:
+    accepted.receiver.receive("cmd/twist", twist(velocity_mps=value))
+    accepted.receiver.receive("cmd/twist", twist(rate_radps=value))
+    accepted.receiver.receive("cmd/heading", codec.heading_cdr(now_ns(), value, 0.0))
+    accepted.receiver.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"not finite": 4}
 
 
 @pytest.mark.parametrize("value", [1e300, -1e9, 1001.0])
-def test_what_is_absurd_is_refused(obeyed: Obeyed, value: float) -> None:
-    obeyed.commands.take("cmd/twist", twist(velocity_mps=value))
-    obeyed.commands.take("cmd/twist", twist(rate_radps=value))
-    obeyed.commands.take("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
-    assert obeyed.setpoints == [] and obeyed.commands.refused == {"out of range": 3}
+def test_refuses_numbers_out_of_range(accepted: AcceptedCommands, value: float) -> None:
+    accepted.receiver.receive("cmd/twist", twist(velocity_mps=value))
+    accepted.receiver.receive("cmd/twist", twist(rate_radps=value))
+    accepted.receiver.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"out of range": 3}
 
 
-def test_another_frame_is_refused_and_none_is_taken_for_ours(obeyed: Obeyed) -> None:
-    obeyed.commands.take("cmd/twist", twist(frame="odom"))
-    obeyed.commands.take("cmd/twist", twist(frame="map" * 100))
-    assert obeyed.setpoints == [] and obeyed.commands.refused == {"another frame": 2}
-    obeyed.commands.take("cmd/twist", twist(frame=""))
-    assert obeyed.commands.accepted == 1
+def test_refuses_other_frames_and_accepts_an_empty_one(accepted: AcceptedCommands) -> None:
+    accepted.receiver.receive("cmd/twist", twist(frame="odom"))
+    accepted.receiver.receive("cmd/twist", twist(frame="map" * 100))
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"wrong frame": 2}
+    accepted.receiver.receive("cmd/twist", twist(frame=""))
+    assert accepted.receiver.accepted == 1
 
 
 @pytest.mark.parametrize("later_s", [-0.6, -30.0, -59.0])
-def test_what_was_sent_long_ago_is_refused(obeyed: Obeyed, later_s: float) -> None:
-    obeyed.commands.take("cmd/twist", twist(later_s=later_s))
-    assert obeyed.setpoints == [] and obeyed.commands.refused == {"sent long ago": 1}
+def test_refuses_commands_that_are_too_old(accepted: AcceptedCommands, later_s: float) -> None:
+    accepted.receiver.receive("cmd/twist", twist(later_s=later_s))
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 1}
 
 
 @pytest.mark.parametrize("later_s", [-0.1, 5.0, -61.0, -1e8, 86400.0])
-def test_the_stamp_of_another_clock_does_not_count(obeyed: Obeyed, later_s: float) -> None:
-    obeyed.commands.take("cmd/twist", twist(later_s=later_s))
-    assert obeyed.commands.accepted == 1
+def test_ignores_the_stamp_of_another_clock(accepted: AcceptedCommands, later_s: float) -> None:
+    accepted.receiver.receive("cmd/twist", twist(later_s=later_s))
+    assert accepted.receiver.accepted == 1
 
 
-def test_senseless_stamps_do_not_count_either(obeyed: Obeyed) -> None:
+def test_ignores_invalid_stamps(accepted: AcceptedCommands) -> None:
     for stamp in (struct.pack("<iI", 0, 0), struct.pack("<iI", -(2**31), 2**32 - 1), b"\xff" * 8):
         payload = bytearray(twist())
         payload[4:12] = stamp
-        obeyed.commands.take("cmd/twist", bytes(payload))
-    assert obeyed.commands.accepted == 3
+        accepted.receiver.receive("cmd/twist", bytes(payload))
+    assert accepted.receiver.accepted == 3
 
 
-def test_what_is_too_long_is_not_even_looked_at(obeyed: Obeyed) -> None:
+def test_refuses_long_payloads_without_decoding_them(accepted: AcceptedCommands) -> None:
     good = twist()
-    obeyed.commands.take("cmd/twist", good + bytes(LONGEST_PAYLOAD + 1 - len(good)))
-    assert obeyed.commands.refused == {"too long": 1}
+    accepted.receiver.receive("cmd/twist", good + bytes(LONGEST_PAYLOAD + 1 - len(good)))
+    assert accepted.receiver.refused == {"too long": 1}
 
 
 def damaged(rng: random.Random, good: bytes) -> bytes:
-    """A payload with something wrong."""
+    """Return a payload with random damage."""
     data = bytearray(good)
     match rng.randrange(5):
         case 0:
@@ -125,28 +125,28 @@ def damaged(rng: random.Random, good: bytes) -> bytes:
             for _ in range(rng.randrange(1, 8)):
                 data[rng.randrange(len(data))] = rng.randrange(256)
         case 3:
-            data[12:16] = struct.pack("<I", rng.randrange(2**32))  # how long the frame's name is
+            data[12:16] = struct.pack("<I", rng.randrange(2**32))  # length of the frame's name
         case _:
             data[-48:] = struct.pack("<6d", *(rng.choice((math.nan, math.inf, 1e308, 1e-320)) for _ in range(6)))
     return bytes(data)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_thousand_malformed_payloads(obeyed: Obeyed, seed: int) -> None:
-    """None raises, each is counted, and what damage has left harmless is finite and in range."""
+def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: int) -> None:
+    """None raises, each is counted, and numbers of payloads that are still valid are finite and in range."""
     rng = random.Random(seed)
     for _ in range(1000):
         key, good = rng.choice((("cmd/twist", twist()), ("cmd/heading", codec.heading_cdr(now_ns(), 0.1, 0.2))))
-        obeyed.commands.take(key, damaged(rng, good))
-    refused = obeyed.commands.refused
-    assert obeyed.commands.accepted + sum(refused.values()) == 1000 and obeyed.commands.accepted < 300
+        accepted.receiver.receive(key, damaged(rng, good))
+    refused = accepted.receiver.refused
+    assert accepted.receiver.accepted + sum(refused.values()) == 1000 and accepted.receiver.accepted < 300
     assert len(refused) <= 5 and refused["malformed"] > 400 and refused["not finite"] > 50
-    for setpoint in obeyed.setpoints:
+    for setpoint in accepted.setpoints:
         assert abs(setpoint.velocity_mps) <= 20 and abs(setpoint.yaw_rate_radps) <= 50
         assert setpoint.heading_rad is None or abs(setpoint.heading_rad) <= 1000
 
 
-def test_the_wrong_type_is_refused(obeyed: Obeyed) -> None:
-    obeyed.commands.take("cmd/twist", codec.heading_cdr(now_ns(), 0.1, 0.2))
-    obeyed.commands.take("cmd/twist", codec.pose_stamped_cdr(now_ns(), np.eye(4)))
-    assert obeyed.setpoints == [] and sum(obeyed.commands.refused.values()) == 2
+def test_refuses_messages_of_another_type(accepted: AcceptedCommands) -> None:
+    accepted.receiver.receive("cmd/twist", codec.heading_cdr(now_ns(), 0.1, 0.2))
+    accepted.receiver.receive("cmd/twist", codec.pose_stamped_cdr(now_ns(), np.eye(4)))
+    assert accepted.setpoints == [] and sum(accepted.receiver.refused.values()) == 2

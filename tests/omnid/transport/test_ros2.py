@@ -1,4 +1,4 @@
-"""What ROS 2 sees of the bus, byte by byte: rmw_zenoh, and zenoh-bridge-ros2dds."""
+"""The bus as ROS 2 sees it, byte by byte: rmw_zenoh and zenoh-bridge-ros2dds."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def test_type_hashes_are_those_of_ros(schema: str) -> None:
     assert ros2.type_hash(schema).startswith(f"RIHS01_{HASHES[schema]}") and len(ros2.type_hash(schema)) == 71
 
 
-def test_the_data_key_is_the_one_that_ros_subscribes() -> None:
+def test_the_data_key_is_the_one_that_ros_subscribes_to() -> None:
     assert ros2.data_key(0, "/omnid/odom", codec.ODOMETRY_SCHEMA) == ODOMETRY_KEY
 
 
-def test_the_attachment_is_what_zenoh_s_own_serializer_makes() -> None:
+def test_the_attachment_equals_that_of_zenohs_serializer() -> None:
     gid = bytes(range(16))
     made = ros2.attachment(7, 1_700_000_000_123_456_789, gid)
     assert len(made) == 33
@@ -66,7 +66,7 @@ def test_the_attachment_is_what_zenoh_s_own_serializer_makes() -> None:
     assert made.hex() == "0700000000000000" + struct.pack("<q", 1_700_000_000_123_456_789).hex() + "10" + gid.hex()
 
 
-def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
+def test_tokens_are_those_of_rmw_zenoh() -> None:
     node = ros2.RmwNode(5, "aac3178e146ba6f1fc6e6a4085e77f21", "robot")
     assert node.token == "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/robot"
     assert node.publisher(3, "/site/robot/odom", codec.ODOMETRY_SCHEMA) == (
@@ -76,7 +76,7 @@ def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
     assert len({ros2.gid_of(node.publisher(i, "/a", codec.ODOMETRY_SCHEMA)) for i in range(3)}) == 3
 
 
-def test_rmw_zenoh_gets_the_same_message_with_its_attachment() -> None:
+def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     endpoint, gids, numbers = free_endpoint(), set(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus, client(endpoint) as session:
         samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.FifoChannel(100))
@@ -89,49 +89,49 @@ def test_rmw_zenoh_gets_the_same_message_with_its_attachment() -> None:
                 assert abs(time.time_ns() - sent_ns) < 60 * 10**9
                 numbers.append(number)
                 gids.add(sample.attachment.to_bytes()[17:])
-        with Robot(connect=(endpoint,)) as robot:  # the plain key stays, for those who know omnid
+        with Robot(connect=(endpoint,)) as robot:  # the plain key remains for omnid's clients
             pose = robot.subscribe(Pose).newest()
-            assert pose is not None and pose.note.seq == 1
+            assert pose is not None and pose.attachment.seq == 1
     assert len(gids) == 1 and numbers == list(range(numbers[0], numbers[0] + 3))
 
 
 def tokens(endpoint: str, pattern: str, expected: int) -> set[str]:
     found: set[str] = set()
     with client(endpoint) as session:
-        def look() -> bool:
+        def complete() -> bool:
             found.update(str(reply.ok.key_expr) for reply in session.liveliness().get(pattern) if reply.ok)
             return len(found) >= expected
-        wait_until(look)
+        wait_until(complete)
     return found
 
 
 def test_all_topics_are_announced_to_rmw_zenoh() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.hear(lambda key, payload: None)
+        bus.subscribe_commands(lambda key, payload: None)
         found = [token.split("/") for token in tokens(endpoint, "@ros2_lv/3/**", len(TOPICS) + 1)]
     announced = {parts[9].replace("%", "/"): (parts[5], parts[10]) for parts in found if parts[5] != "NN"}
     assert announced == {topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema))
                          for topic, schema in TOPICS.items()}
-    assert len({parts[4] for parts in found}) == len(TOPICS) + 1, "each endpoint has a number of its own"
+    assert len({parts[4] for parts in found}) == len(TOPICS) + 1, "entity numbers are unique"
     assert [parts[5:] for parts in found if parts[5] == "NN"] == [["NN", "%", "%", "omnid"]]
 
 
-def test_a_twist_of_ros_reaches_the_robot() -> None:
-    endpoint, heard = free_endpoint(), []
+def test_receives_a_twist_from_ros() -> None:
+    endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.hear(lambda key, payload: heard.append((key, payload)))
+        bus.subscribe_commands(lambda key, payload: received.append((key, payload)))
         with client(endpoint) as session:
             message = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1)
-            wait_until(lambda: session.put(key, message) is None and bool(heard))
-    assert heard[0] == ("cmd/twist", message)
+            wait_until(lambda: session.put(key, message) is None and bool(received))
+    assert received[0] == ("cmd/twist", message)
 
 
-def test_the_bridge_finds_topics_under_their_plain_names() -> None:
+def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="ros2dds"))) as bus, client(endpoint) as session:
-        bus.hear(lambda key, payload: None)
+        bus.subscribe_commands(lambda key, payload: None)
         found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
         odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
         wait_until(lambda: bus.publish("odom", odometry(1)) is None and bus.publish("/tf", b"tf") is None
@@ -141,7 +141,7 @@ def test_the_bridge_finds_topics_under_their_plain_names() -> None:
     assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
 
 
-def test_a_name_that_ros_cannot_take_is_refused() -> None:
+def test_a_name_that_ros_does_not_allow_is_refused() -> None:
     with pytest.raises(OmnidError, match="ROS 2 takes"):
         Bus(BusConfig(robot="robot-1", listen=(), ros2="rmw_zenoh"))
 
@@ -153,7 +153,7 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 host, port = sys.argv[1].removeprefix("tcp/").split(":")
-known = ZenohSession.get_instance(host, int(port)).store  # what it would fetch from GitHub
+known = ZenohSession.get_instance(host, int(port)).store  # definitions that it would download otherwise
 known.register({name: kind for name, kind in get_typestore(Stores.ROS2_HUMBLE).fielddefs.items()
                 if name not in known.fielddefs and "Odometry" not in name})
 def say(message):
@@ -169,7 +169,7 @@ time.sleep(30)
 
 
 def listed(router: str) -> set[str]:
-    """The lines of its list; peers find each other a moment after they have found the router."""
+    """Return the lines of its list; peers discover each other a moment after they have found the router."""
     said = subprocess.run([f"{SDK}/bin/zenoh-ros2", "--no-daemon", "--router", router.removeprefix("tcp/"),
                            "--timeout", "3", "topic", "list", "-t"], capture_output=True, text=True, timeout=60)
     return set(said.stdout.splitlines())
@@ -178,21 +178,21 @@ def listed(router: str) -> set[str]:
 @pytest.mark.skipif(not SDK or shutil.which(f"{SDK}/bin/zenoh-ros2") is None,
                     reason="needs zenoh-ros2-sdk in a virtual environment that OMNID_ZENOH_ROS2 names")
 def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
-    """zenoh-ros2-sdk 0.1.8: its `topic list -t`, and its subscriber."""
+    """zenoh-ros2-sdk 0.1.8: `topic list -t` and a subscriber."""
     endpoint = free_endpoint()
-    with contextlib.ExitStack() as ends:
-        ends.enter_context(script(ROUTER, endpoint))
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(script(ROUTER, endpoint))
         config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh", retry_s=0.5)
-        bus = ends.enter_context(contextlib.closing(Bus(config)))
-        bus.hear(lambda key, payload: None)
+        bus = stack.enter_context(contextlib.closing(Bus(config)))
+        bus.subscribe_commands(lambda key, payload: None)
         wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})
         (tmp_path / "Odometry.msg").write_text("std_msgs/Header header\nstring child_frame_id\n"
                                                "geometry_msgs/PoseWithCovariance pose\n"
                                                "geometry_msgs/TwistWithCovariance twist\n")
         echo = subprocess.Popen([f"{SDK}/bin/python", "-c", ECHO, endpoint, str(tmp_path / "Odometry.msg"),
                                  ros2.type_hash(codec.ODOMETRY_SCHEMA)], stdout=subprocess.PIPE, text=True)
-        ends.callback(echo.wait)
-        ends.callback(echo.kill)
+        stack.callback(echo.wait)
+        stack.callback(echo.kill)
         assert echo.stdout is not None
         while "ready" not in echo.stdout.readline():
             assert echo.poll() is None

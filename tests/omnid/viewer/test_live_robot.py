@@ -25,9 +25,9 @@ from drivers.frame import Frame
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.features_attachment import features_bytes
+from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
-from omnid.transport.pose_attachment import Note, note_bytes
+from omnid.transport.pose_attachment import PoseAttachment
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.omnid.viewer.rrd import need_rerun, positions, rows, verified
 from tests.omnid.viewer.test_view import START_NS, made
@@ -50,14 +50,14 @@ def say(bus: Bus, number: int) -> None:
     stamp_ns, T = START_NS + number * 10**7, se3.transform(np.eye(3), [0.01 * number, 0.5, 0.0])
     pose = codec.odometry_cdr(stamp_ns, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
     bus.publish("odom", pose if number % 7 else b"nonsense",
-                note_bytes(Note(number, "degraded", 0, 50, 60, time.time_ns())))
+                PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     said = [DiagnosticStatus("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, said))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
-    pixels = {"agreeing": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}
+    pixels = {"inliers": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}
     bus.publish("panorama", image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1],
-                features_bytes(pixels) if number % 5 else b"nonsense")
+                features_to_bytes(pixels) if number % 5 else b"nonsense")
 
 
 def test_a_robot_is_drawn_as_it_speaks(tmp_path: Path) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Report
+from omnid.transport.decode import Diagnostics
 from omnid.viewer import status_plots as reports
 
 
-def report(*statuses: DiagnosticStatus) -> Report:
-    return Report(7, statuses)
+def report(*statuses: DiagnosticStatus) -> Diagnostics:
+    return Diagnostics(7, statuses)
 
 
 def test_the_latencies_are_those_of_what_makes_a_pose() -> None:
@@ -37,7 +37,7 @@ def test_state_and_landmarks_are_read_where_they_are_told() -> None:
 
 
 def test_only_what_has_changed_is_told_in_bounded_memory_and_plain_letters() -> None:
-    changes = reports.Changes(most_parts=2)
+    changes = reports.StatusChanges(most_parts=2)
     calm, evil = (
         DiagnosticStatus("omnid: pairing", 0, "in step", {}),
         DiagnosticStatus("omnid: wheels", 2, "\x1b[2Jno", {}),

@@ -109,9 +109,9 @@ def clock_step(place: Place) -> Outcome:
             time.sleep(0.5)
             goes_on(base)
         daemon.tell("clock 30")
-        wait_until(lambda: "refused, sent long ago" in operator.values("wheels"), "the refusals")
+        wait_until(lambda: "refused, too old" in operator.values("wheels"), "the refusals")
         stands(base)
-        said = f"wheels: {operator.message('wheels')}; refused: sent long ago"
+        said = f"wheels: {operator.message('wheels')}; refused: too old"
         daemon.tell("clock 0")
         goes_on(base)
         steps_s = [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairwise(operator.poses)]
@@ -131,9 +131,9 @@ def another_clock(place: Place) -> Outcome:
         for _ in range(20):
             operator.send("cmd/heading", codec.heading_cdr(time.time_ns() - 30 * 10**9, 0.3, 0.0))
             time.sleep(0.02)
-        wait_until(lambda: operator.values("wheels").get("refused, sent long ago") == "20", "the refusals")
+        wait_until(lambda: operator.values("wheels").get("refused, too old") == "20", "the refusals")
         assert not base.drives
-        said.append("-30 s: refused as sent long ago, counted")
+        said.append("-30 s: refused as too old, counted")
         assert daemon.end()[0] == 0
     return Outcome("alive", "turned only where stated", "; ".join(said))
 

@@ -1,0 +1,118 @@
+"""Names of the entries of `<robot>/status` and of their keys; producers and consumers take them from here.
+
+Every number is a value of its own, written as a decimal number. Messages of entries are for people: programs do not
+parse them, and they hold no number that changes from one report to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+PREFIX: Final = "omnid: "
+ODOMETRY: Final = f"{PREFIX}odometry"
+PAIRING: Final = f"{PREFIX}pairing"
+WHEELS: Final = f"{PREFIX}wheels"
+BUS: Final = f"{PREFIX}bus"
+RECORDING: Final = f"{PREFIX}recording"
+RIG: Final = f"{PREFIX}rig"
+SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
+STAGE_PREFIX: Final = f"{PREFIX}stage "
+
+STOPPED_PREFIX: Final = "stopped, "  # begins the keys that count stops of the wheels, by reason
+REFUSED_PREFIX: Final = "refused, "  # begins the keys that count refused commands, by reason
+
+_TIME_SUFFIX: Final = "_ms"
+
+
+class Key(StrEnum):
+    """Keys that several entries have, or that omnid's own programs read."""
+
+    # Odometry. An entry with `state` is published when the state changes and has the stamp of that pose.
+    STATE = "state"
+    RESETS = "resets"
+    INLIERS = "inliers"  # landmarks that agree with the pose
+    TRACKED = "tracked"  # landmarks found in the images
+    LENGTH_M = "length_m"
+    AGE_S = "age_s"  # of the newest pose or image
+    RATE_HZ = "rate_hz"
+    # Stages
+    PROCESSED = "processed"
+    DROPPED = "dropped"  # messages
+    MISSED = "missed"  # deadlines of a ticker
+    # Cameras and pairing
+    DROPS = "drops"
+    ERRORS = "errors"
+    LOSSES = "losses"
+    RESTARTS = "restarts"
+    BROKEN = "broken"
+    UNPAIRED_LOWER = "unpaired_lower"
+    UNPAIRED_UPPER = "unpaired_upper"
+    # Wheels
+    EXPIRIES = "expiries"
+    COMMANDS = "commands"
+    STOPS = "stops"
+
+
+# Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.
+WORK: Final = "work"
+CPU: Final = "cpu"
+CAPTURE_TO_POSE: Final = "capture_to_pose"
+CAPTURE_TO_WHEEL: Final = "capture_to_wheel"
+TICK_LATE: Final = "tick_late"
+
+
+class TimeKey(NamedTuple):
+    """Name and statistic of a measured time."""
+
+    name: str  # such as "work"
+    statistic: str  # p50, p99, max ...
+
+
+def camera_name(camera: str) -> str:
+    """Return the name of a camera's entry."""
+    return f"{PREFIX}{camera} camera"
+
+
+def stage_name(stage: str) -> str:
+    """Return the name of a stage's entry."""
+    return f"{STAGE_PREFIX}{stage}"
+
+
+def short_name(name: str) -> str:
+    """Return the name of an entry without the daemon's."""
+    return name.removeprefix(PREFIX)
+
+
+def time_key(name: str, statistic: str) -> str:
+    """Return the key of a measured time in ms: time_key("work", "p50") == "work_p50_ms"."""
+    return f"{name}_{statistic}{_TIME_SUFFIX}"
+
+
+def parsed_time_key(key: str) -> TimeKey | None:
+    """Return name and statistic of the key of a measured time; None for any other key."""
+    name, _, statistic = key.removesuffix(_TIME_SUFFIX).rpartition("_")
+    return TimeKey(name, statistic) if name and key.endswith(_TIME_SUFFIX) else None
+
+
+def number(text: str) -> float | None:
+    """Return the finite number that a value is; None where it is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def count(text: str) -> int | None:
+    """Return the count that a value is; None where it is none."""
+    value = number(text)
+    return int(value) if value is not None and value >= 0 and value.is_integer() else None
+
+
+def landmark_counts(values: Mapping[str, str]) -> tuple[int, int] | None:
+    """Return inliers and tracked landmarks of the odometry's values; None in recordings of earlier versions."""
+    inliers, tracked = count(values.get(Key.INLIERS, "")), count(values.get(Key.TRACKED, ""))
+    return (inliers, tracked) if inliers is not None and tracked is not None else None
