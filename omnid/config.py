@@ -265,7 +265,10 @@ class Config:
 
 
 # Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.
-RENAMED: Final[Mapping[str, str]] = MappingProxyType({})
+RENAMED: Final[Mapping[str, str]] = MappingProxyType({
+    "stereo.matching.rival": "stereo.matching.runner_up_ratio",
+    "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
+})
 
 
 def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:

@@ -1,12 +1,14 @@
-"""The enhanced SAD: which of several candidates is the match (Dang et al. 2012, section III.B).
+"""Enhanced SAD: choose among several candidates by lines to anchors (Dang et al. 2012, section III.B).
 
-A point with one candidate is matched at once and becomes an anchor. For a point with several, each candidate's
-difference grows by that of the grey levels along the line from the point to an anchor in the lower panorama and along
-the line from the candidate to the anchor's match in the upper one. The lowest total wins.
+A point with one candidate is matched at once and becomes an anchor. For a point with several candidates, the line
+difference is added to each candidate's SAD: the difference between the grey levels along the line from the point to an
+anchor in the lower panorama and along the line from the candidate to the anchor's match in the upper panorama. The
+candidate with the lowest total is the match.
 
-On a wall of identical bricks anchors are rare, so they spread: each cell of a coarse grid holds one, and a cell without
-one settles a point of its own by the lines to those of the cells around it, which are long enough to leave a brick;
-and so on outwards. Every other point is then settled by the line to the nearest anchor of its cell and those around.
+On a wall of identical bricks anchors are rare, so they are propagated. Each cell of a coarse grid holds one anchor. A
+cell without one decides a point of its own by the lines to the anchors of the neighbouring cells, which are longer than
+a brick, and that point becomes the cell's anchor; this repeats outwards. Every other point is then decided by the line
+to the nearest anchor of its own or a neighbouring cell.
 """
 
 from __future__ import annotations
@@ -22,145 +24,155 @@ Array = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-CELL_PX = 32
-ROUNDS = 64  # cells the anchors spread over at most
-LONG_SAMPLES, SHORT_SAMPLES = 16, 8  # on a line between cells, on one to the nearest anchor
-DECISIVE, CLEAR = 2.0, 1.0  # grey levels by which the second best total must be worse: of a new anchor, of a point
-CHUNK = 4_000  # lines sampled at a time: their pixels stay in the cache
-NOBODY = -1
+CELL_PX = 32  # side of a cell: longer than the courses of most brick walls are high
+MAX_ROUNDS = 64  # of propagation: cells that anchors can cross
+LONG_LINE_SAMPLES = 16  # of a line to the anchor of a neighbouring cell
+SHORT_LINE_SAMPLES = 8  # of a line to the nearest anchor
+NEW_ANCHOR_MARGIN = 2.0  # grey levels by which the runner-up of a new anchor must be worse: an error would propagate
+CLEAR_MARGIN = 1.0  # the same of an ordinary point
+CHUNK_LINES = 4_000  # lines sampled at a time, so that their pixels stay in the processor's cache
+NO_ANCHOR = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Rows (M,), one for each candidate of each point: the point's index, a disparity [px], its mean difference."""
+    """Rows (M,), one per candidate of each point: index of the point, disparity [px], mean difference [grey levels]."""
 
     point: Indices
     disparity: Indices
     difference: Array
 
     def of(self, points: Flags) -> Candidates:
-        """The rows of the points that are flagged (N,)."""
+        """Return the rows of the points that are flagged (N,)."""
         rows = np.flatnonzero(points[self.point])
         return Candidates(self.point[rows], self.disparity[rows], self.difference[rows])
 
     def best(self, total: Array, count: int) -> tuple[Indices, Array]:
-        """Row (count,) of the lowest total (M,) of each point, and how much worse the second one is; 0 without any."""
+        """Return each point's row with the lowest total, and the margin to its runner-up (count,); 0 without rows.
+
+        total: (M,) one per row. The margin of a point with a single candidate is infinite.
+        """
         lowest, second = np.full((2, count), np.inf, np.float32)
         np.minimum.at(lowest, self.point, total)
-        won = np.flatnonzero(total == lowest[self.point])
+        winners = np.flatnonzero(total == lowest[self.point])
         row = np.zeros(count, np.intp)
-        row[self.point[won]] = won
-        lost = np.flatnonzero(row[self.point] != np.arange(len(total)))
-        np.minimum.at(second, self.point[lost], total[lost])
+        row[self.point[winners]] = winners
+        losers = np.flatnonzero(row[self.point] != np.arange(len(total)))
+        np.minimum.at(second, self.point[losers], total[losers])
         return row, np.where(np.isfinite(lowest), second, 0) - np.where(np.isfinite(lowest), lowest, 0)
 
 
 class AnchorPropagation:
-    """The points of a pair of panoramas (H, W), their disparities (N,), and a grid of anchors among them."""
+    """Points (N,) of a pair of panoramas (H, W) with their disparities, and the grid of anchors among them."""
 
     def __init__(self, images: tuple[Image, Image], pixels: Indices, disparity: Indices) -> None:
+        """images: lower and upper panorama; pixels: flat indices (N,) into the lower one."""
         height, width = images[0].shape
         self.disparity = disparity.copy()
         self._images = images
         rows, columns = np.divmod(pixels, width)
         self._column, self._row = columns.astype(np.float32), rows.astype(np.float32)
-        across = width // CELL_PX + 3  # with a ring of empty cells about the image
-        self._cell = (rows // CELL_PX + 1) * across + columns // CELL_PX + 1
-        self._around = (np.arange(-1, 2)[:, None] * across + np.arange(-1, 2)).reshape(-1)
-        self._anchor = np.full((height // CELL_PX + 3) * across, NOBODY)
+        # A ring of empty cells surrounds the image, so that every cell has eight neighbours.
+        cells_per_row = width // CELL_PX + 3
+        self._cell = (rows // CELL_PX + 1) * cells_per_row + columns // CELL_PX + 1
+        self._neighbourhood = (np.arange(-1, 2)[:, None] * cells_per_row + np.arange(-1, 2)).reshape(-1)
+        self._anchor = np.full((height // CELL_PX + 3) * cells_per_row, NO_ANCHOR)
 
-    def settle(self, sure: Flags, candidates: Candidates) -> Flags:
-        """Sets the disparities of points with candidates from those that are sure; which (N,) clearly beat the others.
+    def propagate(self, sure: Flags, candidates: Candidates) -> Flags:
+        """Choose the disparity of each point with candidates; return the points (N,) that beat their runner-up clearly.
 
-        sure: (N,) flags of what may be an anchor; their disparities must be right. A point takes its lowest total even
-        where that is not clear; one without an anchor around keeps its disparity.
+        sure: (N,) points that may be anchors; their disparities must be right. A point takes its lowest total even
+        where the margin is small; one without an anchor in its neighbourhood keeps its disparity.
         """
-        self._anchor = self._central(np.flatnonzero(sure))
-        several = np.zeros(len(sure), bool)
-        several[candidates.point] = True
-        spread = self._spread(np.flatnonzero(several), candidates)
-        anchor = self._nearest(several & ~spread)
-        rows = candidates.of(anchor != NOBODY)
-        along = self._differences(rows.point, rows.disparity, anchor[rows.point], SHORT_SAMPLES)
+        # 1. Each cell's sure point nearest to the middle is its anchor.
+        self._anchor = self._central_points(np.flatnonzero(sure))
+        # 2. Anchors spread to the cells without one.
+        ambiguous = np.zeros(len(sure), bool)
+        ambiguous[candidates.point] = True
+        new_anchors = self._grow_anchors(np.flatnonzero(ambiguous), candidates)
+        # 3. All other points are decided by the line to their nearest anchor.
+        anchor = self._nearest_anchors(ambiguous & ~new_anchors)
+        rows = candidates.of(anchor != NO_ANCHOR)
+        along = self._line_differences(rows.point, rows.disparity, anchor[rows.point], SHORT_LINE_SAMPLES)
         best, margin = rows.best(rows.difference + along, len(sure))
-        self._decide(rows, best, anchor != NOBODY)
-        return np.asarray(spread | (margin > CLEAR))
+        self._assign(rows, best, anchor != NO_ANCHOR)
+        return np.asarray(new_anchors | (margin > CLEAR_MARGIN))
 
-    def _central(self, points: Indices) -> Indices:
-        """For each cell the one of the points that is nearest to its middle, or NOBODY."""
+    def _central_points(self, points: Indices) -> Indices:
+        """Return, per cell, the one of the points that is nearest to its middle, or NO_ANCHOR."""
         x, y = self._column[points] % CELL_PX, self._row[points] % CELL_PX
         off = np.abs(x - CELL_PX / 2) + np.abs(y - CELL_PX / 2)
         nearest_last = points[np.argsort(-off, kind="stable")]
-        chosen = np.full(len(self._anchor), NOBODY)
+        chosen = np.full(len(self._anchor), NO_ANCHOR)
         chosen[self._cell[nearest_last]] = nearest_last
         return chosen
 
-    def _spread(self, several: Indices, candidates: Candidates) -> Flags:
-        """Makes one of the points an anchor in each cell without one, from its neighbours outwards; which (N,).
+    def _grow_anchors(self, ambiguous: Indices, candidates: Candidates) -> Flags:
+        """Make an ambiguous point the anchor of each cell without one, from neighbour to neighbour; return them (N,).
 
-        A cell whose point is not decided asks again when more of its neighbours have an anchor.
+        A cell whose point could not be decided is tried again when more of its neighbours have an anchor.
         """
         count = len(self.disparity)
         new, seed = np.zeros(count, bool), np.zeros(count, bool)
-        central = self._central(several)
-        seed[central[(self._anchor == NOBODY) & (central != NOBODY)]] = True
-        candidates, seen = candidates.of(seed), np.zeros(count, np.intp)
-        for _ in range(ROUNDS):
-            neighbours = np.count_nonzero(self._near(np.flatnonzero(seed)) != NOBODY, axis=1)
-            asked = np.zeros(count, bool)
-            asked[np.flatnonzero(seed)[neighbours > seen[seed]]] = True
-            seen[seed] = neighbours
-            if not asked.any():
+        central = self._central_points(ambiguous)
+        seed[central[(self._anchor == NO_ANCHOR) & (central != NO_ANCHOR)]] = True
+        candidates, tried_with = candidates.of(seed), np.zeros(count, np.intp)
+        for _ in range(MAX_ROUNDS):
+            neighbours = np.count_nonzero(self._anchors_around(np.flatnonzero(seed)) != NO_ANCHOR, axis=1)
+            active = np.zeros(count, bool)
+            active[np.flatnonzero(seed)[neighbours > tried_with[seed]]] = True
+            tried_with[seed] = neighbours
+            if not active.any():
                 break
-            decided = self._ask_all_around(candidates.of(asked)) & asked
+            decided = self._decide_by_all_anchors(candidates.of(active)) & active
             self._anchor[self._cell[decided]] = np.flatnonzero(decided)
             new, seed = new | decided, seed & ~decided
         return new
 
-    def _ask_all_around(self, rows: Candidates) -> Flags:
-        """Settles points by the mean over the lines to all anchors around; which (N,) have a decisive total."""
-        anchors = self._near(rows.point)
-        row, k = np.nonzero(anchors != NOBODY)
-        along = self._differences(rows.point[row], rows.disparity[row], anchors[row, k], LONG_SAMPLES)
-        mean = np.bincount(row, along, len(anchors)) / np.count_nonzero(anchors != NOBODY, axis=1)
+    def _decide_by_all_anchors(self, rows: Candidates) -> Flags:
+        """Decide points by the mean over the lines to all anchors around; return those (N,) with a large margin."""
+        anchors = self._anchors_around(rows.point)
+        row, k = np.nonzero(anchors != NO_ANCHOR)
+        along = self._line_differences(rows.point[row], rows.disparity[row], anchors[row, k], LONG_LINE_SAMPLES)
+        mean = np.bincount(row, along, len(anchors)) / np.count_nonzero(anchors != NO_ANCHOR, axis=1)
         best, margin = rows.best(rows.difference + mean.astype(np.float32), len(self.disparity))
-        decided = margin > DECISIVE
-        self._decide(rows, best, decided)
+        decided = margin > NEW_ANCHOR_MARGIN
+        self._assign(rows, best, decided)
         return np.asarray(decided)
 
-    def _near(self, points: Indices) -> Indices:
-        """The anchors (N, 9) in the cells of points and around them, NOBODY where there is none."""
-        return np.asarray(self._anchor[self._cell[points][:, None] + self._around])
+    def _anchors_around(self, points: Indices) -> Indices:
+        """Return the anchors (N, 9) of the cells of points and of their neighbours, NO_ANCHOR where there is none."""
+        return np.asarray(self._anchor[self._cell[points][:, None] + self._neighbourhood])
 
-    def _nearest(self, points: Flags) -> Indices:
-        """The nearest anchor (N,) around each of the points flagged; NOBODY for the others."""
-        chosen = np.full(len(points), NOBODY)
-        anchors = self._near(np.flatnonzero(points))
+    def _nearest_anchors(self, points: Flags) -> Indices:
+        """Return the nearest anchor (N,) around each of the points flagged; NO_ANCHOR for the others."""
+        chosen = np.full(len(points), NO_ANCHOR)
+        anchors = self._anchors_around(np.flatnonzero(points))
         dx, dy = (at[anchors] - at[points][:, None] for at in (self._column, self._row))
-        distance = np.where(anchors == NOBODY, np.inf, dx * dx + dy * dy)
+        distance = np.where(anchors == NO_ANCHOR, np.inf, dx * dx + dy * dy)
         chosen[points] = np.take_along_axis(anchors, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
         return chosen
 
-    def _differences(self, point: Indices, disparity: Indices, anchor: Indices, samples: int) -> Array:
-        """The line differences (M,) of points at disparities against anchors."""
+    def _line_differences(self, point: Indices, disparity: Indices, anchor: Indices, samples: int) -> Array:
+        """Return the line differences (M,) of points at disparities against anchors."""
         start = np.stack([self._column[point], self._row[point], disparity.astype(np.float32)])
         end = np.stack([self._column[anchor], self._row[anchor], self.disparity[anchor].astype(np.float32)])
         return line_difference(self._images, start, end, samples)
 
-    def _decide(self, rows: Candidates, best: Indices, decided: Flags) -> None:
+    def _assign(self, rows: Candidates, best: Indices, decided: Flags) -> None:
         self.disparity[decided] = rows.disparity[best[decided]]
 
 
 def line_difference(images: tuple[Image, Image], start: Array, end: Array, samples: int) -> Array:
-    """Mean absolute difference (M,) of grey levels along lines in the lower and in the upper panorama.
+    """Return the mean absolute difference (M,) of grey levels along lines in the lower and in the upper panorama.
 
-    start, end: (3, M) column and row in the lower panorama, and disparity: how much lower in the upper one. Sampled at
-    equal fractions of the lengths.
+    start, end: (3, M) column and row in the lower panorama, and disparity: row in the upper one less row in the lower
+    one. The lines are sampled at equal fractions of their lengths.
     """
     difference = np.empty(start.shape[1], np.float32)
     along = (np.arange(samples, dtype=np.float32) + 0.5) / samples
-    for first in range(0, len(difference), CHUNK):
-        part = slice(first, first + CHUNK)
+    for first in range(0, len(difference), CHUNK_LINES):
+        part = slice(first, first + CHUNK_LINES)
         columns, rows, disparities = start[:, part, None] + along * (end - start)[:, part, None]
         lower, upper = (cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
                         for image, at in zip(images, (rows, rows + disparities), strict=True))

@@ -1,4 +1,4 @@
-"""Where matching is worth while: edges of the blurred panorama (Dang et al. 2012, section III.A)."""
+"""Edge detection: choose the pixels that are matched (Dang et al. 2012, section III.A)."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 
+RESPONSE_SCALE = 0.5  # a 3x3 Sobel of 8-bit images reaches 1020; half of it and less is kept in 8 bits
+
 
 def smooth(image: Image, sigma_px: float) -> Image:
-    """The image blurred by a Gaussian, against the noise of single pixels; sigma 0 leaves it alone."""
+    """Return the image blurred by a Gaussian against the noise of single pixels; sigma 0 returns it unchanged."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.uint8) if sigma_px > 0 else image
 
 
 def edge_pixels(smoothed: Image, valid: NDArray[np.bool_], threshold: int, limit: int) -> NDArray[np.intp]:
-    """Flat indices, ascending, of pixels whose Sobel response along the column is a maximum above a threshold.
+    """Return flat indices, ascending, of pixels where the Sobel response along the column is a maximum.
 
-    Only the change along the column tells a match apart from its neighbours there, so only it counts; of each edge
-    its crest alone is kept. threshold in units of the 3x3 Sobel (8 per grey level and pixel). Where more than limit
-    remain, every n-th is taken, evenly over the image.
+    Only a change along the column distinguishes a match from its neighbours there, so only that is measured, and only
+    the crest of each edge is kept. threshold: least response, in units of the 3x3 Sobel (8 per grey level and pixel).
+    If more than limit remain, every n-th is taken, evenly over the image.
     """
-    response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=0.5)
-    crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > threshold // 2)
+    response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=RESPONSE_SCALE)
+    least = int(threshold * RESPONSE_SCALE)
+    crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > least)
     chosen = np.flatnonzero(crest & valid[1:-1]) + smoothed.shape[1]
     return np.asarray(chosen[:: max(1, -(-len(chosen) // limit))])

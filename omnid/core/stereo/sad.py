@@ -10,22 +10,23 @@ Image = NDArray[np.uint8]
 Costs = NDArray[np.uint16]
 Indices = NDArray[np.intp]
 
-NEVER = np.uint16(65535)  # the cost of a match outside the image
+NO_MATCH = np.uint16(65535)  # cost of a match outside the image
+MIN_SLOPE = 1.0  # grey levels per pixel of the sum, so that a flat minimum divides by no zero
 
 
 class SadVolume:
-    """SAD of every pixel of the lower panorama with the pixel d rows below it in the upper one, d = 0 .. D-1.
+    """SAD of every pixel of the lower panorama and the pixel d rows below it in the upper one, d = 0 .. D-1.
 
     The planes (D, H, W) uint16 are allocated once. A window of up to 15x15 keeps the sums below 65535.
     """
 
     def __init__(self, shape: tuple[int, int], disparities: int, window_px: int) -> None:
         self.window_px = window_px
-        self.planes = np.full((min(disparities, shape[0]), *shape), NEVER, np.uint16)
+        self.planes = np.full((min(disparities, shape[0]), *shape), NO_MATCH, np.uint16)
         self._difference = np.empty(shape, np.uint8)
 
     def fill(self, lower: Image, upper: Image, disparities: range | None = None) -> None:
-        """Computes the planes for a pair of panoramas (H, W): all, or those of the disparities asked for."""
+        """Compute the planes for a pair of panoramas (H, W): all of them, or those of some disparities."""
         window = (self.window_px, self.window_px)
         for d in disparities or range(len(self.planes)):
             rows, plane = lower.shape[0] - d, self.planes[d]
@@ -34,27 +35,27 @@ class SadVolume:
                           borderType=cv2.BORDER_REPLICATE)
 
     def at(self, pixels: Indices) -> Costs:
-        """Costs (D, N) of the lower panorama's pixels (flat indices)."""
+        """Return the costs (D, N) of pixels of the lower panorama (flat indices)."""
         costs = np.empty((len(self.planes), len(pixels)), np.uint16)
         for plane, row in zip(self.planes, costs, strict=True):
             np.take(plane.reshape(-1), pixels, out=row, mode="clip")
         return costs
 
     def around(self, pixels: Indices, disparity: Indices, reach: int) -> Costs:
-        """Costs (2 reach + 1, N) of pixels (flat indices) at disparity - reach .. disparity + reach; NEVER outside."""
-        wanted = disparity[None] + np.arange(-reach, reach + 1)[:, None]
-        inside = (wanted >= 0) & (wanted < len(self.planes))
+        """Return costs (2 reach + 1, N) of pixels (flat indices) at disparity - reach .. + reach; NO_MATCH outside."""
+        searched = disparity[None] + np.arange(-reach, reach + 1)[:, None]
+        inside = (searched >= 0) & (searched < len(self.planes))
         size = self.planes[0].size
-        return np.where(inside, self.planes.reshape(-1)[np.where(inside, wanted, 0) * size + pixels], NEVER)
+        return np.where(inside, self.planes.reshape(-1)[np.where(inside, searched, 0) * size + pixels], NO_MATCH)
 
-    def seen_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
-        """The disparity that the upper panorama's pixel would choose and its cost, (N,) each.
+    def best_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
+        """Return the best disparities (N,) of the upper panorama's pixels, and their costs (N,): the left-right check.
 
-        For lower pixels and their disparities.
+        The upper pixels are given by pixels (N,) of the lower panorama and their disparities (N,).
         """
         width = self.planes.shape[2]
         upper = pixels + disparity * width
-        best = np.full(len(pixels), NEVER, np.uint16)
+        best = np.full(len(pixels), NO_MATCH, np.uint16)
         choice = np.zeros(len(pixels), np.intp)
         for d, plane in enumerate(self.planes):
             cost = np.take(plane.reshape(-1), np.maximum(upper - d * width, 0), mode="clip")
@@ -64,20 +65,20 @@ class SadVolume:
 
 
 def local_minima(costs: Costs, limit: Costs | int) -> NDArray[np.bool_]:
-    """Which of costs (D, N) are minima along D and not above a limit; the ends of the range are none."""
-    inner = (costs[1:-1] < costs[:-2]) & (costs[1:-1] <= costs[2:]) & (costs[1:-1] <= limit) & (costs[2:] < NEVER)
+    """Return flags (D, N) of the costs that are minima along D and not above a limit; the ends of D are no minima."""
+    inner = (costs[1:-1] < costs[:-2]) & (costs[1:-1] <= costs[2:]) & (costs[1:-1] <= limit) & (costs[2:] < NO_MATCH)
     minima = np.zeros(costs.shape, bool)
     minima[1:-1] = inner
     return minima
 
 
 def subpixel(costs: Costs, disparity: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Disparities (N,) with the fraction at which two lines of equal slope through the minimum's sides would meet.
+    """Return disparities (N,) refined to where two lines of equal slope through the minimum's sides meet.
 
     A sum of absolute differences is V-shaped about its minimum, so lines fit it better than a parabola.
     """
     each = np.arange(costs.shape[1])
     middle = np.clip(disparity, 1, len(costs) - 2)
     before, at, after = (costs[middle + k, each].astype(np.float32) for k in (-1, 0, 1))
-    steeper = np.maximum(np.maximum(before, after) - at, 1.0)
+    steeper = np.maximum(np.maximum(before, after) - at, MIN_SLOPE)
     return np.asarray(middle + np.clip((before - after) / (2 * steeper), -0.5, 0.5), np.float32)

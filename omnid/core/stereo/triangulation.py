@@ -1,4 +1,4 @@
-"""Points from two bearings: the common perpendicular of both rays, and how far to trust it."""
+"""Triangulation: points from two bearings by the common perpendicular of both rays, and their covariance."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ from calib.panorama import Cylinder
 
 Array = NDArray[np.float64]
 
+PARALLEL_CROSS2 = 1e-14  # squared length of the cross product of two rays below which they count as parallel
+MIN_RADIUS_M = 1e-9  # from the axis: a point on it has no disparity
+MIN_RADIUS2_M2 = 1e-12  # the same, squared, in derivatives
+
 
 def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Array) -> Array:
-    """Midpoints (N, 3) of the common perpendiculars of two bundles of rays; NaN where they diverge or are parallel.
+    """Return midpoints (N, 3) of the common perpendiculars of two bundles of rays; NaN where they diverge.
 
-    lower_rays, upper_rays (N, 3) any length, the lower ones from the origin, the upper ones from upper_origin (3,).
-    Solves V1 = lambda n1, V2 = mu n2 + B for the closest lambda, mu: Dang et al. 2012, eq. (2) to (5), in the closed
-    form that stands for the damaged (4) and (5).
+    lower_rays, upper_rays (N, 3) any length, the lower ones from the origin, the upper ones from upper_origin (3,);
+    parallel rays give NaN as well.
+    Solves V1 = lambda n1, V2 = mu n2 + B for the closest lambda, mu: Dang et al. 2012, eq. (2) to (5). Equations (4)
+    and (5) are damaged in print; this is the closed form of the same problem.
     """
     normal = np.cross(lower_rays, upper_rays)
     squared = (normal**2).sum(axis=1)
-    squared = np.where(squared > 1e-14, squared, np.nan)
+    squared = np.where(squared > PARALLEL_CROSS2, squared, np.nan)
     along_lower = (np.cross(upper_origin, upper_rays) * normal).sum(axis=1) / squared
     along_upper = (np.cross(upper_origin, lower_rays) * normal).sum(axis=1) / squared
     middle = (along_lower[:, None] * lower_rays + along_upper[:, None] * upper_rays + upper_origin) / 2
@@ -28,23 +33,23 @@ def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Arr
 
 
 def triangulate(views: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Points (N, 3) [m] in the rectified frame of views (N, 3) = (column, row in lower, row in upper) [px]."""
+    """Return points (N, 3) [m] in the rectified frame of views (N, 3) = (column, row in lower, row in upper) [px]."""
     lower = cylinder.rays(views[:, :2])
     upper = cylinder.rays(views[:, [0, 2]])
     return common_perpendicular(lower, upper, np.array([0.0, 0.0, baseline_m]))
 
 
 def view(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Views (N, 3) = (column, row in lower, row in upper) [px] of points (N, 3) [m] in the rectified frame."""
+    """Return views (N, 3) = (column, row in lower, row in upper) [px] of points (N, 3) [m] in the rectified frame."""
     lower = cylinder.pixels(points)
-    disparity = cylinder.focal_px * baseline_m / np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
+    disparity = cylinder.focal_px * baseline_m / np.maximum(np.hypot(points[:, 0], points[:, 1]), MIN_RADIUS_M)
     return np.column_stack([lower, lower[:, 1] + disparity])
 
 
 def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Derivatives (N, 3, 3) [px/m] of the view (column, lower row, upper row) by the point."""
+    """Return the derivatives (N, 3, 3) [px/m] of the view (column, lower row, upper row) by the point."""
     x, y, z = points.T
-    r2 = np.maximum(x * x + y * y, 1e-12)
+    r2 = np.maximum(x * x + y * y, MIN_RADIUS2_M2)
     r, f = np.sqrt(r2), cylinder.focal_px
     J = np.zeros((len(points), 3, 3))
     J[:, 0, 0], J[:, 0, 1] = f * y / r2, -f * x / r2
@@ -54,6 +59,6 @@ def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array
 
 
 def point_covariance(points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float) -> Array:
-    """Covariances (N, 3, 3) [m^2] of triangulated points when each view coordinate has deviation sigma_px."""
+    """Return covariances (N, 3, 3) [m^2] of points triangulated from view coordinates of sigma_px each."""
     J = np.linalg.inv(view_jacobian(points, cylinder, baseline_m))
     return np.asarray(sigma_px**2 * J @ np.swapaxes(J, -1, -2))

@@ -1,4 +1,4 @@
-"""Settling several candidates by lines to anchors: the lines, the spreading of anchors, and what stays undecided."""
+"""Choosing among candidates by lines to anchors: line differences, propagation of anchors, points left undecided."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.anchors import CELL_PX, CHUNK, AnchorPropagation, Candidates, line_difference
+from omnid.core.stereo.anchors import CELL_PX, CHUNK_LINES, AnchorPropagation, Candidates, line_difference
 from tests.omnid.core.scenery import texture
 
 Flags = NDArray[np.bool_]
@@ -19,7 +19,7 @@ def lines(*ends: tuple[float, float, float]) -> NDArray[np.float32]:
     return np.array(ends, np.float32).T
 
 
-def test_the_difference_along_lines_is_that_of_the_pixels_on_them() -> None:
+def test_line_difference_is_the_mean_of_the_pixels_on_the_line() -> None:
     lower, upper = texture(13, SHAPE), texture(14, SHAPE)
     start, end = lines((10, 20, 10)), lines((42, 84, 22))
     along = (np.arange(32) + 0.5) / 32
@@ -34,22 +34,23 @@ def test_the_difference_along_lines_is_that_of_the_pixels_on_them() -> None:
     assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
 
 
-def test_many_lines_give_what_each_of_them_gives() -> None:
+def test_line_differences_do_not_depend_on_the_chunks() -> None:
     image = texture(15, SHAPE)
-    start, end = np.repeat(lines((10, 20, 0)), CHUNK + 7, axis=1), np.repeat(lines((40, 80, 0)), CHUNK + 7, axis=1)
+    count = CHUNK_LINES + 7
+    start, end = (np.repeat(lines(point), count, axis=1) for point in ((10, 20, 0), (40, 80, 0)))
     start[2, -1] = 40
     difference = line_difference((image, image), start, end, 4)
     assert (difference[:-1] == 0).all() and difference[-1] > 5
 
 
-def test_the_lowest_total_and_how_clear_it_is() -> None:
+def test_returns_the_lowest_total_and_the_margin_to_the_runner_up() -> None:
     point = np.array([3, 0, 3, 0, 3, 4])
     rows = Candidates(point, np.arange(6), np.zeros(6, np.float32))
     best, margin = rows.best(np.array([5, 2, 4, 7, 9, 1], np.float32), 5)
     np.testing.assert_array_equal(best[[0, 3, 4]], [1, 2, 5])
     np.testing.assert_array_equal(margin, [5, 0, 0, 1, np.inf])
     _, margin = rows.best(np.array([5, 2, 5, 7, 9, 1], np.float32), 5)
-    assert margin[3] == 0  # two alike are not clear
+    assert margin[3] == 0  # equal totals have no margin
     np.testing.assert_array_equal(rows.of(np.arange(5) == 3).disparity, [0, 2, 4])
 
 
@@ -60,43 +61,43 @@ def courses() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     return wall[SHIFT_PX : SHIFT_PX + SHAPE[0]], wall[: SHAPE[0]]
 
 
-def everywhere() -> Indices:
+def grid_of_pixels() -> Indices:
     rows, columns = np.meshgrid(np.arange(30, 110, 5), np.arange(6, SHAPE[1] - 6, 5), indexing="ij")
     return np.asarray((rows * SHAPE[1] + columns).ravel())
 
 
-def settled(sure: Flags, pixels: Indices) -> tuple[Indices, Flags]:
+def propagated(sure: Flags, pixels: Indices) -> tuple[Indices, Flags]:
     """All but the sure points have equally good candidates one course apart, and start with a wrong one."""
     true = np.array([SHIFT_PX + k * COURSE_PX for k in (-1, 0, 1, 2)])
     several = np.flatnonzero(~sure)
     point, disparity = np.repeat(several, 4), np.tile(true, len(several))
-    settlement = AnchorPropagation(courses(), pixels, np.where(sure, SHIFT_PX, true[0]))
-    clear = settlement.settle(sure, Candidates(point, disparity, np.ones(len(point), np.float32)))
-    return settlement.disparity, clear
+    propagation = AnchorPropagation(courses(), pixels, np.where(sure, SHIFT_PX, true[0]))
+    clear = propagation.propagate(sure, Candidates(point, disparity, np.ones(len(point), np.float32)))
+    return propagation.disparity, clear
 
 
-def test_from_a_few_anchors_at_one_end_the_whole_wall_is_settled() -> None:
-    pixels = everywhere()
+def test_a_few_anchors_at_one_end_decide_the_whole_wall() -> None:
+    pixels = grid_of_pixels()
     sure = pixels % SHAPE[1] < 12
-    disparity, clear = settled(sure, pixels)
+    disparity, clear = propagated(sure, pixels)
     assert clear[~sure].mean() > 0.9
     assert np.mean(disparity[clear] == SHIFT_PX) > 0.98
 
 
 def test_anchors_do_not_spread_across_a_gap() -> None:
-    pixels = everywhere()
+    pixels = grid_of_pixels()
     columns = pixels % SHAPE[1]
     pixels = pixels[(columns < 5 * CELL_PX) | (columns >= 7 * CELL_PX)]
     columns = pixels % SHAPE[1]
-    disparity, clear = settled(columns < 12, pixels)
+    disparity, clear = propagated(columns < 12, pixels)
     assert clear[(columns > 12) & (columns < 150)].mean() > 0.9
     assert not clear[columns >= 7 * CELL_PX].any()
-    assert (disparity[columns >= 7 * CELL_PX] == SHIFT_PX - COURSE_PX).all()  # as they came
+    assert (disparity[columns >= 7 * CELL_PX] == SHIFT_PX - COURSE_PX).all()  # unchanged
 
 
-def test_without_anchors_or_without_questions_nothing_changes() -> None:
-    pixels = everywhere()
+def test_changes_nothing_without_anchors_or_without_candidates() -> None:
+    pixels = grid_of_pixels()
     for sure in (np.zeros(len(pixels), bool), np.ones(len(pixels), bool)):
-        disparity, clear = settled(sure, pixels)
+        disparity, clear = propagated(sure, pixels)
         assert not clear.any()
         np.testing.assert_array_equal(disparity, np.where(sure, SHIFT_PX, SHIFT_PX - COURSE_PX))

@@ -1,4 +1,4 @@
-"""Matching two panoramas: walls that repeat, textures that do not, fractions, seams and the image's end."""
+"""Matching two panoramas: repeated and unique textures, subpixel disparities, borders of the image."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def matched(method: str, lower: Image, upper: Image, valid: Flags) -> tuple[NDAr
 
 
 def middle(rows: tuple[int, int] = (12, SHAPE[0] - DISPARITIES - 4)) -> Flags:
-    """Pixels whose every candidate lies inside the image."""
+    """Return the pixels whose candidates all lie inside the image."""
     valid = np.zeros(SHAPE, bool)
     valid[rows[0] : rows[1], 12:-12] = True
     return valid
@@ -36,7 +36,7 @@ def noisy(image: Image, seed: int) -> Image:
 
 
 def brick_wall() -> tuple[Image, Image]:
-    """Courses that look alike, one spot that does not, and the same SHIFT_PX lower; each with noise of its own."""
+    """Return a wall of identical courses with one unique spot, and the same wall SHIFT_PX lower, both with noise."""
     course = texture(1, (COURSE_PX * 3, 40), 2.0)[COURSE_PX : 2 * COURSE_PX]
     wall = np.tile(course, (SHAPE[0] // COURSE_PX + 4, SHAPE[1] // 40 + 1))[:, : SHAPE[1]]
     spot = texture(2, (34, 34), 2.0)
@@ -47,14 +47,14 @@ def brick_wall() -> tuple[Image, Image]:
 
 
 def right(found: tuple[NDArray[np.intp], NDArray[np.float32]]) -> Flags:
-    """Which matches away from the spot have the true disparity."""
+    """Return flags of the matches away from the spot: True where the disparity is right."""
     pixels, disparity = found
     rows, columns = np.divmod(pixels, SHAPE[1])
     away = (np.abs(columns - 117) > 26) | (np.abs(rows - 77) > 26)
     return np.asarray(np.abs(disparity[away] - SHIFT_PX) < 1)
 
 
-def test_on_a_brick_wall_the_enhanced_sad_is_right_where_the_original_is_wrong() -> None:
+def test_enhanced_sad_is_right_on_a_brick_wall_where_sad_is_wrong() -> None:
     wall = brick_wall()
     original, enhanced = (right(matched(method, *wall, middle())) for method in ("sad", "enhanced"))
     assert original.mean() < 0.6  # eq. (1) alone cannot tell the courses apart
@@ -62,8 +62,8 @@ def test_on_a_brick_wall_the_enhanced_sad_is_right_where_the_original_is_wrong()
     assert enhanced.sum() > 1.5 * original.sum()
 
 
-def test_the_original_takes_the_lowest_sum_of_absolute_differences() -> None:
-    """Eq. (1) written out: the lowest of the column, and from the match's column the lowest as well."""
+def test_sad_takes_the_lowest_sum_with_left_right_check() -> None:
+    """The lowest of eq. (1), written out, from the lower pixel and from the upper one."""
     lower, upper = brick_wall()
     pixels, disparity = matched("sad", lower, upper, middle())
     soft = [smooth(image, 0.8).astype(int) for image in (lower, upper)]
@@ -84,7 +84,7 @@ def test_the_original_takes_the_lowest_sum_of_absolute_differences() -> None:
         assert down[best] <= 12 * 81 and abs(int(np.argmin(up)) - best) <= 1
 
 
-def test_on_a_texture_that_does_not_repeat_both_give_the_same() -> None:
+def test_enhanced_sad_equals_sad_on_a_unique_texture() -> None:
     lower = texture(5, SHAPE)
     upper = np.roll(texture(5, SHAPE), SHIFT_PX, axis=0)
     original, enhanced = (matched(method, noisy(lower, 6), noisy(upper, 7), middle()) for method in ("sad", "enhanced"))
@@ -94,8 +94,8 @@ def test_on_a_texture_that_does_not_repeat_both_give_the_same() -> None:
     assert np.abs(original[1] - SHIFT_PX).max() < 0.6
 
 
-def test_without_a_single_anchor_the_enhanced_sad_is_the_original() -> None:
-    """A wall of courses only: nothing is unique, so nothing can be settled."""
+def test_enhanced_sad_equals_sad_without_an_anchor() -> None:
+    """A wall of identical courses has no unique point, so no anchor."""
     course = texture(1, (COURSE_PX * 3, SHAPE[1]), 2.0)[COURSE_PX : 2 * COURSE_PX]
     wall = np.tile(course, (SHAPE[0] // COURSE_PX, 1))
     pair = noisy(wall, 3), noisy(np.roll(wall, 4, axis=0), 4)
@@ -106,28 +106,28 @@ def test_without_a_single_anchor_the_enhanced_sad_is_the_original() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_nothing_to_match(method: str) -> None:
+def test_no_valid_pixels_give_no_matches(method: str) -> None:
     image = texture(19, SHAPE)
     pixels, disparity = matched(method, image, image, np.zeros(SHAPE, bool))
     assert len(pixels) == len(disparity) == 0
 
 
 class RenderedRoom:
-    """What a rig in the middle of a closed room sees, and the true disparities; the walls have one texture each."""
+    """Panoramas of a rig in the middle of a closed room with true disparities; each wall has one texture."""
 
     HALF_M, HEIGHT_M, EYE_M, DISPARITIES = 1.3, 2.6, 1.2, 56
 
     def __init__(self, *walls: str) -> None:
         rig = make_rig(size=512, baseline_m=0.2)
         cameras = Eyes.of(rig, room(3, (2 * self.HALF_M, 2 * self.HALF_M), 0, (*walls, "tiles")))
-        self._sight = cameras.frame(0, se3.transform(np.eye(3), np.array([0, 0, self.EYE_M])))
-        height, width = self._sight.lower.image.shape
+        self._frame = cameras.frame(0, se3.transform(np.eye(3), np.array([0, 0, self.EYE_M])))
+        height, width = self._frame.lower.image.shape
         self._shape, self._valid = (height, width), np.zeros((height, width), bool)
         self._valid[:, PAD_PX:-PAD_PX] = cv2.erode(cameras.usable.astype(np.uint8), np.ones((15, 15), np.uint8))
         self._cylinder, self._R, self._baseline_m = cameras.cylinder, rig.T_rect_rig[:3, :3], rig.baseline_m
 
     def disparity(self, pixels: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Of the surface that a pixel of the lower panorama sees."""
+        """Return the true disparities (N,) of pixels of the lower panorama."""
         rows, columns = np.divmod(pixels, self._shape[1])
         rays = self._cylinder.rays(np.stack([columns - PAD_PX, rows], axis=1).astype(float)) @ self._R
         ahead = np.where(rays > 0, [self.HALF_M, self.HALF_M, self.HEIGHT_M - self.EYE_M],
@@ -136,15 +136,15 @@ class RenderedRoom:
         return np.asarray(self._cylinder.focal_px * self._baseline_m / distance)
 
     def counts(self, method: str) -> tuple[int, int]:
-        """How many matches are right to a pixel, and how many wrong."""
+        """Return the number of matches right to a pixel, and of wrong ones."""
         matcher = Matcher(self._shape, MatchingSettings(method=method, disparities=self.DISPARITIES))
-        pixels, disparity = matcher.match(self._sight.lower.image, self._sight.upper.image, self._valid)
+        pixels, disparity = matcher.match(self._frame.lower.image, self._frame.upper.image, self._valid)
         wrong = np.abs(disparity - self.disparity(pixels)) > 1
         return int((~wrong).sum()), int(wrong.sum())
 
 
-def test_in_a_room_of_identical_bricks_the_enhanced_sad_has_few_wrong_matches() -> None:
-    """The paper's experiment: bricks, seen from 1.2 m and 1.4 m, with a few images among them."""
+def test_enhanced_sad_has_few_wrong_matches_in_a_brick_room() -> None:
+    """The experiment of the paper: a room of bricks with the viewpoints at 1.2 m and 1.4 m."""
     bricks = RenderedRoom("brick", "brick", "brick", "brick")
     (right, wrong), (enhanced_right, enhanced_wrong) = bricks.counts("sad"), bricks.counts("enhanced")
     assert wrong > 0.3 * right  # or there was nothing to improve
@@ -152,7 +152,7 @@ def test_in_a_room_of_identical_bricks_the_enhanced_sad_has_few_wrong_matches() 
     assert enhanced_right > 2 * right
 
 
-def test_in_a_room_whose_textures_do_not_repeat_the_enhanced_sad_loses_nothing() -> None:
+def test_enhanced_sad_loses_no_matches_in_a_room_of_unique_textures() -> None:
     control = RenderedRoom("granite", "plaster", "granite", "plaster")
     (right, wrong), (enhanced_right, enhanced_wrong) = control.counts("sad"), control.counts("enhanced")
     assert right > 3000 and wrong < 0.05 * right
@@ -160,7 +160,7 @@ def test_in_a_room_whose_textures_do_not_repeat_the_enhanced_sad_loses_nothing()
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_fractions_of_a_pixel(method: str) -> None:
+def test_disparities_are_subpixel(method: str) -> None:
     lower = texture(8, SHAPE)
     upper = np.ascontiguousarray(np.rot90(turned(np.ascontiguousarray(np.rot90(lower)), 12.4), -1))
     pixels, disparity = matched(method, lower, upper, middle())
@@ -170,7 +170,7 @@ def test_fractions_of_a_pixel(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_has_no_match_gets_none(method: str) -> None:
+def test_leaves_out_pixels_without_a_match(method: str) -> None:
     blank, other = np.full(SHAPE, 90, np.uint8), texture(9, SHAPE)
     assert len(matched(method, blank, other, middle())[0]) == 0
     lower, valid = texture(10, SHAPE), middle()
@@ -183,7 +183,7 @@ def test_what_has_no_match_gets_none(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_two_distances_side_by_side(method: str) -> None:
+def test_finds_two_depths_side_by_side(method: str) -> None:
     """A near wall on the right, a far one on the left."""
     lower = texture(11, SHAPE)
     upper = np.where(np.arange(SHAPE[1]) < 120, np.roll(lower, 8, axis=0), np.roll(lower, 31, axis=0))
@@ -195,8 +195,8 @@ def test_two_distances_side_by_side(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_row_is_matched_whose_match_lies_in_the_image(method: str) -> None:
-    """Down to the floor: a small disparity needs no room for the largest."""
+def test_matches_every_row_whose_match_lies_in_the_image(method: str) -> None:
+    """Rows near the lower border: a small disparity needs no space for the largest one."""
     lower, valid = texture(16, SHAPE), middle((12, SHAPE[0] - 16))
     pixels, disparity = matched(method, lower, np.roll(lower, 8, axis=0), valid)
     assert np.abs(disparity - 8).max() < 0.6
@@ -204,7 +204,7 @@ def test_every_row_is_matched_whose_match_lies_in_the_image(method: str) -> None
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_disparity_of_the_range_is_found(method: str) -> None:
+def test_finds_every_disparity_of_the_range(method: str) -> None:
     lower, valid = texture(17, SHAPE), middle()
     for shift in (3, 17, 33, DISPARITIES - 3):
         pixels, disparity = matched(method, lower, np.roll(lower, shift, axis=0), valid)
@@ -212,7 +212,7 @@ def test_every_disparity_of_the_range_is_found(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_panorama_lower_than_the_range_is_matched_all_the_same(method: str) -> None:
+def test_matches_a_panorama_with_fewer_rows_than_disparities(method: str) -> None:
     lower = texture(18, (DISPARITIES - 4, 240))
     pixels, disparity = matched(method, lower, np.roll(lower, 6, axis=0), np.ones(lower.shape, bool))
     inside = (pixels // 240 > 8) & (pixels // 240 < DISPARITIES - 16)

@@ -1,4 +1,4 @@
-"""The sums of absolute differences against a slow literal eq. (1), their minima and fractions."""
+"""SAD volume against a literal eq. (1), local minima, subpixel refinement."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.sad import NEVER, SadVolume, local_minima, subpixel
+from omnid.core.stereo.sad import NO_MATCH, SadVolume, local_minima, subpixel
 from tests.omnid.core.scenery import texture
 
 Image = NDArray[np.uint8]
@@ -15,8 +15,8 @@ HEIGHT, WIDTH, DISPARITIES, WINDOW_PX = 20, 26, 7, 5
 LOWER, UPPER = texture(1, (HEIGHT, WIDTH), 1.0), texture(2, (HEIGHT, WIDTH), 1.0)
 
 
-def literal(lower: Image, upper: Image, column: int, row: int, disparity: int) -> int:
-    """Eq. (1) pixel by pixel."""
+def literal_sad(lower: Image, upper: Image, column: int, row: int, disparity: int) -> int:
+    """Return eq. (1), computed pixel by pixel."""
     half = WINDOW_PX // 2
     window = range(-half, half + 1)
     return sum(abs(int(lower[row + j, column + i]) - int(upper[row + disparity + j, column + i]))
@@ -30,28 +30,28 @@ def volume() -> SadVolume:
     return filled
 
 
-def test_the_planes_are_eq_1(volume: SadVolume) -> None:
+def test_planes_are_eq_1(volume: SadVolume) -> None:
     half = WINDOW_PX // 2
     for d in range(DISPARITIES):
         for row in range(half, HEIGHT - half - d):
             for column in range(half, WIDTH - half):
-                assert volume.planes[d, row, column] == literal(LOWER, UPPER, column, row, d)
+                assert volume.planes[d, row, column] == literal_sad(LOWER, UPPER, column, row, d)
 
 
-def test_nothing_matches_below_the_image(volume: SadVolume) -> None:
+def test_rows_below_the_image_have_no_match(volume: SadVolume) -> None:
     for d in range(1, DISPARITIES):
-        assert (volume.planes[d, -d:] == NEVER).all()
-        assert (volume.planes[d, :-d] < NEVER).all()
+        assert (volume.planes[d, -d:] == NO_MATCH).all()
+        assert (volume.planes[d, :-d] < NO_MATCH).all()
 
 
-def test_filling_again_leaves_nothing_of_the_last_pair(volume: SadVolume) -> None:
+def test_filling_again_replaces_the_last_pair(volume: SadVolume) -> None:
     again = SadVolume((HEIGHT, WIDTH), DISPARITIES, WINDOW_PX)
     again.fill(UPPER, LOWER)
     again.fill(LOWER, UPPER)
     np.testing.assert_array_equal(again.planes, volume.planes)
 
 
-def test_the_largest_window_of_the_greatest_difference_does_not_overflow() -> None:
+def test_the_largest_window_does_not_overflow() -> None:
     volume = SadVolume((20, 20), 2, 15)
     volume.fill(np.zeros((20, 20), np.uint8), np.full((20, 20), 255, np.uint8))
     assert volume.planes[0, 10, 10] == 15 * 15 * 255
@@ -62,22 +62,22 @@ def test_costs_of_chosen_pixels(volume: SadVolume) -> None:
     np.testing.assert_array_equal(volume.at(pixels), volume.planes.reshape(DISPARITIES, -1)[:, pixels])
 
 
-def test_costs_around_a_disparity_and_never_outside_the_range(volume: SadVolume) -> None:
+def test_costs_around_a_disparity_are_no_match_outside_the_range(volume: SadVolume) -> None:
     pixels, disparity = np.array([30, 77, 100, 140]), np.array([3, 0, 6, 1])
     around = volume.around(pixels, disparity, 2)
     for n, (pixel, d) in enumerate(zip(pixels, disparity, strict=True)):
-        expected = [volume.planes[k].flat[pixel] if 0 <= k < DISPARITIES else NEVER for k in range(d - 2, d + 3)]
+        expected = [volume.planes[k].flat[pixel] if 0 <= k < DISPARITIES else NO_MATCH for k in range(d - 2, d + 3)]
         np.testing.assert_array_equal(around[:, n], expected)
 
 
-def test_the_upper_pixel_chooses_among_all_that_could_be_it(volume: SadVolume) -> None:
+def test_best_from_upper_searches_all_disparities(volume: SadVolume) -> None:
     rows, columns = np.meshgrid(np.arange(2, HEIGHT - DISPARITIES), np.arange(2, WIDTH - 2), indexing="ij")
     pixels = (rows * WIDTH + columns).ravel()
     disparity = np.random.default_rng(3).integers(0, DISPARITIES, len(pixels))
-    chosen = volume.seen_from_upper(pixels, disparity)
+    chosen = volume.best_from_upper(pixels, disparity)
     for pixel, d, choice, cost in zip(pixels, disparity, *chosen, strict=True):
         row, column = divmod(pixel + d * WIDTH, WIDTH)
-        costs = [volume.planes[k, row - k, column] if row >= k else NEVER for k in range(DISPARITIES)]
+        costs = [volume.planes[k, row - k, column] if row >= k else NO_MATCH for k in range(DISPARITIES)]
         assert choice == int(np.argmin(costs)) and cost == min(costs)
 
 
@@ -91,13 +91,13 @@ def test_minima_lie_inside_the_range_and_below_the_limit() -> None:
 
 
 @pytest.mark.parametrize("fraction", [-0.45, -0.2, 0.0, 0.3, 0.5])
-def test_the_fraction_of_a_v_is_exact(fraction: float) -> None:
+def test_subpixel_is_exact_for_a_v(fraction: float) -> None:
     steps = np.arange(7)[:, None]
     costs = np.rint(40 + 1000 * np.abs(steps - (3 + fraction))).astype(np.uint16)
     assert subpixel(costs, np.array([3]))[0] == pytest.approx(3 + fraction, abs=0.002)
 
 
-def test_the_fraction_stays_within_half_a_pixel_also_on_a_plain() -> None:
+def test_subpixel_stays_within_half_a_pixel() -> None:
     flat = np.full((5, 1), 7, np.uint16)
     assert subpixel(flat, np.array([2]))[0] == 2
     assert subpixel(np.array([[60000], [50], [60], [70]], np.uint16), np.array([2]))[0] == 1.5
