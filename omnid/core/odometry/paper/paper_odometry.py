@@ -1,7 +1,7 @@
-"""The ego-motion of Dang et al. 2012, section IV, as it stands: frame to frame, 3-D to 3-D.
+"""Ego-motion of Dang et al. 2012, section IV and figure 5, as published: frame to frame, 3-D to 3-D.
 
-Kept to be measured against: eq. (9) believes far points as much as near ones, their depth noise stands on both of its
-sides, and what one pair of frames gets wrong stays wrong.
+Kept for comparison with the default method. Its known weaknesses: eq. (9) weights far points as much as near ones,
+depth noise enters both of its sides, and an error between two frames is never corrected later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, flow, track
 from omnid.core.odometry.yaw_search import steps
-from omnid.core.stereo.triangulation import triangulate
+from omnid.core.stereo.triangulation import triangulate, view
 from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
 
@@ -32,21 +32,23 @@ Flags = NDArray[np.bool_]
 TRACKERS = ("improved", "klt")
 REFERENCES = ("previous", "keyframe")
 FEATURES = 500
-ENOUGH = 0.5  # share of the features that must be found for a turn to be nearly right ("N is more than needed")
-AMPLE = 0.85  # share that ends the search; between the two the next turn is tried, for as long as it finds more
-EPSILON_PX = 3  # eq. (8): how far a located point may be from a feature that it locates
-THRESHOLD_M = 0.05  # section IV.B: how far a point of the consensus may be from where the motion puts it
-LEAST = 6  # points of the consensus, below which the motion is refused
-WORN = 0.5  # share of a keyframe's best consensus, below which the present sight takes its place
-# For the motion filter: the turns of section IV.F change the yaw rate by radians per second within a tenth of one, and
-# a filter that calls this impossible would bend the turn and swing after it.
+# Share of the features that makes a yaw hypothesis good enough ("N is more than needed", section IV.F). Beyond the
+# ample share the search ends; between the two the next larger turn is tried as long as it finds more.
+ENOUGH_RATIO = 0.5
+AMPLE_RATIO = 0.85
+EPSILON_PX = 3  # eq. (8): largest distance of a located point from the feature that it locates
+THRESHOLD_M = 0.05  # section IV.B: largest 3-D error of a point of the consensus set
+MIN_INLIERS = 6  # points of the consensus set, below which the motion is refused
+KEYFRAME_RATIO = 0.5  # share of a keyframe's largest consensus set, below which the current frame replaces it
+# Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
+# radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
-BLIND_SPEED = 0.5  # what may have happened where it is [m/s and rad/s], one deviation
+UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while nothing is tracked, m/s and rad/s
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The sight that motions are measured against, with its pose and covariance."""
+    """The frame that motions are measured against, with its pose and the pose's covariance."""
 
     frame: StereoFrame
     T_odom_rect: Array
@@ -54,11 +56,11 @@ class Reference:
 
 
 class PaperOdometry:
-    """Follows the rectified frame from each sight to the next; odom is that frame at the first one.
+    """Estimate the pose of the rectified frame from pair to pair; odom is the rectified frame of the first pair.
 
-    tracker: 'improved' turns the image until enough features are found (section IV.F), 'klt' does not. reference:
-    'previous' measures against the sight before, as the paper does; 'keyframe' against one that is kept as long as
-    half of its points agree, to tell what keyframes alone are worth.
+    tracker: 'improved' rotates the image until enough features are tracked (section IV.F), 'klt' does not. reference:
+    'previous' measures against the previous frame, as the paper does; 'keyframe' against a frame that is kept while
+    half of its points are inliers, which shows the effect of keyframes alone.
     """
 
     def __init__(
@@ -68,81 +70,84 @@ class PaperOdometry:
             if found not in known:
                 raise OmnidError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
         self._model, self._klt, self._tracker = model, klt, tracker
-        self._keeps = reference == "keyframe"
+        self._keeps_reference = reference == "keyframe"
         self._filter = MotionFilter(JERK_PSD)
-        self._T, self._covariance = np.eye(4), np.zeros((6, 6))
+        self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._reference: Reference | None = None
         self._most_inliers = 0
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
-        """The pose at a sight, dt_s after the one before (0 for the first)."""
+        """Return the pose at a frame, dt_s [s] after the previous one (0 for the first): the steps of figure 5."""
         reference = self._reference
         if reference is None:
-            self._refer_to(frame)
-            return self._ego(TrackingState.TRACKING, 0, 0)
-        Ma, Mb = self._located(reference.frame, frame)
-        M, agree = consensus(Ma, Mb, np.random.default_rng(frame.seq), THRESHOLD_M)
-        inliers = int(agree.sum())
-        if inliers < LEAST:
-            ego = self._refuse(dt_s, len(Ma), inliers)
-            self._refer_to(frame)
-            return ego
-        self._move(reference, register(Ma[agree], Mb[agree], M), dt_s)
-        self._most_inliers = max(self._most_inliers, inliers)
-        if not self._keeps or inliers < WORN * self._most_inliers:
-            self._refer_to(frame)
-        return self._ego(TrackingState.TRACKING, len(Ma), inliers)
+            self._set_reference(frame)
+            return self._result(TrackingState.TRACKING, 0, 0)
 
-    def _refer_to(self, frame: StereoFrame) -> None:
-        """From now on measures against a sight whose pose is the present one."""
-        self._reference = Reference(frame, self._T, self._covariance)
+        # 1. Detect features, track them into the current frame and locate them in both frames (section IV.A).
+        F_a = corners(reference.frame.lower, reference.frame.usable, FEATURES)
+        F_b, tracked = self._track(reference.frame, frame, F_a)
+        X_a = locate(reference.frame, F_a[tracked], self._model)
+        X_b = locate(frame, F_b[tracked], self._model)
+        located = np.isfinite(X_a).all(axis=1) & np.isfinite(X_b).all(axis=1)
+        X_a, X_b = X_a[located], X_b[located]
+
+        # 2. Eliminate outliers by RANSAC on three points (section IV.B).
+        M, is_inlier = consensus(X_a, X_b, np.random.default_rng(frame.seq), THRESHOLD_M)
+        inliers = int(is_inlier.sum())
+        if inliers < MIN_INLIERS:
+            return self._refuse(frame, dt_s, (len(X_a), inliers))
+
+        # 3. Estimate the motion of the points by Gauss-Newton (section IV.C, eq. 9).
+        motion = register(X_a[is_inlier], X_b[is_inlier], M)
+
+        # 4. Refine the result by KLT, started where the estimated motion predicts the features.
+        motion = refine((reference.frame, frame), F_a, motion, self._model, self._klt)
+
+        # 5. Filter the motion (section IV.D) and compose its inverse, the motion of the camera (eq. 12).
+        self._move(reference, motion, dt_s)
+        self._most_inliers = max(self._most_inliers, inliers)
+        if not self._keeps_reference or inliers < KEYFRAME_RATIO * self._most_inliers:
+            self._set_reference(frame)
+        return self._result(TrackingState.TRACKING, len(X_a), inliers)
+
+    def _set_reference(self, frame: StereoFrame) -> None:
+        """Measure the following motions against a frame whose pose is the current one."""
+        self._reference = Reference(frame, self._T_odom_rect, self._covariance)
         self._most_inliers = 0
 
-    def _located(self, previous: StereoFrame, frame: StereoFrame) -> tuple[Array, Array]:
-        """Ma, Mb (N, 3): the same features before and now, those that SAD has located in both sights (section IV.A)."""
-        F_a = corners(previous.lower, previous.usable, FEATURES)
-        F_b, found = self._tracked(previous, frame, F_a) if len(F_a) else (F_a, np.zeros(0, bool))
-        if not found.any():
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        Ma, Mb = self._points(previous, F_a[found]), self._points(frame, F_b[found])
-        both = np.isfinite(Ma).all(axis=1) & np.isfinite(Mb).all(axis=1)
-        return Ma[both], Mb[both]
-
-    def _tracked(self, previous: StereoFrame, frame: StereoFrame, F_a: Array) -> tuple[Array, Flags]:
-        """F_b (N, 2) and which were found; plain KLT takes Lucas and Kanade's word for it."""
+    def _track(self, previous: StereoFrame, frame: StereoFrame, features: Array) -> tuple[Array, Flags]:
+        """Return the pixels (N, 2) of features in a frame, and flags (N,) of those that were found."""
+        if not len(features):
+            return features, np.zeros(0, bool)
         if self._tracker == "klt":
-            return flow(previous.lower, frame.lower, F_a, F_a, self._klt)
-        return turned_track(previous, frame, F_a, self._klt)
+            return flow(previous.lower, frame.lower, features, features, self._klt)
+        return turned_track(previous, frame, features, self._klt)
 
-    def _points(self, frame: StereoFrame, features: Array) -> Array:
-        """3-D points (N, 3) in the rectified frame of features (N, 2), NaN where no located point is near: eq. (8)."""
-        disparity = nearby_disparity(frame.disparity, features, EPSILON_PX)
-        views = np.column_stack([features, features[:, 1] + disparity])
-        return triangulate(views, self._model.cylinder, self._model.baseline_m)
+    def _move(self, reference: Reference, motion: Registration, dt_s: float) -> None:
+        """Filter the motion of the points and compose its inverse to the current pose.
 
-    def _move(self, reference: Reference, found: Registration, dt_s: float) -> None:
-        """Filters the motion (section IV.D) and composes the inverse of what the points did: eq. (12).
-
-        The filter hears the fit's own covariance. It takes the twist where eq. (11) has Euler angles: the same for
-        small motions, and for large ones the only thing that is proportional to time.
+        The measurement noise of the filter is the covariance of the registration. The measurement is the twist where
+        eq. (11) has Euler angles: both agree for small motions, and for large ones only the twist is proportional to
+        time.
         """
-        T_ref_curr = se3.inverse(found.M)
-        T_prev_curr = se3.inverse(self._T) @ reference.T_odom_rect @ T_ref_curr
+        T_ref_curr = se3.inverse(motion.M)
+        T_prev_curr = se3.inverse(self._T_odom_rect) @ reference.T_odom_rect @ T_ref_curr
         if dt_s > 0:
             self._filter.predict(dt_s)
-            T_prev_curr = self._filter.update(T_prev_curr, found.covariance, dt_s)
-        self._T = self._T @ T_prev_curr
-        self._covariance = _carried(reference.covariance, T_ref_curr) + found.covariance
+            T_prev_curr = self._filter.update(T_prev_curr, motion.covariance, dt_s)
+        self._T_odom_rect = self._T_odom_rect @ T_prev_curr
+        self._covariance = _moved_covariance(reference.covariance, T_ref_curr) + motion.covariance
 
-    def _refuse(self, dt_s: float, located: int, inliers: int) -> OdometryEstimate:
-        """Stays where it was: the paper has nothing for this."""
+    def _refuse(self, frame: StereoFrame, dt_s: float, counts: tuple[int, int]) -> OdometryEstimate:
+        """Keep the pose and let its covariance grow: the paper does not treat this case. counts: tracked, inliers."""
         self._filter.reset()
-        self._covariance = self._covariance + (BLIND_SPEED * dt_s) ** 2 * np.eye(6)
-        return self._ego(TrackingState.LOST, located, inliers)
+        self._covariance = self._covariance + (UNTRACKED_SPEED_SIGMA * dt_s) ** 2 * np.eye(6)
+        self._set_reference(frame)
+        return self._result(TrackingState.LOST, *counts)
 
-    def _ego(self, state: TrackingState, tracked: int, inliers: int) -> OdometryEstimate:
+    def _result(self, state: TrackingState, tracked: int, inliers: int) -> OdometryEstimate:
         return OdometryEstimate(
-            self._T,
+            self._T_odom_rect,
             self._covariance,
             self._filter.velocity,
             self._filter.velocity_covariance,
@@ -153,10 +158,43 @@ class PaperOdometry:
         )
 
 
-def _carried(covariance: Array, T_a_b: Array) -> Array:
-    """Covariance (6, 6) of a pose, given in its own axes a, in the axes of b that is rigidly joined to it."""
+def _moved_covariance(covariance: Array, T_a_b: Array) -> Array:
+    """Return the covariance (6, 6) of a pose, given in its own axes a, in axes b that are rigidly joined to it."""
     A = se3.adjoint(se3.inverse(T_a_b))
     return np.asarray(A @ covariance @ A.T)
+
+
+def locate(frame: StereoFrame, features: Array, model: StereoModel) -> Array:
+    """Return 3-D points (N, 3) in the rectified frame of features (N, 2), by the located point next to each: eq. (8).
+
+    NaN where no located point is near.
+    """
+    disparity = nearby_disparity(frame.disparity, features, EPSILON_PX)
+    views = np.column_stack([features, features[:, 1] + disparity])
+    return triangulate(views, model.cylinder, model.baseline_m)
+
+
+def refine(
+    frames: tuple[StereoFrame, StereoFrame], features: Array, motion: Registration, model: StereoModel, klt: KltSettings
+) -> Registration:
+    """Return the motion between two frames estimated again from all located features (N, 2): figure 5, step 4.
+
+    The paper names this step and does not describe it. Here KLT starts where the motion predicts each feature, so that
+    features are found that the first search missed or tracked badly; those within THRESHOLD_M of the motion take part
+    in eq. (9) once more. With fewer than MIN_INLIERS of them the motion is returned as it is.
+    """
+    previous, current = frames
+    X_a = locate(previous, features, model)
+    known = np.isfinite(X_a).all(axis=1)
+    features, X_a = features[known], X_a[known]
+    predicted = view(se3.apply(motion.M, X_a), model.cylinder, model.baseline_m)[:, :2]
+    pixels, found = track(previous.lower, current.lower, features, predicted, klt)
+    X_a, X_b = X_a[found], locate(current, pixels[found], model)
+    error_m = np.linalg.norm(se3.apply(motion.M, X_a) - X_b, axis=1)
+    is_inlier = error_m < THRESHOLD_M  # false for NaN
+    if is_inlier.sum() < MIN_INLIERS:
+        return motion
+    return register(X_a[is_inlier], X_b[is_inlier], motion.M)
 
 
 def turned_track(
@@ -183,8 +221,8 @@ def turned_track(
             there, found = track(previous.lower, frame.lower, features, features + np.array([shift, 0.0]), klt)
             if found.sum() > most:
                 best, most = (there, found), int(found.sum())
-            if most >= AMPLE * len(features):
+            if most >= AMPLE_RATIO * len(features):
                 return best
-        if most == before and most >= ENOUGH * len(features):
+        if most == before and most >= ENOUGH_RATIO * len(features):
             break
     return best
