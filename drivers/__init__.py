@@ -1,1 +1,1 @@
-"""Hardware and logs: cameras, MCAP files, motors. Imports neither ``calib`` nor ``omnid``."""
+"""Hardware and logs: cameras, MCAP files, motors. Imports neither `calib` nor `omnid`."""

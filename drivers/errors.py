@@ -1,9 +1,9 @@
-"""What a driver raises: one line that says what was asked, what was found and what to do about it."""
+"""Exceptions of the drivers; each message is one line: what was requested, what was found, what to do."""
 
 
 class DriverError(Exception):
-    """A device or a log cannot be used as it was asked for."""
+    """A device or a log that cannot be used as requested."""
 
 
-class BrokenFrame(DriverError):  # noqa: N818 - it is told of a frame, not of the program
-    """One image cannot be decoded; the stream that brought it goes on."""
+class FrameDecodeError(DriverError):
+    """An image that cannot be decoded; the stream that delivered it continues."""

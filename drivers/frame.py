@@ -1,4 +1,4 @@
-"""One image of one camera as it came off the wire, and its grey pixels."""
+"""One undecoded image of one camera, and its conversion to grey pixels."""
 
 from __future__ import annotations
 
@@ -10,17 +10,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 
 Camera = Literal["lower", "upper"]
 
 MAX_PIXELS = 64 * 2**20
 _MAX_JPEG_SEGMENTS = 1000
-_PADDING_BYTES = 4096
-_OPENING = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
-_CLOSING = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
+_TAIL_BLOCK_BYTES = 4096  # the padding is searched backwards in blocks of this size
+_TAIL_BYTES = 16  # before the padding; longer than any end marker
+_START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
+_END_MARKER = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
+_PNG_SIZE = slice(16, 24)  # width and height in the IHDR chunk (PNG 1.2, 4.1.1)
+_JPEG_FIRST_FRAME, _JPEG_LAST_FRAME = 0xC0, 0xCF  # markers SOF0 to SOF15 (ITU T.81, table B.1)
+_JPEG_NO_FRAME = (0xC4, 0xC8, 0xCC)  # among them: DHT, JPG, DAC
+_JPEG_FILL = 0xFF
+_JPEG_FRAME_BYTES = 9  # marker, length, precision, height, width
 _CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
-_LUMA = {"yuyv": 0, "uyvy": 1}  # the channel, of two bytes a pixel
+_LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
+_MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
     "rgb8": cv2.COLOR_RGB2GRAY,
@@ -31,97 +38,101 @@ _TO_GRAY = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """An undecoded image; width, height, step and bigendian describe the raw encodings only."""
+    """An undecoded image; width, height, step and bigendian are used by the raw encodings only."""
 
-    seq: int  # counts the frames of this camera from 0
+    seq: int  # number of the frame of this camera, from 0
     stamp_ns: int  # capture time
     camera: Camera
     encoding: str  # jpeg | png | mono8 | mono16 | bgr8 | rgb8 | bgra8 | rgba8 | yuyv | uyvy | nv12
     data: memoryview | bytes | NDArray[Any]  # C-contiguous
     width: int = 0  # px
     height: int = 0  # px
-    step: int = 0  # bytes from row to row; 0: rows are packed
+    step: int = 0  # bytes from row to row; 0: rows without padding
     bigendian: bool = False  # byte order of mono16
 
 
 class FrameSource(Protocol):
-    """Whatever delivers frames: a camera, a log, a simulation."""
+    """A source of frames: a camera, a log, a simulation."""
 
     def frames(self) -> Iterator[Frame]:
-        """Gives the frames until the source ends or is closed."""
+        """Yield the frames until the source ends or is closed."""
 
     def close(self) -> None:
-        """Lets go of the device or file; may be called twice."""
+        """Release the device or file; may be called twice."""
 
 
 def gray(frame: Frame) -> NDArray[np.uint8]:
-    """The image as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
+    """Return the image as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
 
-    Colours are weighed as OpenCV does, mono16 keeps its upper byte, yuyv, uyvy and nv12 their luma as it is, and an
-    EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises BrokenFrame for
-    anything cut, malformed or unknown.
+    Colours are converted with OpenCV's weights; of mono16 the upper byte is kept, of yuyv, uyvy and nv12 the luma.
+    An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
+    an image that is truncated, malformed or of an unknown encoding.
     """
     try:
-        image = _decompress(frame) if frame.encoding in _OPENING else _unpack(frame)
+        image = _decompress(frame) if frame.encoding in _START_MARKER else _unpack(frame)
     except (cv2.error, ValueError, TypeError, BufferError, OverflowError, MemoryError) as error:
-        raise _broken(frame, " ".join(str(error).split())[:120]) from error
+        raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
     image.setflags(write=False)
     return image
 
 
-def _broken(frame: Frame, reason: str) -> BrokenFrame:
-    return BrokenFrame(f"{frame.camera} frame {frame.seq} ({frame.encoding[:40]!r}) cannot be decoded: {reason}")
+def _decode_error(frame: Frame, reason: str) -> FrameDecodeError:
+    encoding = frame.encoding[:_MAX_ENCODING]
+    return FrameDecodeError(f"{frame.camera} frame {frame.seq} ({encoding!r}) cannot be decoded: {reason}")
 
 
 def _decompress(frame: Frame) -> NDArray[np.uint8]:
     data = np.frombuffer(frame.data, np.uint8)
-    head = data[: len(_OPENING[frame.encoding])].tobytes()
-    if head != _OPENING[frame.encoding]:
-        raise _broken(frame, f"it starts with {head.hex() or 'nothing'}")
-    # libjpeg fills the missing rest of a cut image with grey and calls it a success, so the end is looked for first
-    if not _unpadded_tail(data).endswith(_CLOSING[frame.encoding]):
-        raise _broken(frame, f"its end is missing after {data.size} bytes")
-    _refuse_size(frame, *(_png_size(data) if frame.encoding == "png" else _jpeg_size(data)))
+    head = data[: len(_START_MARKER[frame.encoding])].tobytes()
+    if head != _START_MARKER[frame.encoding]:
+        raise _decode_error(frame, f"it starts with {head.hex() or 'nothing'}")
+    # libjpeg fills the missing part of a truncated image with grey and reports success, so the end is checked first
+    if not _unpadded_tail(data).endswith(_END_MARKER[frame.encoding]):
+        raise _decode_error(frame, f"its end is missing after {data.size} bytes")
+    width, height = _png_size(data) if frame.encoding == "png" else _jpeg_size(data)
+    _require_size(frame, width, height)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
-        raise _broken(frame, "its content is corrupt")
+        raise _decode_error(frame, "its content is corrupt")
     return np.ascontiguousarray(image, np.uint8)
 
 
 def _unpadded_tail(data: NDArray[np.uint8]) -> bytes:
-    """The last bytes before any padding with zeros, which cameras add to fill their buffers."""
+    """Return the last 16 bytes before the zeros with which cameras fill their buffers."""
     end = data.size
     while end:
-        tail = data[max(0, end - _PADDING_BYTES) : end].tobytes()
-        if kept := len(tail.rstrip(b"\0")):
-            return data[max(0, end - len(tail) + kept - 16) : end - len(tail) + kept].tobytes()
-        end -= len(tail)
+        block = data[max(0, end - _TAIL_BLOCK_BYTES) : end].tobytes()
+        start = end - len(block)
+        if used := len(block.rstrip(b"\0")):
+            return data[max(0, start + used - _TAIL_BYTES) : start + used].tobytes()
+        end = start
     return b""
 
 
 def _png_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    head = data[16:24].tobytes()
-    return int.from_bytes(head[:4], "big"), int.from_bytes(head[4:], "big")
+    """Return (width, height) from the IHDR chunk."""
+    size = data[_PNG_SIZE].tobytes()
+    return int.from_bytes(size[:4], "big"), int.from_bytes(size[4:], "big")
 
 
 def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    """(width, height) from the start-of-frame segment, (0, 0) where there is none (ITU T.81, B.1)."""
-    at = 2
+    """Return (width, height) from the start-of-frame segment, (0, 0) without one (ITU T.81, B.1.1 and B.2.2)."""
+    offset = 2  # after the start of image
     for _ in range(_MAX_JPEG_SEGMENTS):
-        segment = data[at : at + 9].tobytes()
-        if len(segment) < 9 or segment[0] != 0xFF:
+        segment = data[offset : offset + _JPEG_FRAME_BYTES].tobytes()
+        if len(segment) < _JPEG_FRAME_BYTES or segment[0] != _JPEG_FILL:
             break
         marker = segment[1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        if _JPEG_FIRST_FRAME <= marker <= _JPEG_LAST_FRAME and marker not in _JPEG_NO_FRAME:
             return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
-        at += 1 if marker == 0xFF else 2 + int.from_bytes(segment[2:4], "big")
+        offset += 1 if marker == _JPEG_FILL else 2 + int.from_bytes(segment[2:4], "big")
     return 0, 0
 
 
-def _refuse_size(frame: Frame, width: int, height: int) -> None:
-    """Raises BrokenFrame for a size that is empty or absurd, before anything of that size is allocated."""
+def _require_size(frame: Frame, width: int, height: int) -> None:
+    """Raise FrameDecodeError for an empty or excessive size, before anything of that size is allocated."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise _broken(frame, f"its size is {width} x {height} px, not 1 to {MAX_PIXELS} px in all")
+        raise _decode_error(frame, f"its size is {width} x {height} px, not 1 to {MAX_PIXELS} px in all")
 
 
 def _unpack(frame: Frame) -> NDArray[np.uint8]:
@@ -136,21 +147,23 @@ def _unpack(frame: Frame) -> NDArray[np.uint8]:
 
 
 def _pixels(frame: Frame) -> NDArray[Any]:
-    """A view of the raw pixels, (H, W) or (H, W, channels), that leaves out the padding of the rows and the planes
-    after the first."""
+    """Return a view of the raw pixels, (H, W) or (H, W, channels), without the padding of rows and further planes."""
     channels = _CHANNELS.get(frame.encoding)
     if channels is None:
-        raise _broken(frame, f"known encodings are {', '.join([*_OPENING, *_CHANNELS])}")
-    _refuse_size(frame, frame.width, frame.height)
-    dtype = np.dtype(np.uint8 if frame.encoding != "mono16" else ">u2" if frame.bigendian else "<u2")
-    pixel = channels * dtype.itemsize
-    row = frame.width * pixel
-    step = frame.step or row
+        raise _decode_error(frame, f"known encodings are {', '.join([*_START_MARKER, *_CHANNELS])}")
+    _require_size(frame, frame.width, frame.height)
+    dtype: np.dtype[Any] = np.dtype(np.uint8)
+    if frame.encoding == "mono16":
+        dtype = np.dtype(">u2" if frame.bigendian else "<u2")
+    pixel_bytes = channels * dtype.itemsize
+    row_bytes = frame.width * pixel_bytes
+    step = frame.step or row_bytes
     data = np.frombuffer(frame.data, np.uint8)
-    if step < row:
-        raise _broken(frame, f"its step is {step} bytes, a row of {frame.width} px takes {row}")
-    if data.size < step * (frame.height - 1) + row:
-        raise _broken(frame, f"it has {data.size} bytes, {frame.width} x {frame.height} px take {step * frame.height}")
-    shape, strides = (frame.height, frame.width, channels), (step, pixel, dtype.itemsize)
+    if step < row_bytes:
+        raise _decode_error(frame, f"its step is {step} bytes, a row of {frame.width} px takes {row_bytes}")
+    if data.size < step * (frame.height - 1) + row_bytes:
+        size = f"{frame.width} x {frame.height} px take {step * frame.height}"
+        raise _decode_error(frame, f"it has {data.size} bytes, {size}")
+    shape, strides = (frame.height, frame.width, channels), (step, pixel_bytes, dtype.itemsize)
     axes = 2 if channels == 1 else 3
     return np.ndarray(shape[:axes], dtype, buffer=data.data, strides=strides[:axes])

@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Final
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
-from drivers.logs.log_folder import Rotation
+from drivers.logs.log_folder import RotationSettings
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from omnid.core.control.heading_controller import HeadingLimits
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -205,10 +205,10 @@ class RecordConfig:
     cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
                              high=10_000_000)
 
-    def rotation(self) -> Rotation:
+    def rotation(self) -> RotationSettings:
         """The same for the driver of the files."""
-        return Rotation(self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6, self.free_mb * 10**6,
-                        self.sync_s)
+        return RotationSettings(self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6,
+                                self.free_mb * 10**6, self.sync_s)
 
 
 @dataclass(frozen=True, slots=True)

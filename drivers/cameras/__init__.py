@@ -1,1 +1,1 @@
-"""Cameras: V4L2 devices, and a log in the place of one."""
+"""Cameras: V4L2 devices, and recorded logs that replace them."""

@@ -1,4 +1,4 @@
-"""A V4L2 camera as a source of frames that outlives its unplugging."""
+"""A V4L2 camera as a source of frames that survives being unplugged."""
 
 from __future__ import annotations
 
@@ -12,51 +12,52 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.v4l2_buffers import NOTICE, WARNING, BufferAccounting, CameraState, Report
+from drivers.cameras.camera_state import CameraState
+from drivers.cameras.v4l2_buffers import BufferAccounting
 from drivers.cameras.v4l2_settings import V4l2Settings
-from drivers.cameras.v4l2_stream import V4l2Stream, explained
+from drivers.cameras.v4l2_stamps import StampValidator
+from drivers.cameras.v4l2_stream import V4l2Stream, device_error
 from drivers.errors import DriverError
+from drivers.events import NOTICE, WARNING, EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
 _FIRST_RETRY_S: Final = 0.1
-_SETTLED_FRAMES: Final = 30  # a device that comes and goes is waited for longer each time
-_PAUSE_S: Final = 0.005  # where a driver signals an error but tells none
-
-
-def unheard(severity: int, text: str) -> None:
-    """A report that goes nowhere."""
+_SETTLED_FRAMES: Final = 30  # after fewer frames the wait before the next try doubles, else it starts again
+_PAUSE_S: Final = 0.005  # where poll() reports a device as ready and no buffer is filled
 
 
 class V4l2Camera:
-    """The camera at settings.device, streaming from the start; DriverError where it cannot be had or set as asked.
+    """The camera at settings.device, streaming from construction on.
 
-    Once it has been opened, no fault of the device raises: it is let go, told of once by `report`, and opened again by
-    the same path with all its settings until it is back. `state` may be read from any thread.
+    Raises DriverError where the device cannot be opened or does not take the settings. Later faults of the device
+    raise nothing: it is released, reported once by `on_event`, and opened again by the same path with all its
+    settings until it is back. `state` may be read from any thread.
     """
 
-    def __init__(self, settings: V4l2Settings, camera: Camera, *, report: Report = unheard) -> None:
-        self._streams = deque([V4l2Stream(settings)])  # the open one, if any: to pop it is to own it
+    def __init__(self, settings: V4l2Settings, camera: Camera, *, on_event: EventCallback = ignore_event) -> None:
+        self._streams = deque([V4l2Stream(settings)])  # at most one; the thread that pops it closes it
         self.state = CameraState(mode=str(self._streams[0].image))
-        self._settings, self._camera, self._report = settings, camera, report
+        self._settings, self._camera, self._on_event = settings, camera, on_event
         self._name = f"{camera} camera"
-        self._ledger = BufferAccounting(self._name, self.state, report)
-        self._wake = _Wake()
+        self._accounting = BufferAccounting(self.state)
+        self._stamps = StampValidator(self._name, self.state, on_event)
+        self._wake = _WakeEvent()
         self._closing = self._reading = False
         self._bus_info = "" if Path(settings.device).is_symlink() else self._streams[0].bus_info
 
     def frames(self) -> Iterator[Frame]:
-        """Gives the images as they come, until `close`; what was taken before the first call is not among them."""
+        """Yield the frames as they arrive, until `close`; those captured before the first call are discarded."""
         self._reading = True
         retry_s = _FIRST_RETRY_S
         try:
             self._discard()
             while not self._closing:
-                given = self.state.frames
+                delivered = self.state.frames
                 try:
                     yield from self._images()
                 except (OSError, DriverError) as error:
                     self._lose(error)
-                    settled = self.state.frames - given > _SETTLED_FRAMES
+                    settled = self.state.frames - delivered > _SETTLED_FRAMES
                     retry_s = _FIRST_RETRY_S if settled else min(2 * retry_s, self._settings.retry_s)
                     self._wake.wait(retry_s)
         finally:
@@ -64,19 +65,22 @@ class V4l2Camera:
             self._end()
 
     def close(self) -> None:
-        """Ends `frames`, which lets go of the device, at once; without it, lets go here. For any thread, any times."""
+        """End `frames` at once, which then releases the device; release it here where `frames` is not running.
+
+        May be called from any thread, any number of times.
+        """
         self._closing = True  # before _reading is read; frames() writes and reads in the other order
         self._wake.set()
         if not self._reading:
             self._end()
 
     def _images(self) -> Iterator[Frame]:
-        """The images of one opening; OSError or DriverError at its end, unless closing."""
+        """Yield the frames of one opening; raise OSError or DriverError at its end, unless closing."""
         stream = self._streams[0] if self._streams else self._reopened()
         image = stream.image
-        self._ledger.begin()
+        self._accounting.restart()
         if self.state.status == "lost" and self._next(stream) is None:
-            return  # the first image anew is left out: it may be an old one (v4l2loopback) or a dark one (webcams)
+            return  # the first image after reopening is skipped: it may be old (v4l2loopback) or dark (webcams)
         while (filled := self._next(stream)) is not None:
             stamp_ns, data = filled
             seq = self._counted()
@@ -84,55 +88,59 @@ class V4l2Camera:
                         image.step)
 
     def _next(self, stream: V4l2Stream) -> tuple[int, bytes] | None:
-        """Stamp and bytes of the next good image, None when closing; DriverError when none came in time."""
+        """Return stamp and bytes of the next valid image, None when closing; raise DriverError at the timeout."""
         deadline_s = time.monotonic() + self._settings.timeout_s
         while not self._closing:
             if self._wake.wait_for(stream.fd, deadline_s - time.monotonic()):
                 filled = stream.take()
                 if filled is None:
                     self._wake.wait(_PAUSE_S)
-                elif (stamp_ns := self._admitted(filled[0], stream)) is not None:
+                elif (stamp_ns := self._accepted(filled[0], stream)) is not None:
                     return stamp_ns, filled[1]
             if time.monotonic() > deadline_s and not self._closing:
-                raise DriverError(f"camera {self._settings.device} sent no good image for "
+                raise DriverError(f"camera {self._settings.device} sent no valid image for "
                                   f"{self._settings.timeout_s:g} s; check its cable and power")
         return None
 
-    def _admitted(self, buffer: v4l2.V4l2Buffer, stream: V4l2Stream) -> int | None:
-        return self._ledger.admit(buffer, time.monotonic_ns(), stream.image.least_bytes)
+    def _accepted(self, buffer: v4l2.V4l2Buffer, stream: V4l2Stream) -> int | None:
+        """Return the capture time of a buffer [ns], None if it holds no image."""
+        arrival_ns = time.monotonic_ns()
+        if not self._accounting.accept(buffer, stream.image.min_bytes):
+            return None
+        return self._stamps.validate(buffer, arrival_ns)
 
     def _counted(self) -> int:
-        """The number of the image that is about to be given; with the first one the camera is here, or back."""
+        """Return the number of the next frame; the first one after a loss is reported."""
         if self.state.status == "lost":
-            self._report(NOTICE, f"{self._name}: back, {self.state.mode}")
+            self._on_event(NOTICE, f"{self._name}: back, {self.state.mode}")
         self.state.status, self.state.problem = "streaming", ""
         self.state.frames += 1
         return self.state.frames - 1
 
     def _lose(self, error: OSError | DriverError) -> None:
-        """Lets go of the device and says so, unless that is known."""
+        """Release the device; report it unless it was lost before."""
         self._release()
-        reason = explained(self._settings.device, error) if isinstance(error, OSError) else error
+        reason = device_error(self._settings.device, error) if isinstance(error, OSError) else error
         self.state.problem = str(reason)
         if self.state.status != "lost":
             self.state.status = "lost"
             self.state.losses += 1
-            self._report(WARNING, f"{self._name}: lost, and tried again until it is back: {reason}")
+            self._on_event(WARNING, f"{self._name}: lost, and tried again until it is back: {reason}")
 
     def _reopened(self) -> V4l2Stream:
-        """The device opened anew; DriverError also where a name that is not stable now leads to another camera."""
+        """Open the device again; raise DriverError too where its name now belongs to another camera."""
         stream = V4l2Stream(self._settings)
         self._streams.append(stream)
         self.state.reopens += 1
         if self._bus_info and stream.bus_info != self._bus_info:
-            raise DriverError(f"camera {self._settings.device} was at {self._bus_info}, there is now that at "
-                              f"{stream.bus_info}; use a name that stays, see `omnid cameras`")
+            raise DriverError(f"camera {self._settings.device} was at {self._bus_info}, and is another one at "
+                              f"{stream.bus_info} now; use a persistent name, see `omnid cameras`")
         self.state.mode = str(stream.image)
         return stream
 
     def _discard(self) -> None:
-        """Gives back what filled up before anybody read."""
-        with suppress(OSError):  # a device that was lost meanwhile says so again
+        """Return the buffers that were filled before the first read."""
+        with suppress(OSError):  # a lost device raises again at the next read
             while not self._closing and self._streams and self._streams[0].take():
                 pass
 
@@ -145,25 +153,25 @@ class V4l2Camera:
         self.state.status = "closed"
 
 
-class _Wake:
-    """A bell that any thread may ring, and that ends every wait from then on."""
+class _WakeEvent:
+    """An event that any thread may set; from then on it ends every wait."""
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def __del__(self) -> None:
-        os.close(self._fd)  # not earlier: somebody may still ring
+        os.close(self._fd)  # not earlier: another thread may still call set()
 
     def set(self) -> None:
-        """Rings."""
+        """Set the event."""
         os.eventfd_write(self._fd, 1)
 
     def wait(self, timeout_s: float) -> None:
-        """Returns when it rings, or after the time."""
+        """Return when the event is set, or after timeout_s."""
         self._poll((self._fd,), timeout_s)
 
     def wait_for(self, fd: int, timeout_s: float) -> bool:
-        """Whether the device has something to say, be it an error, before the bell rings and the time is over."""
+        """True if the device is ready, or in error, before the event is set and before timeout_s is over."""
         return any(ready == fd for ready, _ in self._poll((self._fd, fd), timeout_s))
 
     @staticmethod
@@ -171,4 +179,4 @@ class _Wake:
         poll = select.poll()
         for fd in fds:
             poll.register(fd, select.POLLIN)
-        return poll.poll(max(0.0, timeout_s) * 1000)
+        return poll.poll(max(0.0, timeout_s) * 1000)  # ms

@@ -1,8 +1,8 @@
-"""The part of the kernel's V4L2 interface that a camera needs: its structures, its request numbers and the call.
+"""The part of the kernel's V4L2 interface that a camera needs: structures, request numbers and the ioctl call.
 
-Source: linux/videodev2.h of Linux 6.1 and its documentation (userspace-api/media/v4l). The structures follow the C
-library's own long, so that they are right on 64 bits and on 32; there the kernel's old requests with a 32-bit timeval
-are used, which a monotonic clock does not outgrow.
+Source: linux/videodev2.h of Linux 6.1 and its documentation (userspace-api/media/v4l). The structures use the C
+library's `long`, which makes them correct on 64-bit and on 32-bit machines; the latter use the kernel's old requests
+with a 32-bit timeval, which CLOCK_MONOTONIC does not overflow.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ CAP_STREAMING: Final = 0x04000000
 CAP_DEVICE_CAPS: Final = 0x80000000
 CAP_TIMEPERFRAME: Final = 0x1000
 
-BUFFER_ERROR: Final = 0x40
-TIMESTAMP_MASK: Final = 0xE000
-TIMESTAMP_MONOTONIC: Final = 0x2000
+BUFFER_ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
+TIMESTAMP_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
+TIMESTAMP_MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
 
-NEXT_CONTROL: Final = 0x80000000
-CONTROL_DISABLED: Final = 0x01
-CONTROL_READ_ONLY: Final = 0x04
-CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER_MENU = 1, 2, 3, 9
+NEXT_CONTROL: Final = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
+CONTROL_DISABLED: Final = 0x01  # V4L2_CTRL_FLAG_DISABLED
+CONTROL_READ_ONLY: Final = 0x04  # V4L2_CTRL_FLAG_READ_ONLY
+CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER_MENU = 1, 2, 3, 9  # enum v4l2_ctrl_type
 
-Number = ctypes.c_int32
+Int32 = ctypes.c_int32
 _u8, _u32, _i32 = ctypes.c_uint8, ctypes.c_uint32, ctypes.c_int32
 
 
@@ -61,7 +61,7 @@ class Fraction(ctypes.Structure):
 
 
 class FrameInterval(ctypes.Structure):
-    """struct v4l2_frmivalenum; interval [s]: the only one, or the shortest, the longest and the step."""
+    """struct v4l2_frmivalenum; interval [s]: one discrete value, or min, max, step."""
 
     _fields_ = (("index", _u32), ("pixel_format", _u32), ("width", _u32), ("height", _u32), ("type", _u32),
                 ("interval", Fraction * 3), ("reserved", _u32 * 2))
@@ -76,7 +76,7 @@ class PixelFormat(ctypes.Structure):
 
 
 class _AnyFormat(ctypes.Union):
-    _fields_ = (("pix", PixelFormat), ("raw_data", _u8 * 200), ("aligned_as_pointers_are", ctypes.c_long))
+    _fields_ = (("pix", PixelFormat), ("raw_data", _u8 * 200), ("pointer_alignment", ctypes.c_long))
 
 
 class Format(ctypes.Structure):
@@ -102,7 +102,7 @@ class _Timeval(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_usec", ctypes.c_long))
 
 
-class _Place(ctypes.Union):
+class _BufferMemory(ctypes.Union):
     _fields_ = (("offset", _u32), ("userptr", ctypes.c_long))
 
 
@@ -110,12 +110,12 @@ class V4l2Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
     _fields_ = (("index", _u32), ("type", _u32), ("bytesused", _u32), ("flags", _u32), ("field", _u32),
-                ("timestamp", _Timeval), ("timecode", _u32 * 4), ("sequence", _u32), ("memory", _u32), ("m", _Place),
-                ("length", _u32), ("reserved2", _u32), ("request_fd", _u32))
+                ("timestamp", _Timeval), ("timecode", _u32 * 4), ("sequence", _u32), ("memory", _u32),
+                ("m", _BufferMemory), ("length", _u32), ("reserved2", _u32), ("request_fd", _u32))
 
     @property
     def stamp_ns(self) -> int:
-        """The kernel's stamp; of which clock, the flags say."""
+        """The kernel's stamp [ns]; the flags name its clock."""
         return int(self.timestamp.tv_sec) * 10**9 + int(self.timestamp.tv_usec) * 1000
 
 
@@ -127,7 +127,7 @@ class QueryControl(ctypes.Structure):
 
 
 class QueryMenu(ctypes.Structure):
-    """struct v4l2_querymenu; the first 8 bytes of name may be a number instead."""
+    """struct v4l2_querymenu; of an integer menu the first 8 bytes of name are a number."""
 
     _fields_ = (("id", _u32), ("index", _u32), ("name", ctypes.c_char * 32), ("reserved", _u32))
 
@@ -138,11 +138,11 @@ class V4l2Control(ctypes.Structure):
     _fields_ = (("id", _u32), ("value", _i32))
 
 
-_WRITE, _READ = 1, 2
+_WRITE, _READ = 1, 2  # _IOC_WRITE, _IOC_READ
 
 
-def _request(direction: int, number: int, argument: type[ctypes.Structure] | type[Number]) -> int:
-    """_IOC of asm-generic/ioctl.h for the type 'V'."""
+def _request(direction: int, number: int, argument: type[ctypes.Structure] | type[Int32]) -> int:
+    """Return the request number: _IOC of asm-generic/ioctl.h for the type 'V'."""
     return direction << 30 | ctypes.sizeof(argument) << 16 | ord("V") << 8 | number
 
 
@@ -154,8 +154,8 @@ REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
 QUERYBUF: Final = _request(_READ | _WRITE, 9, V4l2Buffer)
 QBUF: Final = _request(_READ | _WRITE, 15, V4l2Buffer)
 DQBUF: Final = _request(_READ | _WRITE, 17, V4l2Buffer)
-STREAMON: Final = _request(_WRITE, 18, Number)
-STREAMOFF: Final = _request(_WRITE, 19, Number)
+STREAMON: Final = _request(_WRITE, 18, Int32)
+STREAMOFF: Final = _request(_WRITE, 19, Int32)
 G_PARM: Final = _request(_READ | _WRITE, 21, StreamParameters)
 S_PARM: Final = _request(_READ | _WRITE, 22, StreamParameters)
 G_CTRL: Final = _request(_READ | _WRITE, 27, V4l2Control)
@@ -166,16 +166,16 @@ ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FrameSize)
 ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, FrameInterval)
 
 
-def call(fd: int, request: int, argument: ctypes.Structure | Number) -> None:
-    """Hands the argument to the driver, which fills in its answer; OSError with the driver's errno."""
+def call(fd: int, request: int, argument: ctypes.Structure | Int32) -> None:
+    """Pass the argument to the driver, which writes its result into it; raise OSError with the driver's errno."""
     fcntl.ioctl(fd, request, argument, True)
 
 
 def fourcc(code: int) -> str:
-    """The four letters of a pixel format, such as 'YUYV'."""
+    """Return the four letters of a pixel format, such as 'YUYV'."""
     return code.to_bytes(4, "little").decode("latin-1").rstrip()
 
 
 def fourcc_code(letters: str) -> int:
-    """The number of a pixel format's four letters."""
+    """Return the number of a pixel format given by its four letters."""
     return int.from_bytes(letters.ljust(4).encode("latin-1"), "little")

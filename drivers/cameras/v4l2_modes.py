@@ -1,4 +1,4 @@
-"""What a capture device offers to send, and which of it is taken for a image of a size and a rate."""
+"""The modes of a capture device (format, size, rate) and the choice of a format."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Any, Final
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.errors import DriverError
 
-# what each format is called in a Frame; the order is the order of choice: no decoding first, then fewer bytes
+# V4L2's fourcc -> the name in a Frame, in the order of preference: no decoding first, then fewer bytes
 ENCODINGS: Final = {"GREY": "mono8", "NV12": "nv12", "YUYV": "yuyv", "UYVY": "uyvy", "MJPG": "jpeg", "JPEG": "jpeg"}
-BYTES_PER_PIXEL: Final = {"GREY": 1, "NV12": 1, "YUYV": 2, "UYVY": 2}  # of a row of the first plane; else compressed
-RATE_TOLERANCE: Final = 0.02  # 29.97 Hz is 30 Hz
-_MAX_LISTED = 256  # of anything that a driver enumerates
+BYTES_PER_PIXEL: Final = {"GREY": 1, "NV12": 1, "YUYV": 2, "UYVY": 2}  # of the first plane; others are compressed
+RATE_TOLERANCE: Final = 0.02  # relative; 29.97 Hz passes for 30 Hz
+MAX_SIZE_PX: Final = 16384
+_MAX_ENUMERATED: Final = 256  # bounds every enumeration of a faulty driver
+_MAX_SHOWN: Final = 12  # modes in an error message
 
 
 @dataclass(frozen=True, slots=True)
-class Sizes:
-    """Widths or heights from low to high in steps, px."""
+class SizeRange:
+    """Widths or heights from low to high in steps [px]."""
 
     low: int
     high: int
@@ -33,19 +35,19 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """A format, its sizes and its rates; where the driver does not tell rates, there are none."""
+    """A format with its sizes and rates."""
 
     pixel_format: str  # four letters
-    widths: Sizes
-    heights: Sizes
-    rates_hz: tuple[float, ...] = ()  # falling; a driver that takes all rates between two tells these
+    widths: SizeRange
+    heights: SizeRange
+    rates_hz: tuple[float, ...] = ()  # descending; the limits where the rate is continuous; empty if unknown
 
-    def has(self, width_px: int, height_px: int) -> bool:
-        """Whether the size is one of its sizes."""
+    def has_size(self, width_px: int, height_px: int) -> bool:
+        """True if the size is offered."""
         return width_px in self.widths and height_px in self.heights
 
-    def reaches(self, rate_hz: float) -> bool:
-        """Whether the rate is not above the highest, as far as is known; 0 stands for any."""
+    def has_rate(self, rate_hz: float) -> bool:
+        """True if the rate is not above the highest one, or if the rates are unknown; 0 stands for any rate."""
         return not self.rates_hz or rate_hz <= self.rates_hz[0] * (1 + RATE_TOLERANCE)
 
     def __str__(self) -> str:
@@ -53,76 +55,77 @@ class Mode:
         return f"{self.pixel_format} {self.widths}x{self.heights}" + (f" at {rates} Hz" if rates else "")
 
 
-_ANY_SIZE: Final = (Sizes(1, 16384), Sizes(1, 16384))  # of a driver that tells none: what it gives is looked at
+_ANY_SIZE: Final = (SizeRange(1, MAX_SIZE_PX), SizeRange(1, MAX_SIZE_PX))  # where the driver enumerates no sizes
 
 
-def choose(modes: Iterable[Mode], pixel_format: str, size_px: tuple[int, int], rate_hz: float) -> str:
-    """The four letters of the format to ask for: the one named, or for "auto" the first of ENCODINGS that fits.
+def choose_format(modes: Iterable[Mode], pixel_format: str, size_px: tuple[int, int], rate_hz: float) -> str:
+    """Return the four letters of the format to request: the one named, or for "auto" the first match in ENCODINGS.
 
-    DriverError where the device does not offer it, with what it offers.
+    Raises DriverError, which lists what the device offers, where it has no such mode.
     """
     offered = list(modes)
     wanted = tuple(ENCODINGS) if pixel_format == "auto" else (pixel_format,)
-    fitting = {mode.pixel_format for mode in offered if mode.has(*size_px) and mode.reaches(rate_hz)}
+    matching = {mode.pixel_format for mode in offered if mode.has_size(*size_px) and mode.has_rate(rate_hz)}
     for name in wanted:
-        if name in fitting:
+        if name in matching:
             return name
-    asked = f"{pixel_format} {size_px[0]}x{size_px[1]} at {rate_hz:g} Hz"
+    requested = f"{pixel_format} {size_px[0]}x{size_px[1]} at {rate_hz:g} Hz"
     known = [str(mode) for mode in offered if mode.pixel_format in ENCODINGS]
-    found = "; ".join(known[:12]) + ("; ..." if len(known) > 12 else "") or "no format that is known here"
-    raise DriverError(f"{asked} is not offered; choose from: {found}")
+    found = "; ".join(known[:_MAX_SHOWN]) + ("; ..." if len(known) > _MAX_SHOWN else "") or "no supported format"
+    raise DriverError(f"{requested} is not offered; choose from: {found}")
 
 
-def modes(fd: int) -> list[Mode]:
-    """All modes of an open device, in the driver's order."""
+def list_modes(fd: int) -> list[Mode]:
+    """Return all modes of an open device in the driver's order."""
     return [Mode(v4l2.fourcc(code), widths, heights, tuple(_rates(fd, code, widths.low, heights.low)))
             for code in _formats(fd) for widths, heights in list(_sizes(fd, code)) or [_ANY_SIZE]]
 
 
 def _formats(fd: int) -> Iterator[int]:
-    def ask(index: int) -> v4l2.FormatDescription:
+    def query(index: int) -> v4l2.FormatDescription:
         entry = v4l2.FormatDescription(index=index, type=v4l2.CAPTURE)
         v4l2.call(fd, v4l2.ENUM_FMT, entry)
         return entry
 
-    return (entry.pixelformat for entry in _each(ask))
+    return (entry.pixelformat for entry in _enumerate(query))
 
 
-def _sizes(fd: int, code: int) -> Iterator[tuple[Sizes, Sizes]]:
-    def ask(index: int) -> v4l2.FrameSize:
+def _sizes(fd: int, code: int) -> Iterator[tuple[SizeRange, SizeRange]]:
+    def query(index: int) -> v4l2.FrameSize:
         entry = v4l2.FrameSize(index=index, pixel_format=code)
         v4l2.call(fd, v4l2.ENUM_FRAMESIZES, entry)
         return entry
 
-    for entry in _each(ask):
-        low_w, high_w, step_w, low_h, high_h, step_h = entry.size
+    for entry in _enumerate(query):
         if entry.type == v4l2.DISCRETE:
-            yield Sizes(low_w, low_w), Sizes(high_w, high_w)  # two numbers: width and height
+            width, height = entry.size[:2]
+            yield SizeRange(width, width), SizeRange(height, height)
         else:
-            yield Sizes(low_w, high_w, step_w), Sizes(low_h, high_h, step_h)
+            min_width, max_width, width_step, min_height, max_height, height_step = entry.size
+            yield SizeRange(min_width, max_width, width_step), SizeRange(min_height, max_height, height_step)
             return
 
 
 def _rates(fd: int, code: int, width: int, height: int) -> Iterator[float]:
-    def ask(index: int) -> v4l2.FrameInterval:
+    def query(index: int) -> v4l2.FrameInterval:
         entry = v4l2.FrameInterval(index=index, pixel_format=code, width=width, height=height)
         v4l2.call(fd, v4l2.ENUM_FRAMEINTERVALS, entry)
         return entry
 
     rates: set[float] = set()
-    for entry in _each(ask):
-        told = entry.interval[:1] if entry.type == v4l2.DISCRETE else entry.interval[:2]
-        rates |= {interval.denominator / interval.numerator for interval in told if interval.numerator}
+    for entry in _enumerate(query):
+        intervals = entry.interval[:1] if entry.type == v4l2.DISCRETE else entry.interval[:2]
+        rates |= {interval.denominator / interval.numerator for interval in intervals if interval.numerator}
         if entry.type != v4l2.DISCRETE:
             break
     return iter(sorted(rates, reverse=True))
 
 
-def _each(ask: Callable[[int], Any]) -> Iterator[Any]:
-    """What the driver answers for index 0, 1, ... until it has no more, which it says by an error."""
-    for index in range(_MAX_LISTED):
+def _enumerate(query: Callable[[int], Any]) -> Iterator[Any]:
+    """Yield the driver's entries for index 0, 1, ... up to its first error, which marks the end (EINVAL)."""
+    for index in range(_MAX_ENUMERATED):
         try:
-            entry = ask(index)
+            entry = query(index)
         except OSError:
             return
         yield entry

@@ -1,4 +1,4 @@
-"""How a V4L2 camera is to be set."""
+"""Settings of a V4L2 camera."""
 
 from __future__ import annotations
 
@@ -6,43 +6,44 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.cameras.v4l2_modes import ENCODINGS
+from drivers.cameras.v4l2_modes import ENCODINGS, MAX_SIZE_PX
 from drivers.errors import DriverError
 
 SWITCH: Final = ("keep", "on", "off")  # "keep" leaves a control as the camera has it
 POWER_LINE: Final = ("keep", "off", "50", "60", "auto")
 PIXEL_FORMATS: Final = ("auto", *ENCODINGS)
+_MAX_CONTROL: Final = 2**31 - 1  # struct v4l2_control holds a signed 32-bit value
 
 
 @dataclass(frozen=True, slots=True)
 class V4l2Settings:
-    """Device, image and controls; DriverError for a value that no camera takes."""
+    """Device, image and controls; raises DriverError for a value out of range."""
 
-    device: str  # a path that stays when the camera is plugged in again: /dev/omnid/lower, /dev/v4l/by-path/...
+    device: str  # a path that persists when the camera is plugged in again: /dev/omnid/lower, /dev/v4l/by-path/...
     width_px: int = 1280
     height_px: int = 960
-    rate_hz: float = 30.0  # 0: whatever the device does
+    rate_hz: float = 30.0  # 0: the device's own
     pixel_format: str = "auto"  # or GREY, NV12, YUYV, UYVY, MJPG, JPEG
     auto_exposure: str = "keep"  # keep, on or off
-    exposure_us: int = 0  # above 0: fixed, automatic off; in steps of 100
+    exposure_us: int = 0  # above 0: fixed, automatic exposure off; in steps of 100
     auto_gain: str = "keep"
-    gain: int = -1  # from 0: fixed, in the device's own units
+    gain: int = -1  # 0 and above: fixed, in the device's own units
     auto_white_balance: str = "keep"
     auto_focus: str = "keep"
-    focus: int = -1  # from 0: fixed, in the device's own units
-    power_line: str = "keep"  # keep, off, 50, 60 (Hz) or auto: against flicker of lamps
-    controls: tuple[str, ...] = ()  # any other, as `v4l2-ctl --list-ctrls` names it: "sharpness=2"
-    buffers: int = 4  # v4l2loopback wants this number
-    timeout_s: float = 2.0  # without a image for so long, the device is opened anew
+    focus: int = -1  # 0 and above: fixed, in the device's own units
+    power_line: str = "keep"  # keep, off, 50, 60 (Hz) or auto: suppresses the flicker of lamps
+    controls: tuple[str, ...] = ()  # any others, as `v4l2-ctl --list-ctrls` names them: "sharpness=2"
+    buffers: int = 4  # v4l2loopback needs exactly this number
+    timeout_s: float = 2.0  # without an image for so long, the device is opened again
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
 
     def __post_init__(self) -> None:
         for name, allowed in (("pixel_format", PIXEL_FORMATS), ("power_line", POWER_LINE), ("auto_exposure", SWITCH),
                               ("auto_gain", SWITCH), ("auto_white_balance", SWITCH), ("auto_focus", SWITCH)):
             self._require(name, getattr(self, name) in allowed, f"one of {', '.join(allowed)}")
-        for name, low, high in (("width_px", 16, 16384), ("height_px", 16, 16384), ("rate_hz", 0, 1000),
+        for name, low, high in (("width_px", 16, MAX_SIZE_PX), ("height_px", 16, MAX_SIZE_PX), ("rate_hz", 0, 1000),
                                 ("buffers", 2, 32), ("timeout_s", 0.05, 60), ("retry_s", 0.05, 60),
-                                ("exposure_us", 0, 10**7), ("gain", -1, 2**31 - 1), ("focus", -1, 2**31 - 1)):
+                                ("exposure_us", 0, 10**7), ("gain", -1, _MAX_CONTROL), ("focus", -1, _MAX_CONTROL)):
             value = getattr(self, name)
             self._require(name, low <= value <= high, f"{low} to {high}")
         self._require("device", self.device.startswith("/"), "a path such as /dev/v4l/by-path/..., see `omnid cameras`")
@@ -52,6 +53,6 @@ class V4l2Settings:
             self._require(f"auto_{name}", not (fixed and getattr(self, f"auto_{name}") == "on"),
                           f"off where a fixed {name} is set")
 
-    def _require(self, name: str, fine: bool, allowed: str) -> None:
-        if not fine:
+    def _require(self, name: str, valid: bool, allowed: str) -> None:
+        if not valid:
             raise DriverError(f"camera {self.device}: {name} is {getattr(self, name)!r}; give {allowed}")

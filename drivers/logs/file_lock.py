@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import IO
 
 
-def hold(file: IO[bytes]) -> None:
+def lock(file: IO[bytes]) -> None:
     """Marks the open file as being written until it is closed; without effect where the file system has no locks."""
     with suppress(OSError):
         fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def is_held(path: str | os.PathLike[str]) -> bool:
+def is_locked(path: str | os.PathLike[str]) -> bool:
     """Whether somebody writes the file, this program included; false where it cannot be opened."""
     if not Path(path).is_file():
         return False

@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
-from drivers.logs.file_lock import is_held
+from drivers.logs.file_lock import is_locked
 
-PART: Final = ".part"
+PART_SUFFIX: Final = ".part"
 _MAX_NUMBER: Final = 999_999
 _MB: Final = 10**6
 
 
 @dataclass(frozen=True, slots=True)
-class Rotation:
+class RotationSettings:
     """When a new file is begun, and what is kept of the old ones."""
 
     file_bytes: int = 500 * _MB  # a new file after so much
@@ -56,17 +56,17 @@ class LogFolder:
         self._name = re.sub(r"[^\w.-]", "-", name)
         self._pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,6})\.mcap(?:\.part)?")
 
-    def unused(self, stamp_ns: int, number: int) -> tuple[Path, int]:
+    def unused_path(self, stamp_ns: int, number: int) -> tuple[Path, int]:
         """A path for a file that starts at the stamp, and the number that it got, from `number` on."""
         at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
         for n in range(number, _MAX_NUMBER):
             whole = self.path / f"{self._name}_{at}_{n:03}.mcap"
-            part = Path(f"{whole}{PART}")
+            part = Path(f"{whole}{PART_SUFFIX}")
             if not (os.path.lexists(whole) or os.path.lexists(part)):
                 return part, n
         raise DriverError(f"cannot record to {str(self.path)!r}: all numbers are taken; name another folder")
 
-    def clear(self, files: int, size: int) -> int:
+    def delete_oldest(self, files: int, size: int) -> int:
         """Deletes the oldest recordings until at most so many files and bytes are left; how many that were.
 
         What is being written stays, and what cannot be deleted.
@@ -76,12 +76,12 @@ class LogFolder:
         for recording in found:
             if len(found) - deleted <= files and total <= size:
                 break
-            if not is_held(recording.path) and delete(recording.path):
+            if not is_locked(recording.path) and delete_file(recording.path):
                 total -= recording.size
                 deleted += 1
         return deleted
 
-    def require_room(self, wanted_bytes: int) -> None:
+    def require_free_space(self, wanted_bytes: int) -> None:
         """DriverError where the disk has less; makes the folder."""
         try:
             with suppress(FileExistsError):
@@ -103,7 +103,7 @@ class LogFolder:
                         yield RecordingFile(found[1], int(found[2]), Path(entry.path), entry.stat().st_size)
 
 
-def delete(path: Path) -> bool:
+def delete_file(path: Path) -> bool:
     """Deletes a file; whether that went well."""
     with suppress(OSError):
         path.unlink()
@@ -111,6 +111,6 @@ def delete(path: Path) -> bool:
     return False
 
 
-def without_part(path: Path) -> Path:
+def complete_path(path: Path) -> Path:
     """The name of a file once it is whole."""
-    return path.with_name(path.name.removesuffix(PART))
+    return path.with_name(path.name.removesuffix(PART_SUFFIX))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from drivers.logs.mcap_records import PARSE_ERRORS, RecordError, parsing
+from drivers.logs.mcap_records import PARSE_ERRORS, RecordError, parser
 
 _MAX_CHANNELS = 4096
 _MAX_DEFINITION_BYTES = 2**20
@@ -35,10 +35,10 @@ class Catalog:
             raise RecordError("more channels, schemas or text in them than any robot has")
         try:
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(parsing(body))
+                schema = Schema.read(parser(body))
                 self._types[schema.id] = _ros_name(schema.name[:_MAX_NAME])
             else:
-                channel = Channel.read(parsing(body))
+                channel = Channel.read(parser(body))
                 self._channels[channel.id] = _lean(channel)
         except PARSE_ERRORS as error:
             raise RecordError("a channel or schema record is malformed") from error

@@ -13,15 +13,15 @@ from mcap.records import Attachment, AttachmentIndex, Statistics
 
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_records import (
-    HEAD,
     MAGIC,
     PARSE_ERRORS,
+    RECORD_HEADER,
     ByteBuffer,
     LogFile,
     Record,
     RecordError,
-    content,
-    parsing,
+    parser,
+    read_content,
     records,
 )
 
@@ -34,7 +34,7 @@ _FOOTER = struct.Struct("<QQI")  # summary start, summary offset start, CRC of t
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class LogSummary:
     """The end of a whole log: what is in it and where."""
 
     catalog: Catalog
@@ -42,7 +42,7 @@ class Summary:
     attachments: tuple[int, ...] = field(repr=False)  # where their records start
 
 
-def read_summary(file: LogFile) -> Summary | None:
+def read_summary(file: LogFile) -> LogSummary | None:
     """The log's summary, None where the file is cut, was written without one, or the summary's CRC is wrong."""
     section = summary_section(file)
     if section is None:
@@ -51,16 +51,16 @@ def read_summary(file: LogFile) -> Summary | None:
     attachments: list[int] = []
     try:
         for record in records(section, 0, section.size):
-            body = content(section, record)
+            body = read_content(section, record)
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 catalog.add(record.opcode, body)
             elif record.opcode == Opcode.STATISTICS:
-                counts.update(Statistics.read(parsing(body)).channel_message_counts)
+                counts.update(Statistics.read(parser(body)).channel_message_counts)
             elif record.opcode == Opcode.ATTACHMENT_INDEX and len(attachments) < MAX_ATTACHMENTS:
-                attachments.append(AttachmentIndex.read(parsing(body)).offset)
+                attachments.append(AttachmentIndex.read(parser(body)).offset)
     except (RecordError, *PARSE_ERRORS):
         return None
-    return Summary(catalog, counts, tuple(attachments))
+    return LogSummary(catalog, counts, tuple(attachments))
 
 
 def has_footer(file: LogFile) -> bool:
@@ -69,10 +69,11 @@ def has_footer(file: LogFile) -> bool:
 
 
 def _footer(file: LogFile) -> bytes | None:
-    size = HEAD.size + _FOOTER.size
+    size = RECORD_HEADER.size + _FOOTER.size
     end = file.read(max(0, file.size - size - len(MAGIC)), size + len(MAGIC))
-    whole = len(end) == size + len(MAGIC) and end.endswith(MAGIC) and HEAD.unpack_from(end) == (2, _FOOTER.size)
-    return end[:size] if whole else None
+    if len(end) < size + len(MAGIC) or not end.endswith(MAGIC):
+        return None
+    return end[:size] if RECORD_HEADER.unpack_from(end) == (Opcode.FOOTER, _FOOTER.size) else None
 
 
 def summary_section(file: LogFile) -> ByteBuffer | None:
@@ -80,7 +81,7 @@ def summary_section(file: LogFile) -> ByteBuffer | None:
     footer = _footer(file)
     if footer is None:
         return None
-    start, _, crc = _FOOTER.unpack_from(footer, HEAD.size)
+    start, _, crc = _FOOTER.unpack_from(footer, RECORD_HEADER.size)
     size = file.size - len(MAGIC) - len(footer) - start
     if not start or not 0 < size <= _MAX_SUMMARY_BYTES:
         return None
@@ -90,7 +91,7 @@ def summary_section(file: LogFile) -> ByteBuffer | None:
     return ByteBuffer(section)
 
 
-def read_attachments(file: LogFile, summary: Summary | None) -> dict[str, bytes]:
+def read_attachments(file: LogFile, summary: LogSummary | None) -> dict[str, bytes]:
     """Name -> bytes of the attachments that are whole and within the limits; without a summary, those at the start."""
     found: dict[str, bytes] = {}
     places = records(file, len(MAGIC), file.size) if summary is None else _records_at(file, summary.attachments)
@@ -111,8 +112,8 @@ def _records_at(file: LogFile, offsets: tuple[int, ...]) -> Iterator[Record]:
 
 def _attachment(file: LogFile, record: Record) -> dict[str, bytes]:
     try:
-        body = content(file, record)
-        attachment = Attachment.read(parsing(body))
+        body = read_content(file, record)
+        attachment = Attachment.read(parser(body))
     except (RecordError, *PARSE_ERRORS):
         return {}
     crc = int.from_bytes(body[-4:], "little")

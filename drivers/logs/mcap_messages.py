@@ -9,21 +9,30 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_records import MAGIC, ByteSource, LogFile, Record, RecordError, content, records, unpack_chunk
+from drivers.logs.mcap_records import (
+    MAGIC,
+    ByteSource,
+    LogFile,
+    Record,
+    RecordError,
+    read_content,
+    records,
+    unpack_chunk,
+)
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
-class Message(NamedTuple):
+class LogMessage(NamedTuple):
     """A message not yet read: where its bytes are."""
 
     channel_id: int
     log_time_ns: int
     source: ByteSource
-    place: Record
+    record: Record
 
     def data(self) -> memoryview:
-        return content(self.source, self.place)
+        return read_content(self.source, self.record)
 
 
 class DataSection:
@@ -41,7 +50,7 @@ class DataSection:
         self.broken = 0
         self.at = len(MAGIC)
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[LogMessage]:
         for record in records(self._file, len(MAGIC), self._file.size):
             if record.opcode == Opcode.DATA_END or record.at > self._stop:
                 self.ended = record.opcode == Opcode.DATA_END
@@ -52,9 +61,9 @@ class DataSection:
             else:
                 yield from self._single(self._file, record)
 
-    def _chunk(self, record: Record) -> Iterator[Message]:
+    def _chunk(self, record: Record) -> Iterator[LogMessage]:
         try:
-            chunk = unpack_chunk(content(self._file, record))
+            chunk = unpack_chunk(read_content(self._file, record))
         except RecordError:
             self.broken += 1
             return
@@ -64,26 +73,26 @@ class DataSection:
             yield from self._single(chunk, inner)
         self.broken += end != chunk.size
 
-    def _single(self, source: ByteSource, record: Record) -> Iterator[Message]:
+    def _single(self, source: ByteSource, record: Record) -> Iterator[LogMessage]:
         try:
             if record.opcode == Opcode.MESSAGE:
                 yield _message(source, record)
             elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.catalog.add(record.opcode, content(source, record))
+                self.catalog.add(record.opcode, read_content(source, record))
         except RecordError:
             self.broken += 1
 
 
-def _message(source: ByteSource, record: Record) -> Message:
+def _message(source: ByteSource, record: Record) -> LogMessage:
     try:
         channel_id, _, log_time_ns, _ = _MESSAGE.unpack(source.read(record.at, min(record.size, _MESSAGE.size)))
     except struct.error as error:
         raise RecordError(f"a message record of {record.size} bytes is too short") from error
     rest = Record(record.opcode, record.at + _MESSAGE.size, record.size - _MESSAGE.size)
-    return Message(channel_id, log_time_ns, source, rest)
+    return LogMessage(channel_id, log_time_ns, source, rest)
 
 
-def scan(file: LogFile, limit_bytes: int, limit_messages: int) -> Catalog:
+def scan_channels(file: LogFile, limit_bytes: int, limit_messages: int) -> Catalog:
     """The channels that the start of a log mentions, for logs without a summary."""
     section = DataSection(file, Catalog(), stop=limit_bytes)
     for count, _ in enumerate(section.messages()):

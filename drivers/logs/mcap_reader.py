@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
-from drivers.errors import BrokenFrame, DriverError
+from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
-from drivers.logs.mcap_messages import DataSection, Message, scan
+from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
 from drivers.logs.mcap_records import LogFile, RecordError
+from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, RosImage, parse_image
-from drivers.logs.stamp_order import StampOrder
 from drivers.logs.topic_choice import choose_topics
 
 _SCAN_BYTES = 64 * 2**20
@@ -65,7 +65,7 @@ class LogReader:
         """Gives the frames of both cameras in the order of their stamps, each camera's seq from 0; data is bytes."""
         self._forget()
         section = DataSection(self._file, self._catalog)
-        order = StampOrder(self._window, self.counts)
+        order = ReorderBuffer(self._window, self.counts)
         for message in section.messages():
             taken = self._image(message)
             if taken is not None:
@@ -100,16 +100,16 @@ class LogReader:
         """From the summary; a cut log has none, so there the start of the file is looked through."""
         if self._summary is not None and self._summary.catalog.topics():
             return self._summary.catalog
-        return scan(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
+        return scan_channels(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
 
-    def _image(self, message: Message) -> tuple[Camera, RosImage] | None:
+    def _image(self, message: LogMessage) -> tuple[Camera, RosImage] | None:
         """The message's image, copied out of its chunk so that a waiting frame holds no more than itself."""
         topic = self._catalog.topic(message.channel_id)
         if topic is None or topic.name not in self._cameras or topic.type not in (IMAGE, COMPRESSED_IMAGE):
             return None
         try:
             image = parse_image(topic.type, message.data())
-        except (BrokenFrame, RecordError) as error:
+        except (FrameDecodeError, RecordError) as error:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)
             return None

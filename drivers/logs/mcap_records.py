@@ -25,7 +25,7 @@ from drivers.errors import DriverError
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 256 * 2**20
 
-HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 _CHUNK = struct.Struct("<QQQII")  # first log time, last log time, unpacked size, CRC, length of the compression's name
 _SIZE = struct.Struct("<Q")
 
@@ -127,19 +127,19 @@ def _file_in(path: Path) -> Path:
 def records(source: ByteSource, start: int, end: int) -> Iterator[Record]:
     """The records from start on, up to the first one that is cut or does not fit before end."""
     at = start
-    while at + HEAD.size <= end:
-        head = source.read(at, HEAD.size)
-        if len(head) < HEAD.size:
+    while at + RECORD_HEADER.size <= end:
+        head = source.read(at, RECORD_HEADER.size)
+        if len(head) < RECORD_HEADER.size:
             return
-        opcode, size = HEAD.unpack(head)
-        at += HEAD.size
+        opcode, size = RECORD_HEADER.unpack(head)
+        at += RECORD_HEADER.size
         if opcode == 0 or size > end - at:
             return
         yield Record(opcode, at, size)
         at += size
 
 
-def content(source: ByteSource, record: Record) -> memoryview:
+def read_content(source: ByteSource, record: Record) -> memoryview:
     """What the record holds; raises RecordError where that is too much, or not all there."""
     if record.size > MAX_RECORD_BYTES:
         raise RecordError(f"{record.size} bytes are more than {MAX_RECORD_BYTES}")
@@ -149,7 +149,7 @@ def content(source: ByteSource, record: Record) -> memoryview:
     return memoryview(data)
 
 
-def parsing(body: memoryview) -> ReadDataStream:
+def parser(body: memoryview) -> ReadDataStream:
     """The stream mcap's record classes parse from; they then raise one of PARSE_ERRORS or give what is there."""
     return ReadDataStream(BytesIO(body))
 

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.errors import DriverError
-from drivers.logs.file_lock import hold
+from drivers.logs.file_lock import lock
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
@@ -45,11 +45,11 @@ class LogWriter:
         exclusive: bool = False,
     ) -> None:
         self._path = Path(path)
-        self.messages = self.kept = 0
+        self.messages = self.persisted = 0
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._file = self._open("xb" if exclusive else "wb")
-        hold(self._file)
+        lock(self._file)
         self._usable = True
         self._flushed_bytes = 0
         self._flushed_ns: int | None = None
@@ -162,15 +162,15 @@ class LogWriter:
             self._flush()
         elif self._file.tell() != self._flushed_bytes:
             self._file.flush()
-            self._note_kept()
+            self._note_persisted()
 
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._note_kept()
+        self._note_persisted()
 
-    def _note_kept(self) -> None:
+    def _note_persisted(self) -> None:
         self._flushed_bytes = self._file.tell()
-        self.kept = self.messages
+        self.persisted = self.messages
 
     def _finish(self) -> None:
         self._flush()
@@ -181,7 +181,7 @@ class LogWriter:
     def _reach_disk(self) -> None:
         os.fsync(self._file.fileno())
         if os.fstat(self._file.fileno()).st_nlink == 0:
-            self.kept = 0
+            self.persisted = 0
             raise FileNotFoundError(errno.ENOENT, "the file has been deleted")
 
 

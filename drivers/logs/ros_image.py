@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -35,19 +35,19 @@ class RosImage:
 
 
 def parse_image(schema_name: str, message: memoryview) -> RosImage:
-    """The image in a CDR message of type IMAGE or COMPRESSED_IMAGE; raises BrokenFrame where there is none."""
+    """The image in a CDR message of type IMAGE or COMPRESSED_IMAGE; raises FrameDecodeError where there is none."""
     try:
         cdr = _Cdr(message)
         stamp_ns = _header(cdr)
         return _raw(cdr, stamp_ns) if schema_name == IMAGE else _compressed(cdr, stamp_ns)
     except struct.error as error:
-        raise BrokenFrame(f"a {schema_name} of {len(message)} bytes is cut short") from error
+        raise FrameDecodeError(f"a {schema_name} of {len(message)} bytes is cut short") from error
 
 
 def _header(cdr: _Cdr) -> int:
     seconds, nanoseconds = cdr.number("i"), cdr.number("I")
     if seconds < 0 or nanoseconds >= 10**9:
-        raise BrokenFrame(f"a message has the impossible stamp {seconds} s {nanoseconds} ns")
+        raise FrameDecodeError(f"a message has the impossible stamp {seconds} s {nanoseconds} ns")
     cdr.string()  # frame_id: which camera it is, the topic says
     return seconds * 10**9 + nanoseconds
 
@@ -70,7 +70,7 @@ class _Cdr:
 
     def __init__(self, message: memoryview) -> None:
         if len(message) < 4 or message[0] != 0 or message[1] not in (0, 1):
-            raise BrokenFrame(f"a message starts with {bytes(message[:4]).hex()}, not with a CDR header")
+            raise FrameDecodeError(f"a message starts with {bytes(message[:4]).hex()}, not with a CDR header")
         self._order = "<" if message[1] else ">"
         self._body = message[4:]
         self._at = 0

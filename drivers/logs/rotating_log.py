@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.errors import DriverError
-from drivers.logs.log_folder import LogFolder, Rotation, delete, without_part
+from drivers.events import NOTICE, WARNING, EventCallback, ignore_event
+from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, delete_file
 from drivers.logs.mcap_writer import LogWriter
-
-Report = Callable[[int, str], None]  # how grave it is and one line; the numbers of syslog and journald (RFC 5424)
-WARNING: Final = 4
-NOTICE: Final = 5
 
 _FIRST_RETRY_S: Final = 1.0
 _LAST_STAMP_NS: Final = 2**63
 
 
 @dataclass(slots=True)
-class RecordingState:
+class RotatingLogState:
     """How a recording is; its writing thread alone writes, any thread may read one entry at a time."""
 
     status: Literal["waiting", "recording", "stopped", "closed"] = "waiting"
@@ -36,10 +33,6 @@ class RecordingState:
     stops: int = 0
 
 
-def unheard(severity: int, text: str) -> None:
-    """A report that goes nowhere."""
-
-
 class RotatingLog:
     """Writes messages to MCAP files of limited size and age, each with the attachments; see log_folder for their names.
 
@@ -48,10 +41,11 @@ class RotatingLog:
     """
 
     def __init__(
-        self, folder: LogFolder, rotation: Rotation, attachments: Mapping[str, bytes], *, report: Report = unheard
-    ) -> None:
-        self.state = RecordingState()
-        self._folder, self._rotation, self._attachments, self._report = folder, rotation, attachments, report
+        self, folder: LogFolder, rotation: RotationSettings, attachments: Mapping[str, bytes],
+        *, on_event: EventCallback = ignore_event,
+    ) -> None:  # fmt: skip
+        self.state = RotatingLogState()
+        self._folder, self._rotation, self._attachments, self._on_event = folder, rotation, attachments, on_event
         self._writer: LogWriter | None = None
         self._path = folder.path
         self._number = 1
@@ -95,9 +89,9 @@ class RotatingLog:
 
     def _begin(self, stamp_ns: int) -> None:
         keep = self._rotation
-        self.state.deleted += self._folder.clear(keep.keep_files - 1, keep.keep_bytes - keep.file_bytes)
+        self.state.deleted += self._folder.delete_oldest(keep.keep_files - 1, keep.keep_bytes - keep.file_bytes)
         try:
-            self._folder.require_room(keep.free_bytes + keep.file_bytes)
+            self._folder.require_free_space(keep.free_bytes + keep.file_bytes)
             self._writer = self._created(stamp_ns)
         except DriverError as error:
             self._stop(error)
@@ -111,37 +105,37 @@ class RotatingLog:
     def _created(self, stamp_ns: int) -> LogWriter:
         """A new file under a name of its own, which nobody else can take in the meantime."""
         while True:
-            path, number = self._folder.unused(stamp_ns, self._number)
+            path, number = self._folder.unused_path(stamp_ns, self._number)
             self._number, self._path = number + 1, path
             try:
                 writer = LogWriter(path, self._attachments, compression="none", exclusive=True)
             except DriverError as error:
                 if isinstance(error.__cause__, FileExistsError):
                     continue
-                delete(path)
+                delete_file(path)
                 raise
-            if not os.path.lexists(without_part(path)):
+            if not os.path.lexists(complete_path(path)):
                 return writer
-            delete(path)  # another program has made and ended its own between our look and the creation
+            delete_file(path)  # another program has made and ended its own between our look and the creation
             _drop(writer)
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
         if self.state.refused == 1:
-            self._report(WARNING, f"recording: refused a message, and counts others: {reason}")
+            self._on_event(WARNING, f"recording: refused a message, and counts others: {reason}")
 
     def _stop(self, error: DriverError) -> None:
         """Lets go of the file at hand; what of it has reached the disk stays for `omnid log recover`."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
             self.state.stops += 1
-            self._report(WARNING, f"recording: stopped, and tried again until it works: {error}")
+            self._on_event(WARNING, f"recording: stopped, and tried again until it works: {error}")
         writer, self._writer = self._writer, None
         if writer is not None:
-            self.state.lost += writer.messages - writer.kept
+            self.state.lost += writer.messages - writer.persisted
             _drop(writer)
-            if not writer.kept:
-                delete(self._path)
+            if not writer.persisted:
+                delete_file(self._path)
         self.state.problem, self.state.file = str(error), ""
         self._retry_at_s = time.monotonic() + self._retry_s
         self._retry_s = min(2 * self._retry_s, self._rotation.retry_s)
@@ -150,18 +144,18 @@ class RotatingLog:
         """There is a file again, and it takes what is written."""
         lost = self.state.lost - self._lost_before
         self.state.status, self.state.problem, self._retry_s = "recording", "", _FIRST_RETRY_S
-        self._report(NOTICE, f"recording: goes on in {str(self._path)!r}; {lost} messages were lost")
+        self._on_event(NOTICE, f"recording: goes on in {str(self._path)!r}; {lost} messages were lost")
 
     def _tend(self, writer: LogWriter) -> None:
         """Brings the file to the disk now and then, and looks whether there is still room."""
-        if self.state.status == "stopped" and writer.kept:
+        if self.state.status == "stopped" and writer.persisted:
             self._go_on()
         if time.monotonic() - self._synced_s < self._rotation.sync_s:
             return
         writer.sync()
         self._synced_s = time.monotonic()
         try:
-            self._folder.require_room(self._rotation.free_bytes)
+            self._folder.require_free_space(self._rotation.free_bytes)
         except DriverError as error:
             self._end()
             self._stop(error)
@@ -180,7 +174,7 @@ class RotatingLog:
 
     def _name_whole(self) -> None:
         try:
-            self._path.rename(without_part(self._path))
+            self._path.rename(complete_path(self._path))
         except OSError as error:
             raise DriverError(f"cannot rename the log {str(self._path)!r}: {error.strerror}; is its folder gone?"
                               ) from error

@@ -19,7 +19,7 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 
 T = TypeVar("T")
-Script: TypeAlias = Generator[bytes, bytes, T]
+Transaction: TypeAlias = Generator[bytes, bytes, T]
 
 
 class Framer(Protocol):
@@ -43,17 +43,17 @@ class MotorProtocol(Protocol):
     def framer(self) -> Framer:
         """A new one for its answers."""
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Prepares the controller, has it stop by itself after watchdog_ms, and gives the time in force [ms].
 
         DriverError where it does not.
         """
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Hands a command over; now_s is any steady clock. DriverError for a command that it refuses."""
 
 
-def heard(data: bytes, parse: Callable[[bytes], T | None]) -> Script[T]:
+def request(data: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
     """Writes data and gives the first frame that parse knows."""
     frame = yield data
     while (found := parse(frame)) is None:

@@ -15,7 +15,7 @@ import serial  # type: ignore[import-untyped]
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import MotorProtocol, Script, T
+from drivers.motors.motor_protocol import MotorProtocol, T, Transaction
 from drivers.motors.protocols.line_protocol import LineProtocol
 
 CONNECT_TRY_S = 0.2
@@ -33,11 +33,11 @@ _REASONS = {
 }
 
 
-class Silence(DriverError):  # noqa: N818 - it is what was heard
+class NoReplyError(DriverError):
     """No answer within the time; the port is still there."""
 
 
-class Late(Silence):
+class LateReplyError(NoReplyError):
     """No answer within the time, but the last one is so young that the controller's watchdog cannot have expired."""
 
 
@@ -70,7 +70,7 @@ class SerialMotor:
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
         self.errors = 0  # calls of `send` that failed
-        self.withheld = 0  # commands in place of which a stop was told
+        self.replaced_by_stop = 0  # commands in place of which a stop was told
         self.connections = 0
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
@@ -100,8 +100,8 @@ class SerialMotor:
             return self._sent(command, time.monotonic() + self._timeout_s)
         except DriverError as error:
             self.errors += 1
-            if isinstance(error, Silence) and self._surely_drives():
-                raise Late(str(error)) from None
+            if isinstance(error, NoReplyError) and self._surely_drives():
+                raise LateReplyError(str(error)) from None
             self._stop_first = True
             raise
 
@@ -131,7 +131,7 @@ class SerialMotor:
         self._stop_first = status.watchdog_expired
         if is_stop(command) or not stopping:
             return status
-        self.withheld += 1
+        self.replaced_by_stop += 1
         return replace(status, watchdog_expired=True)
 
     def _connect(self, connect_s: float) -> None:
@@ -149,7 +149,7 @@ class SerialMotor:
         """Silence is borne until the deadline; the last try may go on past it."""
         try:
             self._sent(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
-        except Silence:
+        except NoReplyError:
             if time.monotonic() >= deadline_s:
                 raise
             return
@@ -164,7 +164,7 @@ class SerialMotor:
         self.connections += 1
 
     def _stopped(self) -> bool:
-        with contextlib.suppress(Silence):
+        with contextlib.suppress(NoReplyError):
             self._run(self._protocol.drive(stop_command(0), time.monotonic()), time.monotonic() + self._timeout_s)
             return True
         return False
@@ -186,23 +186,23 @@ class SerialMotor:
             with contextlib.suppress(OSError, termios.error):
                 port.close()
 
-    def _run(self, script: Script[T], deadline_s: float) -> T:
+    def _run(self, transaction: Transaction[T], deadline_s: float) -> T:
         """What a script returns; Silence at the deadline, after a last look at what a late thread finds waiting."""
-        heard = self._framer.garbage + self._protocol.bad_frames
+        request = self._framer.garbage + self._protocol.bad_frames
         try:
             self._forget_input()
-            self._write(next(script))
+            self._write(next(transaction))
             overdue = False
             while not overdue:
                 overdue = time.monotonic() >= deadline_s
                 for frame in self._framer.feed(self._read(deadline_s)):
-                    self._write(script.send(frame))
-            raise Silence
+                    self._write(transaction.send(frame))
+            raise NoReplyError
         except StopIteration as done:
             result: T = done.value
             return result
-        except Silence:
-            raise self._silence(self._framer.garbage + self._protocol.bad_frames - heard) from None
+        except NoReplyError:
+            raise self._silence(self._framer.garbage + self._protocol.bad_frames - request) from None
         except DriverError as error:
             raise DriverError(f"motor on {self._name}: {error}") from None
         except (OSError, termios.error) as error:
@@ -220,9 +220,9 @@ class SerialMotor:
         if data and self._port is not None:
             try:
                 if os.write(self._port.fileno(), data) < len(data):
-                    raise Silence
+                    raise NoReplyError
             except BlockingIOError:
-                raise Silence from None
+                raise NoReplyError from None
 
     def _read(self, deadline_s: float) -> bytes:
         """What has arrived, or arrives until the deadline.
@@ -231,7 +231,7 @@ class SerialMotor:
         kernel that has no priority, on a busy machine far beyond any timeout.
         """
         if self._port is None:
-            raise Silence
+            raise NoReplyError
         while not self._port.in_waiting:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
@@ -239,13 +239,13 @@ class SerialMotor:
             time.sleep(min(left_s, LOOK_S))
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
-    def _silence(self, nonsense: int) -> Silence:
+    def _silence(self, nonsense: int) -> NoReplyError:
         if nonsense:
-            return Silence(
+            return NoReplyError(
                 f"motor on {self._name} answers, but not in its protocol; check motor.protocol, the baud rate "
                 f"({self._baud}) and the cable"
             )
-        return Silence(
+        return NoReplyError(
             f"motor on {self._name} gave no answer; check power, cable, the baud rate ({self._baud}) and motor.protocol"
         )
 

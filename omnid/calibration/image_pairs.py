@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
 from drivers.logs.mcap_reader import LogReader
 from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
@@ -81,7 +81,7 @@ def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedImages:
 def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:
     try:
         return gray(pair[0]), gray(pair[1])
-    except BrokenFrame:
+    except FrameDecodeError:
         return None
 
 

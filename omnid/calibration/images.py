@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import BrokenFrame, DriverError
+from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray
 from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_messages import DataSection, Message, scan
+from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
 from drivers.logs.mcap_records import LogFile
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
@@ -92,7 +92,7 @@ def one_size(images: Images) -> None:
 def _of_log(path: Path, topic: str | None) -> Images:
     file = LogFile(path)
     try:
-        catalog = scan(file, SCAN_BYTES, SCAN_MESSAGES)
+        catalog = scan_channels(file, SCAN_BYTES, SCAN_MESSAGES)
         chosen = _topic(path, catalog, topic)
         stride = max(1, sum(1 for _ in _messages(file, catalog, chosen)) // LOG_FRAMES)
         return dict(_frames(file, catalog, chosen, stride))
@@ -111,7 +111,7 @@ def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
     raise OmnidError(f"{path}: expected {wanted}, found image topics {', '.join(images) or '(none)'}")
 
 
-def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[Message]:
+def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[LogMessage]:
     for message in DataSection(file, catalog).messages():
         found = catalog.topic(message.channel_id)
         if found is not None and found.name == topic:
@@ -128,7 +128,7 @@ def _frames(file: LogFile, catalog: Catalog, topic: str, stride: int) -> Iterato
             image = parse_image(kind.type, message.data())
             yield f"frame{number:06d}", gray(Frame(number, image.stamp_ns, "lower", image.encoding, image.data,
                                                    image.width, image.height, image.step, image.bigendian))
-        except (BrokenFrame, DriverError):
+        except (FrameDecodeError, DriverError):
             continue
 
 

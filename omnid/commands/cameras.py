@@ -22,14 +22,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints the list; 1 if there is none."""
-    from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, described, udev_rules
+    from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, describe_device, udev_rules
 
     devices = capture_devices(ROOT)
     if not devices:
         print("omnid: no cameras: the kernel knows no capture device; check the cables, and what `dmesg` says of them",
               file=sys.stderr)
         return 1
-    print("\n\n".join("\n".join(described(device)) for device in devices))
+    print("\n\n".join("\n".join(describe_device(device)) for device in devices))
     if rules := list(udev_rules(devices)):
         print(_ADVICE.format(file=RULES_FILE), *rules, sep="\n")
     return 0

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.logs.mcap_info import Survey
-    from drivers.logs.mcap_recover import Recovery
+    from drivers.logs.mcap_info import LogInfo
+    from drivers.logs.mcap_recovery import Recovery
 
 WIDEST = 60  # characters of a topic or a type in a column
 
@@ -32,24 +32,24 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run_info(args: argparse.Namespace) -> int:
     """Prints what is in each log; 1 if one is broken, 2 if one is none."""
     from drivers.errors import DriverError
-    from drivers.logs.mcap_info import State, survey
+    from drivers.logs.mcap_info import LogState, read_log_info
 
     code = 0
     for number, path in enumerate(args.logs):
         try:
-            found = survey(path)
+            found = read_log_info(path)
         except DriverError as error:
             print(f"omnid: {error}", file=sys.stderr)
             code = 2
             continue
         print(*[""] * bool(number), *_described(found), sep="\n")
-        code = max(code, int(found.state is State.BROKEN))
+        code = max(code, int(found.state is LogState.BROKEN))
     return code
 
 
 def run_recover(args: argparse.Namespace) -> int:
     """Makes a log whole."""
-    from drivers.logs.mcap_recover import recover
+    from drivers.logs.mcap_recovery import recover
 
     out = args.output or _mended(args.log)
     print("\n".join(_reported(recover(args.log, out), args.log, out)))
@@ -57,9 +57,9 @@ def run_recover(args: argparse.Namespace) -> int:
 
 
 def _mended(path: Path) -> Path:
-    from drivers.logs.log_folder import PART, without_part
+    from drivers.logs.log_folder import PART_SUFFIX, complete_path
 
-    return without_part(path) if path.name.endswith(PART) else path.with_name(f"{path.stem}.recovered.mcap")
+    return complete_path(path) if path.name.endswith(PART_SUFFIX) else path.with_name(f"{path.stem}.recovered.mcap")
 
 
 def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
@@ -76,7 +76,7 @@ def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
     yield f"{path} could be read up to byte {found.end} of {path.stat().st_size}; it was left as it is"
 
 
-def _described(found: Survey) -> Iterator[str]:
+def _described(found: LogInfo) -> Iterator[str]:
     yield f"log          {found.path}"
     yield f"size         {_bytes(found.size)}"
     yield f"state        {_state(found)}"
@@ -92,19 +92,19 @@ def _described(found: Survey) -> Iterator[str]:
         yield from _table(found, duration_s)
 
 
-def _state(found: Survey) -> str:
-    from drivers.logs.mcap_info import State
+def _state(found: LogInfo) -> str:
+    from drivers.logs.mcap_info import LogState
 
     advice = f"`omnid log recover {found.path}`"
-    if found.state is State.BROKEN:
+    if found.state is LogState.BROKEN:
         corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
         return f"cut or corrupt after byte {found.read} of {found.size}{corrupt}: {advice} saves what is whole"
-    if found.state is State.UNINDEXED:
+    if found.state is LogState.UNINDEXED:
         return f"{found.state.value}, so some readers refuse it: {advice} gives it one"
     return str(found.state.value)
 
 
-def _table(found: Survey, duration_s: float) -> Iterator[str]:
+def _table(found: LogInfo, duration_s: float) -> Iterator[str]:
     rows = [(_shown(name), _shown(kind) or "-", count) for name, (kind, count) in found.topics.items()]
     wide = min(WIDEST, max(len(name) for name, _, _ in rows))
     wide_kind = min(WIDEST, max(len(kind) for _, kind, _ in rows))

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as closing:
         sources: dict[Camera, V4l2Camera] = {}
         for name in cameras:
-            sources[name] = V4l2Camera(config.cameras.settings(name), name, report=_say)
+            sources[name] = V4l2Camera(config.cameras.settings(name), name, on_event=_say)
             closing.callback(sources[name].close)
         state = record(sources, config, rig, _say).state
     return 0 if state.messages > state.lost + state.refused else 1

@@ -59,13 +59,13 @@ def _devices(config: Config) -> Opener:
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import say
 
-    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, report=say)
+    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=say)
 
 
 def _recorded(args: argparse.Namespace) -> Opener:
     from drivers.cameras.log_camera import LogCamera, LogImages
 
-    images = LogImages.of(args.log)
+    images = LogImages.load(args.log)
     epoch_ns = time.monotonic_ns()
     return lambda camera: LogCamera(images, camera, epoch_ns, pace=args.pace, once=args.once)
 

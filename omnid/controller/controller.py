@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
-from drivers.motors.serial_motor import Late
+from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.heading_controller import HeadingController, HeadingLimits, Setpoint, Twist
 from omnid.core.control.heading_goal import HeadingGoal
@@ -176,7 +176,7 @@ class Controller:
         """The controller's answer; None where it gave none."""
         try:
             status = self._driver.send(command)
-        except Late:
+        except LateReplyError:
             self._sent = drive  # it was told, and will have heard: the next step goes on from there
             self.account.late += 1
             return None

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
-from drivers.motors.protocols.registry import PROTOCOLS
-from drivers.motors.serial_motor import SerialMotor, Silence
-from drivers.motors.simulated.controllers import TWINS
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from drivers.motors.serial_motor import NoReplyError, SerialMotor
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import MotorConfig
 from omnid.engine.graph import Slot
@@ -52,7 +52,7 @@ class MotorTick:
         except DriverError as error:
             self.errors += 1
             since_ns, first = self._failing = self._failing or (time.monotonic_ns(), error)
-            patience_ns = SILENCE_S * 1e9 if isinstance(error, Silence) else self._stale_ns
+            patience_ns = SILENCE_S * 1e9 if isinstance(error, NoReplyError) else self._stale_ns
             if time.monotonic_ns() - since_ns > patience_ns:
                 raise first from None
 
@@ -72,7 +72,7 @@ def open_motor(config: MotorConfig, closing: ExitStack) -> tuple[SerialMotor, Si
                           f"give at least {least_ms:.0f}, {WATCHDOG_TICKS} ticks, or a higher rate")
     twin = None
     if config.port == SIMULATED:
-        twin = SimulatedMotor(TWINS[config.protocol](config.drive.geometry()))
+        twin = SimulatedMotor(SIMULATED_CONTROLLERS[config.protocol](config.drive.geometry()))
         closing.callback(twin.close)
     protocol = PROTOCOLS[config.protocol](config.drive.geometry())
     driver = SerialMotor(twin.port if twin else config.port, protocol, baud=config.baud,

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
-from drivers.cameras.v4l2_buffers import CameraState
+from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE

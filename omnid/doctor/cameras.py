@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras.v4l2_devices import CaptureDevice
-from drivers.cameras.v4l2_modes import choose
+from drivers.cameras.v4l2_modes import choose_format
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from omnid.doctor.devices import access, holders, is_ours
@@ -112,7 +112,7 @@ def _troubles(subject: str, settings: V4l2Settings, device: CaptureDevice) -> It
 
 def _format(settings: V4l2Settings, device: CaptureDevice) -> str:
     size = settings.width_px, settings.height_px
-    return choose(device.modes, settings.pixel_format, size, settings.rate_hz)
+    return choose_format(device.modes, settings.pixel_format, size, settings.rate_hz)
 
 
 def _image(settings: V4l2Settings, device: CaptureDevice) -> str:

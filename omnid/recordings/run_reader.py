@@ -17,8 +17,8 @@ import numpy as np
 from calib import se3
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import read_attachments, read_summary
-from drivers.logs.mcap_info import State, Survey, survey
-from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_info import LogInfo, LogState, read_log_info
+from drivers.logs.mcap_messages import DataSection, LogMessage
 from drivers.logs.mcap_records import LogFile, RecordError
 from omnid.errors import OmnidError
 from omnid.recordings.series_differences import Series
@@ -51,7 +51,7 @@ def read_run(path: Path, topic: str | None = None) -> Run:
 
     DriverError where there is no log, OmnidError where it has no poses, or more than can be held.
     """
-    found = survey(path)
+    found = read_log_info(path)
     odometry = _odometry_topic(found, topic)
     columns = {name: _Column(width) for name, width in (("poses", 7), ("states", 2), ("drive", 2))}
     robot = odometry.rpartition("/")[0]
@@ -66,7 +66,7 @@ def read_run(path: Path, topic: str | None = None) -> Run:
                tuple(_warnings(found, wanted)))
 
 
-def _odometry_topic(found: Survey, topic: str | None) -> str:
+def _odometry_topic(found: LogInfo, topic: str | None) -> str:
     names = [name for name, (kind, _) in found.topics.items() if kind == ODOMETRY_SCHEMA]
     if topic is not None:
         if topic not in names:
@@ -119,7 +119,7 @@ class _Reading:
     column: _Column
     broken: int = 0
 
-    def take(self, message: Message) -> None:
+    def take(self, message: LogMessage) -> None:
         """Adds the row of a message, if it is one."""
         try:
             row = self.parse(bytes(message.data()))
@@ -167,10 +167,10 @@ def _drive(payload: bytes) -> Row:
     return stamp_ns, (velocity_mps, yaw_rate_radps)
 
 
-def _warnings(found: Survey, wanted: Mapping[str, _Reading]) -> list[str]:
+def _warnings(found: LogInfo, wanted: Mapping[str, _Reading]) -> list[str]:
     """What makes a recording less than whole, one line each."""
     parts = []
-    if found.state in (State.BROKEN, State.WRITTEN):
+    if found.state in (LogState.BROKEN, LogState.WRITTEN):
         parts.append(f"{found.path}: {found.state.value}: what is whole up to byte {found.read} is compared")
     for topic, reading in wanted.items():
         if reading.broken:

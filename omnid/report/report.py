@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.logs.mcap_info import State
+from drivers.logs.mcap_info import LogState
 from omnid import __version__
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory
@@ -88,7 +88,7 @@ def _warnings(recording: ReportData, true: Trajectory | None) -> list[str]:
     """What makes the rest of the page worth less."""
     found, poses = recording.survey, recording.poses
     lines = []
-    if found.state is State.BROKEN:
+    if found.state is LogState.BROKEN:
         lines.append(f"The log is cut or corrupt after byte {found.read} of {found.size}; this is what could be read.")
     if found.broken:
         lines.append(f"{found.broken} corrupt chunks or records were skipped.")

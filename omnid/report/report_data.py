@@ -18,8 +18,8 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.mcap_catalog import Catalog, LogTopic
 from drivers.logs.mcap_index import read_attachments, read_summary
-from drivers.logs.mcap_info import Survey, survey
-from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_info import LogInfo, read_log_info
+from drivers.logs.mcap_messages import DataSection, LogMessage
 from drivers.logs.mcap_records import LogFile, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
@@ -55,7 +55,7 @@ class DriveCommand:
 class ReportData:
     """What a log holds, in bounded memory."""
 
-    survey: Survey
+    survey: LogInfo
     topic: str  # of the odometry
     attachments: Mapping[str, bytes]
     rig: Rig | None
@@ -90,7 +90,7 @@ def read_recording(path: Path, topic: str | None = None, keep_poses: bool = Fals
 
     OmnidError where there is no odometry in it, DriverError where there is no log.
     """
-    found = survey(path)
+    found = read_log_info(path)
     with closing(LogFile(path)) as file:
         summary = read_summary(file)
         attachments = read_attachments(file, summary)
@@ -107,7 +107,7 @@ def read_recording(path: Path, topic: str | None = None, keep_poses: bool = Fals
     return recording
 
 
-def choose_odometry(found: Survey, topic: str | None) -> str:
+def choose_odometry(found: LogInfo, topic: str | None) -> str:
     """The topic of the poses; OmnidError where there is none, or it is not clear which."""
     known = [name for name, (kind, count) in found.topics.items() if kind == ODOMETRY_SCHEMA and count]
     if topic is not None and topic not in known:
@@ -120,7 +120,7 @@ def choose_odometry(found: Survey, topic: str | None) -> str:
     raise OmnidError(_no_odometry(found))
 
 
-def _no_odometry(found: Survey) -> str:
+def _no_odometry(found: LogInfo) -> str:
     if any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in found.topics.values()):
         rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
         return (f"{found.path}: images but no poses: first `omnid replay {found.path}{rig} --record out.mcap`, then "
@@ -152,7 +152,7 @@ class _Reading:
         self._early: deque[Diagnostics] = deque(maxlen=EARLY)  # that came before the first pose
         self._cloud: bytes | None = None
 
-    def take(self, messages: Iterable[Message], catalog: Catalog) -> None:
+    def take(self, messages: Iterable[LogMessage], catalog: Catalog) -> None:
         """All messages."""
         for message in messages:
             topic = catalog.topic(message.channel_id)
@@ -165,9 +165,9 @@ class _Reading:
         self._settle()
         self._to.cloud = self._last_cloud()
 
-    def _message(self, topic: LogTopic, message: Message) -> None:
-        if message.place.size > LARGEST_MESSAGE:
-            raise OmnidError(f"{message.place.size} bytes")
+    def _message(self, topic: LogTopic, message: LogMessage) -> None:
+        if message.record.size > LARGEST_MESSAGE:
+            raise OmnidError(f"{message.record.size} bytes")
         if topic.name == self._to.topic:
             self._pose(odometry_from_cdr(bytes(message.data())), message.log_time_ns)
         elif topic.type == DIAGNOSTICS_SCHEMA and self._of_robot(topic.name):

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
-from drivers.cameras.v4l2_buffers import CameraState
+from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
 from omnid.controller.controller import ControllerSettings

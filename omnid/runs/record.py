@@ -6,9 +6,10 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from drivers.events import NOTICE, WARNING, EventCallback
 from drivers.frame import Camera, FrameSource
 from drivers.logs.log_folder import LogFolder
-from drivers.logs.rotating_log import NOTICE, WARNING, Report, RotatingLog
+from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.signals import ended_by_signals
@@ -20,7 +21,7 @@ PERIOD_S = 15.0  # between two lines about how it goes
 
 
 def open_recorder(
-    config: Config, rig: str, report: Report, *, encode: Encoder | None = None, offset_ns: int = 0
+    config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, offset_ns: int = 0
 ) -> FrameRecorder:
     """The recorder that the settings describe; every file has them attached, and the rig's TOML where there is one.
 
@@ -28,11 +29,11 @@ def open_recorder(
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = LogFolder(Path(config.record.folder), config.bus.robot)
-    log = RotatingLog(folder, config.record.rotation(), attachments, report=report)
+    log = RotatingLog(folder, config.record.rotation(), attachments, on_event=report)
     return FrameRecorder(log, config.bus.robot, encode, offset_ns=offset_ns)
 
 
-def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: Report) -> FrameRecorder:
+def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> FrameRecorder:
     """Records until the sources end or a signal comes; their stamps are CLOCK_MONOTONIC. Gives what became of it."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     recorder = open_recorder(config, rig, report, offset_ns=offset_ns)

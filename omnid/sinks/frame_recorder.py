@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final, TypeAlias
 
 from drivers.frame import Frame
-from drivers.logs.rotating_log import RecordingState, RotatingLog
+from drivers.logs.rotating_log import RotatingLog, RotatingLogState
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports
@@ -36,7 +36,7 @@ class FrameRecorder:
         self.unfit = 0
 
     @property
-    def state(self) -> RecordingState:
+    def state(self) -> RotatingLogState:
         """How the recording is."""
         return self._log.state
 

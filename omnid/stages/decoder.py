@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 from drivers.frame import Camera, Frame, gray
 from omnid.errors import OmnidError
 
@@ -32,7 +32,7 @@ class Decoder:
         """
         try:
             image = gray(frame)
-        except BrokenFrame as error:
+        except FrameDecodeError as error:
             self._skip(str(error))
             return None
         found, expected = image.shape[::-1], self._sizes[frame.camera]

@@ -21,7 +21,9 @@ def jpeg(image: NDArray[np.uint8]) -> bytes:
 
 
 def compressed(image: RosImage) -> tuple[bytes, str]:
-    """The bytes of a image message and their kind; what came raw becomes grey JPEG. BrokenFrame where it is broken.
+    """Return the bytes of an image message and their kind; a raw image becomes grey JPEG.
+
+    Raises FrameDecodeError for a broken image.
     """
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding

@@ -6,7 +6,7 @@ import math
 import time
 from typing import Final
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Diagnostics, Pose, Robot
 from omnid.core.odometry.stereo_frame import Features
@@ -61,7 +61,7 @@ class LiveRobotView:
         """Draw a message, if it is of a kind that can be drawn."""
         try:
             content = _decoded(message)
-        except (OmnidError, BrokenFrame):
+        except (OmnidError, FrameDecodeError):
             self.broken += 1
             return
         match content:
@@ -88,7 +88,7 @@ class LiveRobotView:
 
 
 def _decoded(message: ReceivedMessage) -> Pose | Diagnostics | Cloud | RosImage | None:
-    """Return the content of a message, None for other topics. Raise OmnidError or BrokenFrame where it is broken."""
+    """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
     match message.topic:
         case "odom":
             return decode_pose(message.payload, message.attachment, message.received_ns)

@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_info import Survey
-from drivers.logs.mcap_messages import DataSection, Message
+from drivers.logs.mcap_info import LogInfo
+from drivers.logs.mcap_messages import DataSection, LogMessage
 from drivers.logs.mcap_records import LogFile, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
@@ -24,7 +24,7 @@ IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  #
 _LISTED: Final = 8
 
 
-def poses_topic(found: Survey, robot: str | None) -> str | None:
+def poses_topic(found: LogInfo, robot: str | None) -> str | None:
     """The topic of a recording's poses, that of a robot where one is named; None where it has none.
 
     OmnidError where there are several, or none of the robot that was named.
@@ -50,7 +50,7 @@ class Way(NamedTuple):
 class RecordedRunView:
     """Draws a recording; broken: messages that could not be read, damaged: pieces of the file."""
 
-    def __init__(self, found: Survey, topic: str, board: RerunScene) -> None:
+    def __init__(self, found: LogInfo, topic: str, board: RerunScene) -> None:
         self._found, self._board = found, board
         self._ways = self._by_topic(topic)
         self._pending: Pose | None = None  # until its state is known, which is written after it
@@ -58,7 +58,7 @@ class RecordedRunView:
         self.broken = self.damaged = 0
 
     @staticmethod
-    def images(found: Survey, poses: str) -> str:
+    def images(found: LogInfo, poses: str) -> str:
         """The topic of the images that are shown beside the poses of a topic; '' where there is none."""
         robot = poses.removesuffix("odom")
         return next((robot + name for name in IMAGES if robot + name in found.topics), "")
@@ -68,7 +68,7 @@ class RecordedRunView:
         for way, message in self._messages():
             try:
                 found = way.read(message.data())
-            except (OmnidError, BrokenFrame, RecordError):
+            except (OmnidError, FrameDecodeError, RecordError):
                 self.broken += 1
                 continue
             way.draw(found)
@@ -84,7 +84,7 @@ class RecordedRunView:
             images: {kind: Way(partial(self._image, kind), self._show) for kind in (IMAGE, COMPRESSED_IMAGE)},
         }
 
-    def _messages(self) -> Iterator[tuple[Way, Message]]:
+    def _messages(self) -> Iterator[tuple[Way, LogMessage]]:
         """What can be drawn, in the order of the file."""
         file = LogFile(self._found.path)
         try:

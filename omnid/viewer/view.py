@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.logs.mcap_info import Survey, survey
+from drivers.logs.mcap_info import LogInfo, read_log_info
 from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.runs.replay import Options, ReplayRun, Topics
@@ -50,7 +50,7 @@ def check_file(out: Path | None, *read: tuple[str, Path | None]) -> None:
 
 def show_log(log: Log, config: Config, settings: Path | None, place: ViewerTarget) -> int:
     """Shows a log: the poses that are recorded in it, else what can be computed from its images; the exit code."""
-    found = survey(log.path)
+    found = read_log_info(log.path)
     topic = None if log.replay else poses_topic(found, log.robot)
     image = PANORAMA if topic is None else _title(RecordedRunView.images(found, topic))
     board = RerunScene(place, layout(image, depth=topic is None), _most_messages(found, topic))
@@ -95,7 +95,7 @@ def _computed(log: Log, config: Config, settings: Path | None, board: RerunScene
     return ReplayRun(log.path, config, options).run(log.rig, log.topics)
 
 
-def _recorded(found: Survey, topic: str, board: RerunScene) -> int:
+def _recorded(found: LogInfo, topic: str, board: RerunScene) -> int:
     recorded = RecordedRunView(found, topic, board)
     recorded.show()
     if recorded.broken or recorded.damaged:
@@ -106,7 +106,7 @@ def _recorded(found: Survey, topic: str, board: RerunScene) -> int:
     return 0
 
 
-def _most_messages(found: Survey, topic: str | None) -> int:
+def _most_messages(found: LogInfo, topic: str | None) -> int:
     """How many poses there will be at the most."""
     if topic is not None:
         return found.topics[topic][1]

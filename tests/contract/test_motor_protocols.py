@@ -15,10 +15,10 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import Framer, MotorProtocol
-from drivers.motors.protocols.registry import PROTOCOLS
-from drivers.motors.simulated.controllers import TWINS
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_motor import SimulatedController
-from tests.contract.twins import BASE, LONG_MS, NAMES, answer, controller_of
+from tests.contract.simulated_motors import BASE, LONG_MS, NAMES, answer, controller_of
 
 WIRINGS = [
     BASE,
@@ -52,7 +52,7 @@ class Talk:
 
 
 def test_every_protocol_has_a_twin() -> None:
-    assert set(PROTOCOLS) == set(TWINS)
+    assert set(PROTOCOLS) == set(SIMULATED_CONTROLLERS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -93,7 +93,7 @@ def test_wheels_that_would_be_too_fast_keep_the_curvature(
     talk = Talk(name)
     talk.tell(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
     told = talk.base.last_command
-    assert max(map(abs, talk.base.told_mps)) == pytest.approx(BASE.max_wheel_mps, rel=0.01)
+    assert max(map(abs, talk.base.commanded_mps)) == pytest.approx(BASE.max_wheel_mps, rel=0.01)
     assert told.velocity_mps * yaw_rate_radps == pytest.approx(told.yaw_rate_radps * velocity_mps, abs=0.05)
     assert talk.base.errors == 0
 
@@ -136,7 +136,7 @@ def test_any_bytes_to_the_twin(name: str) -> None:
     for noise in noises(rng, orders):
         assert isinstance(talk.controller.feed(noise), bytes)
     assert talk.base.errors > 100
-    assert all(map(math.isfinite, talk.base.told_mps))
+    assert all(map(math.isfinite, talk.base.commanded_mps))
 
 
 @pytest.mark.parametrize("name", NAMES)

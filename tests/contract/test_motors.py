@@ -11,18 +11,18 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motors.protocols.registry import PROTOCOLS
-from drivers.motors.serial_motor import Late, SerialMotor, Silence
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
-from tests.contract.twins import (
+from tests.contract.simulated_motors import (
     ANSWER_S,
     BASE,
     INSTANT,
     LONG_MS,
     NAMES,
     PATIENCE_S,
+    connected_motor,
     controller_of,
-    motor_and_twin,
     shortest_watchdog_ms,
     until,
 )
@@ -34,27 +34,27 @@ SHORT_S = 0.05
 
 @pytest.mark.parametrize("name", NAMES)
 def test_drives_turns_and_stops(name: str) -> None:
-    with motor_and_twin(name) as (motor, twin):
-        twin.state.limits = INSTANT
+    with connected_motor(name) as (motor, twin):
+        twin.base.limits = INSTANT
         assert until(lambda: motor.send(ARC).watchdog_expired or twin.pose[2] > 0.5)
         x_m, y_m, heading_rad = twin.pose
         assert ((x_m**2 + (y_m - 0.8) ** 2) ** 0.5) == pytest.approx(0.8, rel=0.02)  # a circle of v / w = 0.8 m
-        assert twin.state.velocity_mps == pytest.approx(0.72, rel=0.02)
+        assert twin.base.velocity_mps == pytest.approx(0.72, rel=0.02)
         assert until(lambda: paced(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
         assert twin.pose[2] >= heading_rad
         motor.send(stop_command(0))
-        assert until(lambda: twin.state.velocity_mps == twin.state.yaw_rate_radps == 0.0)
-        assert twin.errors == 0 and motor.errors == motor.withheld == motor.garbage == motor.bad_frames == 0
+        assert until(lambda: twin.base.velocity_mps == twin.base.yaw_rate_radps == 0.0)
+        assert twin.errors == 0 and motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_close_stops_the_wheels(name: str) -> None:
-    with motor_and_twin(name) as (motor, twin):
+    with connected_motor(name) as (motor, twin):
         motor.send(FORWARD)
-        assert twin.state.told_mps != [0.0, 0.0]
+        assert twin.base.commanded_mps != [0.0, 0.0]
         motor.close()
         motor.close()
-        assert twin.state.told_mps == [0.0, 0.0] and not twin.watchdog_expired and twin.errors == 0
+        assert twin.base.commanded_mps == [0.0, 0.0] and not twin.watchdog_expired and twin.errors == 0
         with pytest.raises(DriverError, match="is closed"):
             motor.send(FORWARD)
 
@@ -62,39 +62,39 @@ def test_close_stops_the_wheels(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_silent_host_is_stopped_and_a_zero_comes_before_motion(name: str) -> None:
     watchdog_ms = shortest_watchdog_ms(name)
-    with motor_and_twin(name, watchdog_ms=watchdog_ms) as (motor, twin):
+    with connected_motor(name, watchdog_ms=watchdog_ms) as (motor, twin):
         motor.send(stop_command(0))
         motor.send(FORWARD)
-        assert until(lambda: twin.watchdog_expired and twin.state.velocity_mps == 0.0)
+        assert until(lambda: twin.watchdog_expired and twin.base.velocity_mps == 0.0)
         assert motor.send(FORWARD).watchdog_expired, "told a zero in its place, and says so"
-        assert twin.state.told_mps == [0.0, 0.0] and motor.withheld >= 1
-        assert until(lambda: motor.send(FORWARD) is not None and twin.state.told_mps != [0.0, 0.0])
-        assert twin.state.unsafe_resumes == 0 and twin.errors == 0
+        assert twin.base.commanded_mps == [0.0, 0.0] and motor.replaced_by_stop >= 1
+        assert until(lambda: motor.send(FORWARD) is not None and twin.base.commanded_mps != [0.0, 0.0])
+        assert twin.base.unsafe_resumes == 0 and twin.errors == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_silent_controller_is_an_error_and_then_a_zero_comes_first(name: str) -> None:
-    with motor_and_twin(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, twin):
+    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, twin):
         heard(motor)
-        twin.silent = True
-        assert until(lambda: type(silence(motor)) is Silence), "late at first, then silent"
+        twin.drop_replies = True
+        assert until(lambda: type(silence(motor)) is NoReplyError), "late at first, then silent"
         found = silence(motor)
         assert "gave no answer" in str(found) and twin.port in str(found) and "\n" not in str(found)
-        twin.silent = False
-        assert heard(motor).watchdog_expired and twin.state.told_mps == [0.0, 0.0]
-        assert until(lambda: heard(motor) is not None and twin.state.told_mps != [0.0, 0.0])
+        twin.drop_replies = False
+        assert heard(motor).watchdog_expired and twin.base.commanded_mps == [0.0, 0.0]
+        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_answer_that_is_late_stops_nothing(name: str) -> None:
-    with motor_and_twin(name, timeout_s=SHORT_S) as (motor, twin):
-        assert until(lambda: heard(motor) is not None and twin.state.told_mps != [0.0, 0.0])
-        twin.silent = True
-        found, withheld = silence(motor), motor.withheld
-        assert isinstance(found, Late) and motor.errors >= 1
-        twin.silent = False
-        assert not heard(motor).watchdog_expired and twin.state.told_mps != [0.0, 0.0]
-        assert motor.withheld == withheld
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
+        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
+        twin.drop_replies = True
+        found, replaced_by_stop = silence(motor), motor.replaced_by_stop
+        assert isinstance(found, LateReplyError) and motor.errors >= 1
+        twin.drop_replies = False
+        assert not heard(motor).watchdog_expired and twin.base.commanded_mps != [0.0, 0.0]
+        assert motor.replaced_by_stop == replaced_by_stop
 
 
 def silence(motor: SerialMotor) -> DriverError:
@@ -107,21 +107,21 @@ def silence(motor: SerialMotor) -> DriverError:
 @pytest.mark.parametrize("name", NAMES)
 def test_garbage_is_survived(name: str) -> None:
     rng = random.Random(21)
-    with motor_and_twin(name, timeout_s=SHORT_S) as (motor, twin):
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
         for _ in range(20):
             twin.garbage = rng.randbytes(rng.randint(1, 40)) + b"\r\n"
             with contextlib.suppress(DriverError):
                 motor.send(FORWARD)
         assert motor.garbage + motor.bad_frames + motor.errors > 0
         twin.garbage = b""
-        assert until(lambda: heard(motor) is not None and twin.state.told_mps != [0.0, 0.0])
+        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
         assert twin.errors == 0, "nothing that came back damaged was sent on"
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_stream_without_end_is_an_error(name: str) -> None:
     """A controller that talks without a break and never answers: the deadline holds all the same."""
-    with motor_and_twin(name, timeout_s=SHORT_S) as (motor, twin):
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
         twin.garbage = b"\xff\xfe{[" * 900
         for _ in range(3):
             with contextlib.suppress(DriverError):
@@ -132,11 +132,11 @@ def test_a_stream_without_end_is_an_error(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "ros_arduino_bridge"])  # it tells no voltage
 def test_a_late_answer_is_nobodys(name: str) -> None:
-    with motor_and_twin(name) as (motor, twin):
-        twin.state.battery_v = 9.5
+    with connected_motor(name) as (motor, twin):
+        twin.base.battery_v = 9.5
         late = twin.controller.feed(next(PROTOCOLS[name](BASE).drive(stop_command(0), 0.0)))
-        twin.state.battery_v = 12.0
-        twin.say(late)
+        twin.base.battery_v = 12.0
+        twin.send(late)
         assert motor._port is not None and until(lambda: motor._port.in_waiting >= len(late))
         assert motor.send(stop_command(0)).battery_v == 12.0
 
@@ -144,10 +144,10 @@ def test_a_late_answer_is_nobodys(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_silence_at_connect(name: str) -> None:
     with contextlib.closing(SimulatedMotor(controller_of(name))) as twin:
-        twin.deaf = True
+        twin.drop_input = True
         with pytest.raises(DriverError, match="gave no answer"):
             SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
-        twin.deaf = False
+        twin.drop_input = False
         SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
 
 
@@ -174,13 +174,13 @@ def test_an_unplugged_controller_is_an_error_and_comes_back(name: str, tmp_path:
         with contextlib.closing(SimulatedMotor(controller_of(name))) as second:
             second.expire()  # from now on it complains unless a stop is the first thing told
             port.symlink_to(second.port)
-            assert until(lambda: heard(motor) is not None and second.state.told_mps != [0.0, 0.0])
+            assert until(lambda: heard(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
             assert motor.connections == 2 and second.errors == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_port_is_for_one_program(name: str) -> None:
-    with motor_and_twin(name) as (_, twin), pytest.raises(DriverError, match="in use by another program"):
+    with connected_motor(name) as (_, twin), pytest.raises(DriverError, match="in use by another program"):
         SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import BrokenFrame
+from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
 
 WIDTH, HEIGHT = 37, 23
@@ -130,12 +130,12 @@ def test_the_image_is_read_only_and_nobody_can_change_it_later(encoding: str) ->
 def test_a_cut_image_is_broken_wherever_it_is_cut(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
-        with pytest.raises(BrokenFrame):
+        with pytest.raises(FrameDecodeError):
             gray(frame(encoding, data[:size]))
 
 
 def test_the_padding_does_not_hide_a_cut() -> None:
-    with pytest.raises(BrokenFrame, match="end is missing"):
+    with pytest.raises(FrameDecodeError, match="end is missing"):
         gray(frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)))
 
 
@@ -159,7 +159,7 @@ def test_the_padding_does_not_hide_a_cut() -> None:
     ],
 )
 def test_malformed_frames_are_broken_in_one_line(broken: Frame, reason: str) -> None:
-    with pytest.raises(BrokenFrame, match=reason) as caught:
+    with pytest.raises(FrameDecodeError, match=reason) as caught:
         gray(broken)
     assert "\n" not in str(caught.value) and "lower frame 7" in str(caught.value)
 
@@ -172,7 +172,7 @@ def test_an_absurd_size_is_refused_before_it_is_decoded(suffix: str) -> None:
     else:
         start = data.index(b"\xff\xc0")
         data[start + 5 : start + 9] = struct.pack(">HH", 60000, 60000)
-    with pytest.raises(BrokenFrame, match="60000 x 60000"):
+    with pytest.raises(FrameDecodeError, match="60000 x 60000"):
         gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data)))
 
 
@@ -185,5 +185,5 @@ def test_damaged_images_decode_or_are_broken_and_nothing_else(suffix: str) -> No
             data[chance.randrange(len(data))] = chance.randrange(256)
         try:
             assert gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data))).ndim == 2
-        except BrokenFrame:
+        except FrameDecodeError:
             continue

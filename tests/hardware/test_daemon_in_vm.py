@@ -75,16 +75,17 @@ class Controller:
 
     def _obey(self, data: bytes) -> bytes:
         answer = self._line.feed(data)
-        self._fastest_mps = max(self._fastest_mps, *map(abs, self._line.base.told_mps))
+        self._fastest_mps = max(self._fastest_mps, *map(abs, self._line.base.commanded_mps))
         return answer
 
     def _tell(self, data: bytes) -> bytes:
         if b"\n" not in data:
             return b""
         base = self._line.base
-        state = {"told_mps": max(map(abs, base.told_mps)), "fastest_mps": self._fastest_mps, "way_m": base.travel_m[0],
+        state = {"commanded_mps": max(map(abs, base.commanded_mps)), "fastest_mps": self._fastest_mps,
+                 "way_m": base.travel_m[0],
                  **{name: getattr(base, name) for name in ("commands", "errors", "expiries", "unsafe_resumes")}}
-        self._fastest_mps = state["told_mps"]
+        self._fastest_mps = state["commanded_mps"]
         return json.dumps(state).encode() + b"\n"
 
 
@@ -112,7 +113,7 @@ def rig_of_the_sample() -> bytes:
         rig = attached_rig(reader, SAMPLE)
     finally:
         reader.close()
-    images = LogImages.of(SAMPLE)
+    images = LogImages.load(SAMPLE)
     frames: list[Frame] = [frame for both in zip(images.lower, images.upper, strict=False) for _, frame in both]
     return rig_toml(with_rims(rig, frames)).encode()
 
@@ -143,6 +144,6 @@ def test_what_was_recorded_until_the_kill_is_made_whole(result: Result, tmp_path
     assert mended.returncode == 0, mended.stderr
     assert omnid("log", "info", whole).returncode == 0
     guest = json.loads(result.files["killed.json"])
-    found = LogImages.of(whole)
+    found = LogImages.load(whole)
     for eye in (found.lower, found.upper):
         assert len(eye) > 5 and guest["killed_ns"] - eye[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000

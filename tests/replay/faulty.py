@@ -82,7 +82,7 @@ def main() -> int:
     args = parser.parse_args()
     faults: dict[str, str] = {}
     threading.Thread(target=obey, args=(faults,), daemon=True).start()
-    images, epoch_ns = LogImages.of(args.log), time.monotonic_ns()
+    images, epoch_ns = LogImages.load(args.log), time.monotonic_ns()
     config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
     live = LiveRun(config, lambda camera: SpoiltCamera(images, camera, epoch_ns, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))

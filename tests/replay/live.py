@@ -66,7 +66,7 @@ class NotedLine(SimulatedLine):
     def feed(self, data: bytes) -> bytes:
         """The answers; what is told by now is noted."""
         answer = super().feed(data)
-        self.notes.append(Told(time.monotonic(), (self.base.told_mps[0], self.base.told_mps[1])))
+        self.notes.append(Told(time.monotonic(), (self.base.commanded_mps[0], self.base.commanded_mps[1])))
         return answer
 
     def moved_since(self, at_s: float) -> bool:
@@ -86,7 +86,7 @@ class Base:
     @property
     def drives(self) -> bool:
         """Whether the wheels are told to turn now."""
-        return any(self.line.base.told_mps)
+        return any(self.line.base.commanded_mps)
 
     def unplug(self) -> None:
         """The port is gone."""

@@ -32,7 +32,7 @@ from omnid.runs.record import record
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()
 config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
-images = LogImages.of(log)
+images = LogImages.load(log)
 start_ns = time.monotonic_ns()
 
 class Camera(LogCamera):

@@ -40,7 +40,7 @@ from dataclasses import dataclass, replace
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, heard, require_watchdog
+from drivers.motors.motor_protocol import Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64
@@ -76,7 +76,7 @@ class ProtocolError(DriverError):
 
 
 @dataclass(frozen=True, slots=True)
-class Velocity:
+class VelocityMessage:
     """Host to controller: a command. Its stamp does not travel; a decoded one has stamp 0."""
 
     seq: int
@@ -84,7 +84,7 @@ class Velocity:
 
 
 @dataclass(frozen=True, slots=True)
-class LineStatus:
+class StatusMessage:
     """Controller to host: the answer to the command with this seq."""
 
     seq: int
@@ -92,23 +92,23 @@ class LineStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class SetWatchdog:
+class WatchdogRequest:
     """Host to controller: stop by yourself after this time without a command."""
 
     watchdog_ms: int
 
 
 @dataclass(frozen=True, slots=True)
-class WatchdogSet:
+class WatchdogReply:
     """Controller to host: the watchdog time in force."""
 
     watchdog_ms: int
 
 
-Message = Velocity | LineStatus | SetWatchdog | WatchdogSet
+LineMessage = VelocityMessage | StatusMessage | WatchdogRequest | WatchdogReply
 
 
-def encode(message: Message) -> bytes:
+def encode(message: LineMessage) -> bytes:
     """The line of a message; ProtocolError for a number that is not finite or out of its range."""
     kind, numbers = _fields(message)
     _check(kind, numbers)
@@ -116,7 +116,7 @@ def encode(message: Message) -> bytes:
     return b"$%b*%04X\n" % (body, crc16(body))
 
 
-def decode(line: bytes) -> Message:
+def decode(line: bytes) -> LineMessage:
     """The message of a line, with or without its end; any bytes may come: ProtocolError unless it is exactly one."""
     match = _LINE.fullmatch(line)
     if match is None:
@@ -135,16 +135,16 @@ def crc16(data: bytes) -> int:
     return binascii.crc_hqx(data, 0xFFFF)
 
 
-def _fields(message: Message) -> tuple[str, list[int]]:
+def _fields(message: LineMessage) -> tuple[str, list[int]]:
     match message:
-        case Velocity(seq, command):
+        case VelocityMessage(seq, command):
             return "V", [seq, *_motion(command)]
-        case LineStatus(seq, status):
+        case StatusMessage(seq, status):
             battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
             return "S", [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
-        case SetWatchdog(watchdog_ms):
+        case WatchdogRequest(watchdog_ms):
             return "W", [watchdog_ms]
-        case WatchdogSet(watchdog_ms):
+        case WatchdogReply(watchdog_ms):
             return "A", [watchdog_ms]
 
 
@@ -173,21 +173,21 @@ def _check(kind: str, numbers: list[int]) -> None:
             raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
 
 
-def _message(kind: str, numbers: list[int]) -> Message:
+def _message(kind: str, numbers: list[int]) -> LineMessage:
     if kind == "W":
-        return SetWatchdog(numbers[0])
+        return WatchdogRequest(numbers[0])
     if kind == "A":
-        return WatchdogSet(numbers[0])
+        return WatchdogReply(numbers[0])
     seq, velocity_mps, heading_rad, yaw_rate_radps = numbers[0], *(n / 1000 for n in numbers[1:4])
     if kind == "V":
-        return Velocity(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
+        return VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
     battery_v = math.nan if numbers[4] < 0 else numbers[4] / 1000
-    return LineStatus(
+    return StatusMessage(
         seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(numbers[6]), numbers[5], battery_v)
     )
 
 
-class LineAssembler:
+class LineFramer:
     """Lines out of a byte stream in any pieces; starts anew at every '$', holds at most MAX_LINE bytes."""
 
     def __init__(self) -> None:
@@ -233,36 +233,36 @@ class LineProtocol:
         self._seq = 0
         self._zero_rad = self._heading_rad = 0.0  # what the controller calls 0, and what it said last
 
-    def framer(self) -> LineAssembler:
+    def framer(self) -> LineFramer:
         """Lines from '$' to line feed."""
-        return LineAssembler()
+        return LineFramer()
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Sets the watchdog and hears what is in force."""
-        answer = yield from heard(encode(SetWatchdog(watchdog_ms)), self._watchdog)
+        answer = yield from request(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
         require_watchdog(watchdog_ms, answer.watchdog_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """One velocity line; the status is the one with its seq."""
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
         heading_rad = _wrapped(command.heading_rad - self._zero_rad)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
-        line = encode(Velocity(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
-        answer = yield from heard(line, lambda frame: self._status(frame, seq))
+        line = encode(VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
+        answer = yield from request(line, lambda frame: self._status(frame, seq))
         self._heading_rad = _wrapped(answer.status.heading_rad + self._zero_rad)
         return replace(answer.status, heading_rad=self._heading_rad)
 
-    def _watchdog(self, frame: bytes) -> WatchdogSet | None:
+    def _watchdog(self, frame: bytes) -> WatchdogReply | None:
         message = self._message(frame)
-        return message if isinstance(message, WatchdogSet) else None
+        return message if isinstance(message, WatchdogReply) else None
 
-    def _status(self, frame: bytes, seq: int) -> LineStatus | None:
+    def _status(self, frame: bytes, seq: int) -> StatusMessage | None:
         message = self._message(frame)
-        return message if isinstance(message, LineStatus) and message.seq == seq else None
+        return message if isinstance(message, StatusMessage) and message.seq == seq else None
 
-    def _message(self, frame: bytes) -> Message | None:
+    def _message(self, frame: bytes) -> LineMessage | None:
         try:
             return decode(frame)
         except ProtocolError:

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, TextFramer, require_watchdog
+from drivers.motors.motor_protocol import TextFramer, Transaction, require_watchdog
 
 AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800
@@ -55,7 +55,7 @@ class ODriveAscii:
         """Lines of text."""
         return TextFramer()
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Sets both watchdogs and reads them back; DriverError where an axis has an error that is not its watchdog's.
 
         The axes are armed by the first stop.
@@ -70,7 +70,7 @@ class ODriveAscii:
             require_watchdog(watchdog_ms, 1000 * timeout[0] if enabled[0] else 0.0)
         return float(watchdog_ms)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Both velocities and the questions at once; a stop arms axes that are not."""
         arming = self._disarmed and is_stop(command)
         speeds = self._drive.channels(command)
@@ -84,7 +84,7 @@ class ODriveAscii:
         motion = self._drive.motion(first[-1] / self._drive.turns_per_m, second[-1] / self._drive.turns_per_m)
         return MotorStatus(motion[0], math.nan, motion[1], self._disarmed, flags & ~WATCHDOG_EXPIRED, battery[0])
 
-    def _asked(self, lines: Sequence[str], questions: Sequence[str]) -> Script[list[list[float]]]:
+    def _asked(self, lines: Sequence[str], questions: Sequence[str]) -> Transaction[list[list[float]]]:
         """Writes lines and questions and gives the numbers of each answer; "f" has two, "r" one."""
         answers: list[list[float]] = []
         frame = yield b"".join(map(sealed, [*lines, *questions]))

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, TextFramer, require_watchdog
+from drivers.motors.motor_protocol import TextFramer, Transaction, require_watchdog
 
 RPM, POWER, MIXED = "rpm", "power", "mixed"
 FULL = 1000  # of "!G"
@@ -45,7 +45,7 @@ class Roboteq:
         """Lines of text."""
         return TextFramer()
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Sets the serial watchdog and reads it back; DriverError where mixing is not as the mode wants it."""
         lines = [b"^ECHOF 1", b"^RWD %d" % watchdog_ms, b"~RWD", b"~MXMD"]
         values = yield from self._asked(lines, {b"RWD", b"MXMD"})
@@ -58,7 +58,7 @@ class Roboteq:
         require_watchdog(watchdog_ms, values[b"RWD"][0])
         return values[b"RWD"][0]
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Both channels and the questions at once."""
         question = b"S" if self._mode == RPM else b"M"
         lines = [*self._orders(command), b"?" + question, b"?V 2", b"?FF"]
@@ -82,7 +82,7 @@ class Roboteq:
         per_unit = 1 / (60 * self._drive.turns_per_m) if self._mode == RPM else self._drive.max_wheel_mps / FULL
         return self._drive.motion(values[0] * per_unit, values[1] * per_unit)
 
-    def _asked(self, lines: Sequence[bytes], names: set[bytes]) -> Script[dict[bytes, list[int]]]:
+    def _asked(self, lines: Sequence[bytes], names: set[bytes]) -> Transaction[dict[bytes, list[int]]]:
         """Writes lines and gives the answers by name once all orders are confirmed."""
         orders = sum(line[:1] in b"!^" for line in lines)
         values: dict[bytes, list[int]] = {}

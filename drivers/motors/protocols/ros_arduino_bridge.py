@@ -18,7 +18,7 @@ import re
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, TextFramer
+from drivers.motors.motor_protocol import TextFramer, Transaction
 
 AUTO_STOP_MS = 2000
 FRAME_S = 0.033
@@ -42,7 +42,7 @@ class RosArduinoBridge:
         """Lines of text."""
         return TextFramer()
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Hears whether this is such a board; DriverError where a shorter watchdog is asked for than it has."""
         if watchdog_ms < AUTO_STOP_MS:
             raise DriverError(
@@ -53,7 +53,7 @@ class RosArduinoBridge:
         yield from self._told(b"r\re\r")
         return float(AUTO_STOP_MS)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Both speeds and the question at once; the speed in the status is the mean since the last command."""
         per_mps = self._ticks_per_m * FRAME_S
         first, second = self._drive.channels(command, MAX_TICKS / per_mps)
@@ -70,7 +70,7 @@ class RosArduinoBridge:
         first, second = (_wrapped(new - old) * per_tick for new, old in zip(counts, last[1], strict=True))
         return self._drive.motion(first, second)
 
-    def _told(self, lines: bytes) -> Script[tuple[int, int]]:
+    def _told(self, lines: bytes) -> Transaction[tuple[int, int]]:
         """Writes an order and the question, and gives the counts once the order is confirmed."""
         confirmed = False
         frame = yield lines

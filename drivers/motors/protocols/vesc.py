@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, T
+from drivers.motors.motor_protocol import T, Transaction
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
@@ -116,7 +116,7 @@ class Vesc:
         """Packets."""
         return PacketFramer()
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Reads both timeouts; DriverError where one is off or longer than asked. Gives the shorter one [ms]."""
         first, second = yield from self._both((bytes((GET_APPCONF,)),) * 2, _config)
         for can_id, timeout_ms in (first, second):
@@ -127,7 +127,7 @@ class Vesc:
                 )
         return float(min(first[1], second[1]))
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """The questions and both speeds at once; the questions first, for an order hides that the timeout had come."""
         erpm_per_mps = 60 * self._drive.turns_per_m * self._drive.pole_pairs
         speeds = self._drive.channels(command, MAX_ERPM / erpm_per_mps)
@@ -141,7 +141,7 @@ class Vesc:
 
     def _both(
         self, questions: tuple[bytes, bytes], parse: Callable[[bytes], tuple[int, T] | None], orders: bytes = b""
-    ) -> Script[tuple[tuple[int, T], tuple[int, T]]]:
+    ) -> Transaction[tuple[tuple[int, T], tuple[int, T]]]:
         """What each of the two answers, as id and value."""
         answers: dict[bool, tuple[int, T]] = {}
         frame = yield packet(questions[0]) + packet(forwarded(self._drive.can_id, questions[1])) + orders

@@ -20,7 +20,7 @@ import math
 
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, TextFramer, heard
+from drivers.motors.motor_protocol import TextFramer, Transaction, request
 
 SPEED, FEEDBACK, STREAM, HEARTBEAT, INTERVAL, ECHO, BASE_INFO = 1, 130, 131, 136, 142, 143, 1001
 MAX_WHEEL_MPS = 2.0
@@ -46,17 +46,17 @@ class WaveshareJson:
         """Lines of text."""
         return TextFramer(LONGEST_LINE)
 
-    def connect(self, watchdog_ms: int) -> Script[float]:
+    def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Sets the heartbeat, silences what nobody asked for, and hears whether this is such a board at all."""
         lines = [line(kind, cmd=0) for kind in (ECHO, STREAM, INTERVAL)]
-        yield from heard(b"".join([*lines, line(HEARTBEAT, cmd=watchdog_ms), line(FEEDBACK)]), self._feedback)
+        yield from request(b"".join([*lines, line(HEARTBEAT, cmd=watchdog_ms), line(FEEDBACK)]), self._feedback)
         return float(watchdog_ms)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Script[MotorStatus]:
+    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """The speeds and the question at once."""
         first, second = self._drive.channels(command, MAX_WHEEL_MPS)
         order = line(SPEED, L=round(first, 4), R=round(second, 4)) + line(FEEDBACK)
-        first, second, battery_v = yield from heard(order, self._feedback)
+        first, second, battery_v = yield from request(order, self._feedback)
         velocity_mps, yaw_rate_radps = self._drive.motion(first, second)
         return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, False, 0, battery_v)
 

@@ -7,7 +7,7 @@ import re
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
-from drivers.motors.simulated.simulated_base import SimulatedBase, answered
+from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
 _AUTO_STOP_MS, _LOOP_S = 2000, 0.033
 
@@ -23,7 +23,7 @@ class SimulatedArduino:
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all lines that end in data."""
-        return answered(self.base, self._framer, self._handle, data)
+        return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         return self._answer(line) + b"\r\n"
@@ -42,7 +42,7 @@ class SimulatedArduino:
         self.base.errors += max(abs(first), abs(second)) > 32767
         self.base.commands += 1
         per_tick = 1 / (self._ticks_per_m() * _LOOP_S)
-        self.base.tell_channels(first * per_tick, second * per_tick)
+        self.base.command_channels(first * per_tick, second * per_tick)
         return b"OK"
 
     def _counts(self) -> tuple[int, int]:

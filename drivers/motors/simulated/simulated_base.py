@@ -18,7 +18,7 @@ Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
 
 
 @dataclass(frozen=True, slots=True)
-class TwinLimits:
+class MotionLimits:
     """What the wheels can do."""
 
     acceleration_mps2: float = 2.0
@@ -33,7 +33,7 @@ class SimulatedBase:
     A controller counts its valid commands in `commands` and everything that a real one would complain of in `errors`.
     """
 
-    def __init__(self, drive: DifferentialDrive | None = None, limits: TwinLimits | None = None) -> None:
+    def __init__(self, drive: DifferentialDrive | None = None, limits: MotionLimits | None = None) -> None:
         self.drive = drive or DifferentialDrive()
         self.commands = self.errors = 0
         self.expiries = 0  # times the watchdog has stopped the wheels
@@ -45,11 +45,11 @@ class SimulatedBase:
         self.velocity_mps = self.yaw_rate_radps = 0.0
         self.travel_m = [0.0, 0.0]  # of the wheels
         self.goal_heading_rad: float | None = None  # in the world: steered to while it moves, for what can
-        self.told_mps = [0.0, 0.0]
+        self.commanded_mps = [0.0, 0.0]
         self.expired = [False, False]
-        self._owes_zero = [False, False]
-        self._silence_s = [0.0, 0.0]
-        self.limits = limits or TwinLimits()
+        self._needs_stop = [False, False]
+        self._since_command_s = [0.0, 0.0]
+        self.limits = limits or MotionLimits()
 
     @property
     def watchdog_expired(self) -> bool:
@@ -59,37 +59,37 @@ class SimulatedBase:
     @property
     def last_command(self) -> VelocityCommand:
         """The motion that was told last, with stamp and heading 0."""
-        velocity_mps, yaw_rate_radps = self._twist(*self.told_mps)
+        velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         return VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps)
 
-    def tell(self, velocity_mps: float, yaw_rate_radps: float) -> None:
+    def command(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """A motion for both wheels."""
         half_mps = yaw_rate_radps * self.drive.track_m / 2
-        self.tell_wheel(LEFT, velocity_mps - half_mps)
-        self.tell_wheel(RIGHT, velocity_mps + half_mps)
+        self.command_wheel(LEFT, velocity_mps - half_mps)
+        self.command_wheel(RIGHT, velocity_mps + half_mps)
 
-    def tell_channels(self, first_mps: float, second_mps: float) -> None:
+    def command_channels(self, first_mps: float, second_mps: float) -> None:
         """Speeds for both motors, as they are wired."""
         for side, speed_mps in zip(SIDES, self.drive.sides(first_mps, second_mps), strict=True):
-            self.tell_wheel(side, speed_mps)
+            self.command_wheel(side, speed_mps)
 
-    def tell_channel(self, channel: int, speed_mps: float) -> None:
+    def command_channel(self, channel: int, speed_mps: float) -> None:
         """A speed for one motor, 0 or 1, as it is wired."""
         side = RIGHT if bool(channel) != self.drive.swapped else LEFT
-        self.tell_wheel(side, self.drive.sides(speed_mps, speed_mps)[side])
+        self.command_wheel(side, self.drive.sides(speed_mps, speed_mps)[side])
 
-    def tell_wheel(self, side: int, speed_mps: float) -> None:
+    def command_wheel(self, side: int, speed_mps: float) -> None:
         """A speed for one wheel, forward positive; feeds its watchdog."""
-        if self._owes_zero[side] and speed_mps != 0.0:
+        if self._needs_stop[side] and speed_mps != 0.0:
             self.unsafe_resumes += 1
             self.errors += 1
-        self._owes_zero[side] = self.expired[side] = False
-        self.told_mps[side] = speed_mps
+        self._needs_stop[side] = self.expired[side] = False
+        self.commanded_mps[side] = speed_mps
         self.feed(side)
 
     def feed(self, side: int) -> None:
         """Feeds the watchdog of one wheel."""
-        self._silence_s[side] = 0.0
+        self._since_command_s[side] = 0.0
 
     def channels_mps(self) -> tuple[float, float]:
         """The motors' speeds as they are wired."""
@@ -115,12 +115,12 @@ class SimulatedBase:
             self._step(dt_s / steps)
 
     def _stop(self, side: int) -> None:
-        self.expired[side] = self._owes_zero[side] = True
-        self.told_mps[side] = 0.0
+        self.expired[side] = self._needs_stop[side] = True
+        self.commanded_mps[side] = 0.0
 
     def _step(self, dt_s: float) -> None:
         self._watch(dt_s)
-        velocity_mps, yaw_rate_radps = self._twist(*self.told_mps)
+        velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         self.velocity_mps += _clamp(velocity_mps - self.velocity_mps, self.limits.acceleration_mps2 * dt_s)
         wanted_radps = _clamp(self._steered(yaw_rate_radps), self.limits.yaw_rate_radps)
         self.yaw_rate_radps += _clamp(wanted_radps - self.yaw_rate_radps, self.limits.yaw_acceleration_radps2 * dt_s)
@@ -129,14 +129,14 @@ class SimulatedBase:
     def _watch(self, dt_s: float) -> None:
         before = self.watchdog_expired
         for side in SIDES:
-            self._silence_s[side] += dt_s
-            if 0.0 < self.watchdog_ms < self._silence_s[side] * 1000 and not self.expired[side]:
+            self._since_command_s[side] += dt_s
+            if 0.0 < self.watchdog_ms < self._since_command_s[side] * 1000 and not self.expired[side]:
                 self._stop(side)
         self.expiries += self.watchdog_expired and not before
 
     def _steered(self, yaw_rate_radps: float) -> float:
         """The yaw rate towards the heading that is wanted, where there is one and the base is to move."""
-        if self.goal_heading_rad is None or self.told_mps == [0.0, 0.0]:
+        if self.goal_heading_rad is None or self.commanded_mps == [0.0, 0.0]:
             return yaw_rate_radps
         return self.limits.heading_gain_hz * _wrap(self.goal_heading_rad - self.pose[2])
 
@@ -158,7 +158,7 @@ class SimulatedBase:
         return (right, left) if self.drive.swapped else (left, right)
 
 
-def answered(base: SimulatedBase, framer: Framer, handle: Callable[[bytes], bytes], data: bytes) -> bytes:
+def reply_to(base: SimulatedBase, framer: Framer, handle: Callable[[bytes], bytes], data: bytes) -> bytes:
     """What a controller answers to all frames that end in data; bytes that are of none are errors."""
     before = framer.garbage
     answer = b"".join(handle(frame) for frame in framer.feed(data))

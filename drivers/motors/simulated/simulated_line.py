@@ -8,33 +8,33 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
-    LineAssembler,
-    LineStatus,
+    LineFramer,
     ProtocolError,
-    SetWatchdog,
-    Velocity,
-    WatchdogSet,
+    StatusMessage,
+    VelocityMessage,
+    WatchdogReply,
+    WatchdogRequest,
     decode,
     encode,
 )
-from drivers.motors.simulated.simulated_base import SimulatedBase, TwinLimits, answered
+from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase, reply_to
 
 
 class SimulatedLine:
     """heading_input: steers to the commanded heading; else follows the commanded yaw rate."""
 
     def __init__(
-        self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: TwinLimits | None = None
+        self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: MotionLimits | None = None
     ) -> None:
         self.base = SimulatedBase(drive, limits)
         self._heading_input = heading_input
-        self._assembler = LineAssembler()
+        self._assembler = LineFramer()
         self._zero_rad = 0.0  # world heading the controller calls 0
         self._next_seq: int | None = None
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all lines that end in data."""
-        return answered(self.base, self._assembler, lambda line: self.handle(line) or b"", data)
+        return reply_to(self.base, self._assembler, lambda line: self.handle(line) or b"", data)
 
     def handle(self, line: bytes) -> bytes | None:
         """The answer to a line, None where it gets none."""
@@ -43,9 +43,9 @@ class SimulatedLine:
         except ProtocolError:
             message = None
         match message:
-            case Velocity(seq, command):
+            case VelocityMessage(seq, command):
                 return self._obey(seq, command)
-            case SetWatchdog(watchdog_ms):
+            case WatchdogRequest(watchdog_ms):
                 return self._arm(watchdog_ms)
         self.base.errors += 1
         return None
@@ -54,10 +54,10 @@ class SimulatedLine:
         self.base.errors += self._next_seq not in (None, seq)
         self._next_seq = (seq + 1) % SEQ_COUNT
         self.base.commands += 1
-        answer = encode(LineStatus(seq, self._status()))
+        answer = encode(StatusMessage(seq, self._status()))
         steers = self._heading_input and not is_stop(command)
         self.base.goal_heading_rad = command.heading_rad + self._zero_rad if steers else None
-        self.base.tell(command.velocity_mps, command.yaw_rate_radps)
+        self.base.command(command.velocity_mps, command.yaw_rate_radps)
         return answer
 
     def _arm(self, watchdog_ms: int) -> bytes:
@@ -65,8 +65,8 @@ class SimulatedLine:
         self.base.watchdog_ms = watchdog_ms
         self._next_seq = None
         self._zero_rad = self.base.pose[2]
-        self.base.tell(0.0, 0.0)
-        return encode(WatchdogSet(watchdog_ms))
+        self.base.command(0.0, 0.0)
+        return encode(WatchdogReply(watchdog_ms))
 
     def _status(self) -> MotorStatus:
         base = self.base

@@ -39,7 +39,7 @@ class SimulatedMotor:
         """Opens the pty; `port` is what a driver opens."""
         self.controller = controller or SimulatedLine()
         self.unsent = 0  # answers dropped because nobody read
-        self.silent = self.deaf = False
+        self.drop_replies = self.drop_input = False
         self.garbage = b""
         self._device, self._host = os.openpty()
         tty.setraw(self._host)  # and kept open: without an open host side the device side reads errors
@@ -51,34 +51,34 @@ class SimulatedMotor:
         self._thread.start()
 
     @property
-    def state(self) -> SimulatedBase:
+    def base(self) -> SimulatedBase:
         """The base."""
         return self.controller.base
 
     @property
     def commands(self) -> int:
         """Valid commands so far."""
-        return self.state.commands
+        return self.base.commands
 
     @property
     def errors(self) -> int:
         """What was wrong so far: bytes, numbers, order."""
-        return self.state.errors
+        return self.base.errors
 
     @property
     def pose(self) -> Pose:
         """x [m], y [m], heading [rad] of the base now."""
-        return self.state.pose
+        return self.base.pose
 
     @property
     def watchdog_expired(self) -> bool:
         """Whether the wheels stand because no command came."""
-        return self.state.watchdog_expired
+        return self.base.watchdog_expired
 
     @property
     def last_command(self) -> VelocityCommand:
         """The motion that was told last, with stamp 0."""
-        return self.state.last_command
+        return self.base.last_command
 
     def expire(self) -> None:
         """Has the watchdog stop the wheels at once."""
@@ -86,7 +86,7 @@ class SimulatedMotor:
         while self._expiring.is_set() and self._thread.is_alive():
             time.sleep(STEP_S)
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """Sends bytes, asked or not; drops them where nobody reads."""
         with contextlib.suppress(BlockingIOError):
             if os.write(self._device, data) == len(data):
@@ -107,19 +107,19 @@ class SimulatedMotor:
         while True:
             readable, _, _ = select.select([self._device, self._wake_read], [], [], STEP_S)
             now_s = time.monotonic()
-            self.state.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
+            self.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
             last_s = now_s
             if self._wake_read in readable:
                 return
             if self._expiring.is_set():
-                self.state.expire()
+                self.base.expire()
                 self._expiring.clear()
             if readable:
-                self._hear(os.read(self._device, READ_LIMIT_BYTES))
+                self._receive(os.read(self._device, READ_LIMIT_BYTES))
 
-    def _hear(self, data: bytes) -> None:
-        if self.deaf:
+    def _receive(self, data: bytes) -> None:
+        if self.drop_input:
             return
         answer = self.controller.feed(data)
-        if answer and not self.silent:
-            self.say(self.garbage + answer)
+        if answer and not self.drop_replies:
+            self.send(self.garbage + answer)

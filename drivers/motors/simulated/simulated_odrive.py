@@ -7,7 +7,7 @@ import re
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
-from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, answered
+from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, reply_to
 
 _FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"
 _WATCHDOG_EXPIRED, _CLOSED_LOOP, _IDLE = 0x800, 8, 1
@@ -30,7 +30,7 @@ class SimulatedODrive:
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all lines that end in data."""
-        return answered(self.base, self._framer, self._handle, data)
+        return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         body, star, checksum = line.partition(b"*")
@@ -65,7 +65,7 @@ class SimulatedODrive:
         self._input_vel[axis] = turns_per_s
         self._fed(axis)
         if self._state[axis] == _CLOSED_LOOP:
-            self.base.tell_channel(axis, turns_per_s / self._turns_per_m())
+            self.base.command_channel(axis, turns_per_s / self._turns_per_m())
         return ""
 
     def _fed(self, axis: int) -> str:
@@ -96,7 +96,7 @@ class SimulatedODrive:
             self.base.expired[self._side(axis)] = bool(int(value) & _WATCHDOG_EXPIRED)
         elif value == _CLOSED_LOOP and not self.base.expired[self._side(axis)] and not self.base.fault:
             self._state[axis] = _CLOSED_LOOP
-            self.base.tell_channel(axis, self._input_vel[axis] / self._turns_per_m())
+            self.base.command_channel(axis, self._input_vel[axis] / self._turns_per_m())
         return ""
 
     def _disarm_expired(self) -> None:

@@ -8,7 +8,7 @@ import re
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
 from drivers.motors.protocols.roboteq import MIXED, RPM
-from drivers.motors.simulated.simulated_base import SimulatedBase, answered
+from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
 _ORDER = re.compile(rb"!([SG]) ([12]) (-?[0-9]{1,5})")
 _TOP = {b"S": 65535, b"G": 1000}
@@ -27,7 +27,7 @@ class SimulatedRoboteq:
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all lines that end in data."""
-        return answered(self.base, self._framer, self._handle, data)
+        return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         echo = line + b"\r" if self._echo else b""
@@ -50,7 +50,7 @@ class SimulatedRoboteq:
         self.base.commands += 1
         if self._mode == MIXED:
             return self._mix(channel, value)
-        self.base.tell_channel(channel, value * self._unit_mps())
+        self.base.command_channel(channel, value * self._unit_mps())
         return b"+"
 
     def _mix(self, channel: int, value: int) -> bytes:
@@ -58,7 +58,8 @@ class SimulatedRoboteq:
         self._mixed[channel] = value
         throttle, steering = self._mixed
         if channel == 1:
-            self.base.tell_channels((throttle + steering) * self._unit_mps(), (throttle - steering) * self._unit_mps())
+            unit_mps = self._unit_mps()
+            self.base.command_channels((throttle + steering) * unit_mps, (throttle - steering) * unit_mps)
         return b"+"
 
     def _set(self, name: bytes, value: int) -> bytes:

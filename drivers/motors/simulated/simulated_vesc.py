@@ -7,7 +7,7 @@ import struct
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import PacketFramer
-from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SimulatedBase, answered
+from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SimulatedBase, reply_to
 
 _LOCAL_ID = 77
 _SET_RPM, _GET_APPCONF, _ALIVE, _FORWARD_CAN, _GET_VALUES_SELECTIVE = 8, 17, 30, 34, 50
@@ -24,7 +24,7 @@ class SimulatedVesc:
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all packets that end in data."""
-        return answered(self.base, self._framer, self._route, data)
+        return reply_to(self.base, self._framer, self._route, data)
 
     def _route(self, payload: bytes) -> bytes:
         """To the one on the port, or on to the one on CAN; nobody answers for an id that is not there."""
@@ -51,7 +51,7 @@ class SimulatedVesc:
 
     def _spin(self, channel: int, erpm: int) -> None:
         self.base.commands += 1
-        self.base.tell_channel(channel, erpm / self._erpm_per_mps())
+        self.base.command_channel(channel, erpm / self._erpm_per_mps())
 
     def _config(self, channel: int) -> bytes:
         """Signature, id, timeout, and as much of the rest as makes it a long packet."""

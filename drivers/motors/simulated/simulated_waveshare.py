@@ -8,7 +8,7 @@ from typing import Any
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
-from drivers.motors.simulated.simulated_base import SimulatedBase, answered
+from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
 _TOP_MPS = 2.0
 _SETTINGS = (131, 136, 142, 143)
@@ -25,7 +25,7 @@ class SimulatedWaveshare:
 
     def feed(self, data: bytes) -> bytes:
         """The answers to all lines that end in data."""
-        return answered(self.base, self._framer, self._handle, data)
+        return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         answer = line + b"\r\n" if self._settings[143] else b""
@@ -48,7 +48,7 @@ class SimulatedWaveshare:
             self.base.errors += 1
             return
         self.base.commands += 1
-        self.base.tell_channels(speeds[0], speeds[1])
+        self.base.command_channels(speeds[0], speeds[1])
 
     def _set(self, kind: int, value: object) -> None:
         if not isinstance(value, int) or value < 0:

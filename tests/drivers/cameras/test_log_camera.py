@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import LATEST_NS, LogCamera, LogImages
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.mcap_reader import LogReader
@@ -22,7 +22,7 @@ PATIENCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def recorded(scene: Path) -> LogImages:
-    return LogImages.of(scene / "log.mcap")
+    return LogImages.load(scene / "log.mcap")
 
 
 def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
@@ -65,7 +65,7 @@ def test_forwards_and_backwards_in_even_steps(recorded: LogImages) -> None:
 
 def test_cameras_stay_in_step_though_one_has_lost_images(tmp_path: Path, scene: Path) -> None:
     taken = [p for p in images(scene / "log.mcap") if not (p.camera == "upper" and p.pair in (3, 4, 5, 6, 7))]
-    holed = LogImages.of(save(tmp_path / "holed.mcap", taken))
+    holed = LogImages.load(save(tmp_path / "holed.mcap", taken))
     lower, upper = stamps(holed, "lower", 20 * PAIRS), stamps(holed, "upper", 20 * (PAIRS - 5))
     assert abs(lower[-1] - upper[-1]) < 5e6
     nearest_ns = [min(abs(at_ns - other_ns) for other_ns in lower) for at_ns in upper[:300]]
@@ -78,7 +78,7 @@ def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: LogImages) 
     first = next(frames)
     time.sleep(0.4)
     later = next(frames)
-    assert later.stamp_ns >= first.stamp_ns + 0.4e9 - LATEST_NS
+    assert later.stamp_ns >= first.stamp_ns + 0.4e9 - MAX_DELAY_NS
     assert camera.state.drops == later.seq - first.seq - 1 > 0
 
 
@@ -109,6 +109,6 @@ def test_logs_that_show_nothing_are_refused(tmp_path: Path, scene: Path) -> None
     taken: list[Image] = images(scene / "log.mcap")
     few = [p for p in taken if p.camera == "lower" or p.pair == 0]
     with pytest.raises(DriverError, match="24 images of the lower and 1 of the upper"):
-        LogImages.of(save(tmp_path / "few.mcap", few))
+        LogImages.load(save(tmp_path / "few.mcap", few))
     with pytest.raises(DriverError):
-        LogImages.of(tmp_path / "none.mcap")
+        LogImages.load(tmp_path / "none.mcap")

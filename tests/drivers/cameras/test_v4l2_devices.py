@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from drivers.cameras.v4l2_camera import V4l2Camera
-from drivers.cameras.v4l2_devices import CaptureDevice, capture_devices, described, udev_rules
-from drivers.cameras.v4l2_modes import Mode, Sizes
+from drivers.cameras.v4l2_devices import CaptureDevice, capture_devices, describe_device, udev_rules
+from drivers.cameras.v4l2_modes import Mode, SizeRange
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from omnid.cli import main
@@ -86,10 +86,10 @@ def test_cameras_on_one_port_are_told_apart_by_name(tmp_path: Path) -> None:
 
 
 def test_the_modes_are_a_line_for_each_format() -> None:
-    one, any_of = Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0, 14.985)), Sizes(16, 64)
+    one, any_of = Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0, 14.985)), SizeRange(16, 64)
     offered = (one, one, Mode("GREY", any_of, any_of))
     device = CaptureDevice("/dev/video0", "HD Webcam", "uvcvideo", "usb-0", "/by/path", "", "p", offered)
-    assert list(described(device)) == [
+    assert list(describe_device(device)) == [
         "/dev/video0  HD Webcam  (uvcvideo, usb-0)", "  /by/path",
         "  YUYV 640x480 at 30, 14.98 Hz; 640x480 at 30, 14.98 Hz", "  GREY 16..64x16..64",
     ]  # fmt: skip

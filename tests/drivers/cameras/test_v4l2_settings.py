@@ -14,17 +14,17 @@ from drivers.cameras.v4l2_controls import (
     GAIN,
     POWER_LINE_FREQUENCY,
     CameraControl,
-    planned,
+    plan_controls,
 )
-from drivers.cameras.v4l2_modes import Mode, Sizes, choose
+from drivers.cameras.v4l2_modes import Mode, SizeRange, choose_format
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 
 WEBCAM = [
-    Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0, 15.0)),
-    Mode("YUYV", Sizes(1280, 1280), Sizes(960, 960), (7.5, 5.0)),
-    Mode("MJPG", Sizes(1280, 1280), Sizes(960, 960), (30.0, 15.0)),
-    Mode("H264", Sizes(1280, 1280), Sizes(960, 960), (60.0,)),
+    Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0, 15.0)),
+    Mode("YUYV", SizeRange(1280, 1280), SizeRange(960, 960), (7.5, 5.0)),
+    Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)),
+    Mode("H264", SizeRange(1280, 1280), SizeRange(960, 960), (60.0,)),
 ]
 MENU = {0: "Disabled", 1: "50 Hz", 2: "60 Hz"}
 OFFERED = {
@@ -53,13 +53,13 @@ def settings(**fields: Any) -> V4l2Settings:
 def test_auto_takes_what_needs_no_decoding_if_it_comes_fast_enough(
     size: tuple[int, int], rate_hz: float, chosen: str
 ) -> None:
-    assert choose(WEBCAM, "auto", size, rate_hz) == chosen
+    assert choose_format(WEBCAM, "auto", size, rate_hz) == chosen
 
 
 def test_grey_comes_first_and_unknown_rates_are_trusted() -> None:
-    any_size = Sizes(16, 4096, 16)
+    any_size = SizeRange(16, 4096, 16)
     offered = [Mode(name, any_size, any_size) for name in ("MJPG", "UYVY", "YUYV", "NV12", "GREY")]
-    chosen = [choose(offered[:count], "auto", (640, 480), 90) for count in range(1, 6)]
+    chosen = [choose_format(offered[:count], "auto", (640, 480), 90) for count in range(1, 6)]
     assert chosen == ["MJPG", "UYVY", "YUYV", "NV12", "GREY"]
 
 
@@ -69,21 +69,21 @@ def test_grey_comes_first_and_unknown_rates_are_trusted() -> None:
 )
 def test_what_is_not_offered_is_refused_with_what_is(name: str, size: tuple[int, int], rate_hz: float) -> None:
     with pytest.raises(DriverError, match=r"not offered; choose from: YUYV 640x480 at 30, 15 Hz; .*MJPG") as caught:
-        choose(WEBCAM, name, size, rate_hz)
+        choose_format(WEBCAM, name, size, rate_hz)
     assert "H264" not in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_sizes_come_in_steps() -> None:
-    assert 48 in Sizes(16, 64, 16) and 50 not in Sizes(16, 64, 16) and 80 not in Sizes(16, 64, 16)
-    assert 50 in Sizes(16, 64, 0)
+    assert 48 in SizeRange(16, 64, 16) and 50 not in SizeRange(16, 64, 16) and 80 not in SizeRange(16, 64, 16)
+    assert 50 in SizeRange(16, 64, 0)
 
 
 def test_by_default_no_control_is_touched() -> None:
-    assert planned(settings(), OFFERED) == [] and planned(settings(), {}) == []
+    assert plan_controls(settings(), OFFERED) == [] and plan_controls(settings(), {}) == []
 
 
 def plan(**fields: Any) -> list[tuple[str, int]]:
-    return [(control.name, value) for control, value in planned(settings(**fields), OFFERED)]
+    return [(control.name, value) for control, value in plan_controls(settings(**fields), OFFERED)]
 
 
 def test_a_fixed_value_has_its_automatic_switched_off_before() -> None:
@@ -98,14 +98,14 @@ def test_automatic_exposure_is_the_one_the_camera_has_and_must_not_slow_it() -> 
     full = {
         AUTO_EXPOSURE: CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})
     }
-    assert planned(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
+    assert plan_controls(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
 
 
 def test_a_fixed_gain_needs_no_automatic_but_a_switched_one_does() -> None:
     only_gain = {GAIN: OFFERED[GAIN]}
-    assert planned(settings(gain=15), only_gain) == [(OFFERED[GAIN], 15)]
+    assert plan_controls(settings(gain=15), only_gain) == [(OFFERED[GAIN], 15)]
     with pytest.raises(DriverError, match="no control of its automatic gain"):
-        planned(settings(auto_gain="off"), only_gain)
+        plan_controls(settings(auto_gain="off"), only_gain)
 
 
 def test_other_controls_are_set_by_name() -> None:
@@ -115,9 +115,9 @@ def test_other_controls_are_set_by_name() -> None:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"gain": 101}, "gain: 101 was asked, it takes 0 to 100 in steps of 5"),
+        ({"gain": 101}, "gain: 101 was requested, it accepts 0 to 100 in steps of 5"),
         ({"gain": 13}, "steps of 5"),
-        ({"exposure_us": 40}, "exposure_time_absolute: 0 was asked, it takes 3 to 2047"),
+        ({"exposure_us": 40}, "exposure_time_absolute: 0 was requested, it accepts 3 to 2047"),
         ({"power_line": "auto"}, r"0 \(Disabled\), 1 \(50 Hz\), 2 \(60 Hz\)"),
         ({"focus": 3}, "no control of its focus.*It has: auto_exposure, exposure"),
         ({"auto_white_balance": "on"}, "automatic white balance"),
@@ -127,7 +127,7 @@ def test_other_controls_are_set_by_name() -> None:
 )
 def test_a_control_that_the_camera_does_not_take_is_refused(fields: dict[str, Any], said: str) -> None:
     with pytest.raises(DriverError, match=said) as caught:
-        planned(settings(**fields), OFFERED)
+        plan_controls(settings(**fields), OFFERED)
     assert "\n" not in str(caught.value)
 
 

@@ -16,8 +16,8 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.logs.mcap_reader import LogReader
+from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import RosImage
-from drivers.logs.stamp_order import StampOrder
 from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
@@ -166,7 +166,7 @@ def test_frames_shuffled_within_the_window_come_out_sorted(tmp_path: Path, seed:
 
 def test_waiting_frames_are_bounded_in_bytes_too() -> None:
     data = memoryview(bytes(64 * 2**20))
-    order = StampOrder(32, Counter())
+    order = ReorderBuffer(32, Counter())
     given = [len(list(order.push("lower", RosImage(stamp, "mono8", data)))) for stamp in range(1, 8)]
     assert given == [0, 0, 0, 0, 1, 1, 1]
 

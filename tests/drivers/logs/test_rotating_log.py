@@ -17,18 +17,19 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.errors import DriverError
-from drivers.logs.file_lock import is_held
-from drivers.logs.log_folder import LogFolder, Rotation
+from drivers.events import NOTICE, WARNING
+from drivers.logs.file_lock import is_locked
+from drivers.logs.log_folder import LogFolder, RotationSettings
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_messages import DataSection
 from drivers.logs.mcap_records import LogFile
 from drivers.logs.mcap_writer import LogWriter
-from drivers.logs.rotating_log import NOTICE, WARNING, RotatingLog
+from drivers.logs.rotating_log import RotatingLog
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, image
 
 ROOT = Path(__file__).parents[3]
 RIG = {"rig.toml": b"version = 1"}
-ROOMY = Rotation(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0, retry_s=0.5)
+ROOMY = RotationSettings(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0, retry_s=0.5)
 TICK_NS = 33_333_333
 
 
@@ -42,9 +43,9 @@ class Heard(list[tuple[int, str]]):
 class Bench:
     """A recording of noise that no compression makes smaller, at 30 messages a second of stamps."""
 
-    def __init__(self, folder: Path, rotation: Rotation, name: str = "robot") -> None:
+    def __init__(self, folder: Path, rotation: RotationSettings, name: str = "robot") -> None:
         self.folder, self.heard = folder, Heard()
-        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, report=self.heard)
+        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, on_event=self.heard)
         self.state, self._count = self.log.state, 0
 
     def write(self, count: int, size: int = 1000) -> None:
@@ -68,7 +69,7 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     """Makes benches in the test's own folder."""
     benches: list[Bench] = []
 
-    def make(rotation: Rotation = ROOMY, name: str = "robot", folder: Path = tmp_path / "log") -> Bench:
+    def make(rotation: RotationSettings = ROOMY, name: str = "robot", folder: Path = tmp_path / "log") -> Bench:
         benches.append(Bench(folder, rotation, name))
         return benches[-1]
 
@@ -81,18 +82,18 @@ def test_a_file_is_part_until_it_is_whole(bench: Callable[..., Bench]) -> None:
     recording = bench()
     recording.write(30)
     assert recording.names() == ["robot_20231114T221320Z_001.mcap.part"]
-    assert is_held(recording.state.file)
+    assert is_locked(recording.state.file)
     recording.log.close()
     recording.log.close()
     recording.write(1)
     (path,) = recording.folder.iterdir()
-    assert path.name == "robot_20231114T221320Z_001.mcap" and counted(path) == 30 and not is_held(path)
+    assert path.name == "robot_20231114T221320Z_001.mcap" and counted(path) == 30 and not is_locked(path)
     assert (recording.state.status, recording.state.messages, recording.state.lost) == ("closed", 31, 1)
 
 
 @pytest.mark.parametrize("rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)],
                          ids=["size", "age"])
-def test_a_new_file_is_begun_by_size_and_by_age(bench: Callable[..., Bench], rotation: Rotation) -> None:
+def test_a_new_file_is_begun_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
     recording = bench(rotation)
     recording.write(200, size=10_000)
     recording.log.close()
@@ -302,9 +303,9 @@ def test_what_survives_is_counted_at_every_moment(tmp_path: Path) -> None:
         for n in range(100):
             log.write(*image(LOWER, START_NS + n * TICK_NS))
             kept = len(list(DataSection(LogFile(path), Catalog()).messages()))
-            assert log.kept == kept and log.messages == n + 1
-        assert n - log.kept < 15 and log.size_bytes == path.stat().st_size
+            assert log.persisted == kept and log.messages == n + 1
+        assert n - log.persisted < 15 and log.size_bytes == path.stat().st_size
         log.sync()
-        assert log.kept == 100
+        assert log.persisted == 100
     with pytest.raises(DriverError, match="File exists"):
         LogWriter(path, exclusive=True)

@@ -16,13 +16,13 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Script, T
+from drivers.motors.motor_protocol import T, Transaction
 from drivers.motors.protocols.line_protocol import (
     LineProtocol,
-    LineStatus,
-    SetWatchdog,
-    Velocity,
-    WatchdogSet,
+    StatusMessage,
+    VelocityMessage,
+    WatchdogReply,
+    WatchdogRequest,
     decode,
     encode,
 )
@@ -37,7 +37,7 @@ ANSWER_S = 2.0
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
     """Commands at 20 Hz for a while."""
     for _ in range(round(seconds * 20)):
-        assert state.handle(encode(Velocity(state.base.commands, command))) is not None
+        assert state.handle(encode(VelocityMessage(state.base.commands, command))) is not None
         state.base.advance(0.05)
 
 
@@ -101,14 +101,14 @@ def test_stop_does_not_turn_towards_its_heading() -> None:
 
 def test_watchdog_stops_the_wheels_and_says_so() -> None:
     state = SimulatedLine()
-    assert state.handle(encode(SetWatchdog(200))) == encode(WatchdogSet(200))
+    assert state.handle(encode(WatchdogRequest(200))) == encode(WatchdogReply(200))
     drive(state, 1.0, VelocityCommand(0, 0.5, 0.0, 0.0))
     state.base.advance(0.14)  # with the 0.05 s of the last command
     assert not state.base.watchdog_expired and state.base.velocity_mps == 0.5
     state.base.advance(1.0)
     assert state.base.watchdog_expired and state.base.velocity_mps == 0.0 and state.base.expiries == 1
-    answers = [state.handle(encode(Velocity(20 + i, stop_command(0)))) for i in range(2)]
-    expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, LineStatus)]
+    answers = [state.handle(encode(VelocityMessage(20 + i, stop_command(0)))) for i in range(2)]
+    expired = [a.status.watchdog_expired for a in map(decode, filter(None, answers)) if isinstance(a, StatusMessage)]
     assert expired == [True, False]
 
 
@@ -124,16 +124,16 @@ def test_gap_in_seq_is_an_error_but_obeyed() -> None:
     state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
     for seq, told in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
-        assert state.handle(encode(Velocity(seq, told))) is not None
+        assert state.handle(encode(VelocityMessage(seq, told))) is not None
     assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
 def test_heading_counts_from_where_the_host_connected() -> None:
     state = SimulatedLine()
     drive(state, 4.0, VelocityCommand(0, 0.0, 1.0, 0.1))
-    state.handle(encode(SetWatchdog(500)))
-    answer = decode(state.handle(encode(Velocity(0, stop_command(0)))) or b"")
-    assert isinstance(answer, LineStatus) and answer.status.heading_rad == 0.0
+    state.handle(encode(WatchdogRequest(500)))
+    answer = decode(state.handle(encode(VelocityMessage(0, stop_command(0)))) or b"")
+    assert isinstance(answer, StatusMessage) and answer.status.heading_rad == 0.0
     assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
 
 
@@ -161,7 +161,7 @@ def test_commands_arrive_and_are_answered(twin: SimulatedMotor) -> None:
     assert twin.last_command == VelocityCommand(0, 0.5, 0.0, 0.0)
     assert motor.send(command) == MotorStatus(0.5, 0.0, 0.0, False, 0, 12.0)
     motor.close()
-    assert twin.errors == 0 and twin.state.watchdog_ms == 10_000
+    assert twin.errors == 0 and twin.base.watchdog_ms == 10_000
 
 
 def test_many_commands_over_the_end_of_seq(twin: SimulatedMotor) -> None:
@@ -206,7 +206,7 @@ class Stubborn(SimulatedLine):
     def handle(self, line: bytes) -> bytes | None:
         """The answer of the twin, but with 1000 ms in force."""
         answer = super().handle(line)
-        return encode(WatchdogSet(1000)) if answer and answer.startswith(b"$A") else answer
+        return encode(WatchdogReply(1000)) if answer and answer.startswith(b"$A") else answer
 
 
 def test_watchdog_in_force_is_verified() -> None:
@@ -248,9 +248,8 @@ class Noisy(SimulatedLine):
     def handle(self, line: bytes) -> bytes | None:
         """The twin's answer behind noise, a broken line and an old status."""
         answer = super().handle(line) or b""
-        return (
-            b"\xff\x00$S,1" + b"$S,9,9*0000\n" + encode(LineStatus(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0))) + answer
-        )
+        old_status = encode(StatusMessage(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0)))
+        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + old_status + answer
 
 
 def test_noise_before_the_answer_is_skipped_and_counted() -> None:
@@ -264,7 +263,7 @@ def test_noise_before_the_answer_is_skipped_and_counted() -> None:
 
 def test_twin_counts_what_is_not_of_the_protocol(twin: SimulatedMotor) -> None:
     descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
-    os.write(descriptor, b"hello\n$V,1,2,3,4*0000\n" + encode(Velocity(5, stop_command(0))))
+    os.write(descriptor, b"hello\n$V,1,2,3,4*0000\n" + encode(VelocityMessage(5, stop_command(0))))
     assert until(lambda: twin.commands == 1)
     assert twin.errors == 5 + 1
     os.close(descriptor)
@@ -273,7 +272,7 @@ def test_twin_counts_what_is_not_of_the_protocol(twin: SimulatedMotor) -> None:
 def test_twin_outlives_a_host_that_never_reads(twin: SimulatedMotor) -> None:
     descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
     for seq in range(2000):
-        os.write(descriptor, encode(Velocity(seq, stop_command(0))))
+        os.write(descriptor, encode(VelocityMessage(seq, stop_command(0))))
     assert until(lambda: twin.commands == 2000) and twin.unsent > 0
     os.close(descriptor)
 
@@ -300,7 +299,7 @@ def turn(protocol: LineProtocol, twin: SimulatedLine, heading_rad: float) -> Mot
     return status
 
 
-def told(script: Script[T], twin: SimulatedLine) -> T:
+def told(script: Transaction[T], twin: SimulatedLine) -> T:
     """What a script returns that needs one answer."""
     try:
         script.send(twin.handle(next(script)) or b"")

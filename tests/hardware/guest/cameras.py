@@ -70,7 +70,7 @@ class Watched:
         self.said: list[tuple[int, str]] = []
         self.taken: list[tuple[int, int, int]] = []
         self.last: Frame | None = None
-        self.camera = V4l2Camera(V4l2Settings(device, **fields), "lower", report=lambda *said: self.said.append(said))
+        self.camera = V4l2Camera(V4l2Settings(device, **fields), "lower", on_event=lambda *said: self.said.append(said))
         self.state = self.camera.state
         self.thread = threading.Thread(target=self._read, daemon=True)
 
@@ -264,7 +264,7 @@ def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
         os.rename(node, "/dev/hidden")
         os.symlink(os.path.realpath(UPPER), node)
         control("/dev/hidden", FATAL_ERROR, 1)
-        until(lambda: "use a name that stays" in watched.state.problem)
+        until(lambda: "use a persistent name" in watched.state.problem)
         assert watched.state.status == "lost"
         os.rename("/dev/hidden", node)
         watched.more(3)
@@ -279,7 +279,7 @@ def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
             watched.more(5)
             writer.pausing = True
             until(lambda: watched.state.status == "lost")
-            assert "no good image for 1 s" in watched.state.problem
+            assert "no valid image for 1 s" in watched.state.problem
             until(lambda: watched.state.reopens >= 2)
             writer.pausing = False
             watched.more(5)
@@ -333,10 +333,10 @@ def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"gain": 300}, "300 was asked, it takes 0 to 255"),
+        ({"gain": 300}, "300 was requested, it accepts 0 to 255"),
         ({"exposure_us": 500}, "no control of its automatic exposure"),
         ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: brightness"),
-        ({"rate_hz": 13.0}, "13 Hz was asked, the device gave 1"),
+        ({"rate_hz": 13.0}, "13 Hz was requested, the device set 1"),
         ({"rate_hz": 90.0}, "not offered; choose from: "),
         ({"pixel_format": "MJPG"}, "not offered; choose from: "),
         ({"width_px": 322}, "not offered; choose from: "),

@@ -92,9 +92,9 @@ class Wheels:
         return self.log[-1]
 
     @property
-    def told_mps(self) -> float:
+    def commanded_mps(self) -> float:
         """What they are told now, or were told last."""
-        return float(self.ask()["told_mps"])
+        return float(self.ask()["commanded_mps"])
 
 
 def transform_of(row: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -169,9 +169,9 @@ def test_commands_turn_the_wheels_and_silence_stops_them(operator: Operator, whe
     before = wheels.ask()
     assert before["fastest_mps"] == 0.0
     operator.driving = True
-    until(lambda: wheels.told_mps > 0.25)
+    until(lambda: wheels.commanded_mps > 0.25)
     operator.driving = False
-    until(lambda: wheels.told_mps == 0.0)
+    until(lambda: wheels.commanded_mps == 0.0)
     after = wheels.ask()
     assert after["errors"] == before["errors"] and after["way_m"] > 0.05
     assert "the wheels stop: the command is stale" in words()
@@ -179,15 +179,15 @@ def test_commands_turn_the_wheels_and_silence_stops_them(operator: Operator, whe
 
 def test_one_camera_gone_stops_the_wheels_until_it_is_back(world: World, operator: Operator, wheels: Wheels) -> None:
     operator.driving = True
-    until(lambda: wheels.told_mps > 0.25)
+    until(lambda: wheels.commanded_mps > 0.25)
     world.close("lower")
-    until(lambda: wheels.told_mps == 0.0)
+    until(lambda: wheels.commanded_mps == 0.0)
     until(lambda: operator.message("lower camera").startswith("camera /dev/omnid/lower"))
     until(lambda: operator.message("pairing") == "no images of the lower camera")
     assert wheels.ask()["fastest_mps"] == 0.0
     world.open("lower")
     operator.more(3)
-    until(lambda: wheels.told_mps > 0.25)
+    until(lambda: wheels.commanded_mps > 0.25)
     lost = [text for text in words() if "lower camera: " in text]
     assert sum("lost, and tried again" in text for text in lost) == 1 and sum(": back, " in text for text in lost) == 1
     assert show("NRestarts") == "0"
@@ -197,7 +197,7 @@ def test_a_kill_stops_the_wheels_until_it_is_back(world: World, operator: Operat
     pid, before = int(show("MainPID")), wheels.ask()
     os.kill(pid, signal.SIGKILL)
     killed_ns = time.time_ns()
-    until(lambda: wheels.told_mps == 0.0)
+    until(lambda: wheels.commanded_mps == 0.0)
     after = wheels.ask()
     assert after["expiries"] == before["expiries"], "what steers slowed them down, long before the watchdog"
     keep_what_was_recorded(killed_ns, killed_ns - operator.poses[-1].stamp_ns)
@@ -205,7 +205,7 @@ def test_a_kill_stops_the_wheels_until_it_is_back(world: World, operator: Operat
     assert wheels.ask()["fastest_mps"] == 0.0
     restarted(pid)
     operator.more(3)
-    until(lambda: wheels.told_mps > 0.25)
+    until(lambda: wheels.commanded_mps > 0.25)
     assert wheels.ask()["unsafe_resumes"] == 0
 
 
@@ -219,23 +219,23 @@ def keep_what_was_recorded(killed_ns: int, newest_age_ns: int) -> None:
 def test_a_daemon_that_stands_still_is_started_anew(operator: Operator, wheels: Wheels) -> None:
     pid = int(show("MainPID"))
     os.kill(pid, signal.SIGSTOP)
-    until(lambda: wheels.told_mps == 0.0)
+    until(lambda: wheels.commanded_mps == 0.0)
     restarted(pid)
     lines = words()
     assert any("Watchdog timeout" in text for text in lines)
     assert any("Fatal Python error: Aborted" in text for text in lines)
     operator.more(3)
-    until(lambda: wheels.told_mps > 0.25)
+    until(lambda: wheels.commanded_mps > 0.25)
 
 
 def test_the_end_stops_the_wheels(operator: Operator, wheels: Wheels) -> None:
     before = wheels.ask()
     run("systemctl", "stop", "--no-block", "omnid")
-    until(lambda: wheels.told_mps == 0.0)
+    until(lambda: wheels.commanded_mps == 0.0)
     assert wheels.ask()["expiries"] == before["expiries"], "told so, long before its watchdog"
     run("systemctl", "stop", "omnid")
     after = wheels.ask()
-    assert after["told_mps"] == after["fastest_mps"] == 0.0
+    assert after["commanded_mps"] == after["fastest_mps"] == 0.0
     assert (show("ActiveState"), show("Result"), show("ExecMainStatus")) == ("inactive", "success", "0")
     assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in words())
 
@@ -246,7 +246,7 @@ def test_what_is_recorded_from_the_cameras_alone_is_a_log(operator: Operator, tm
         "--config", "/etc/omnid/omnid.toml")
     log, = (tmp_path / "boards").glob("*.mcap")
     assert "rig.toml" in run("/opt/omnid/bin/omnid", "log", "info", str(log))
-    images = LogImages.of(log)
+    images = LogImages.load(log)
     for eye in (images.lower, images.upper):
         stamps_ns = [frame.stamp_ns for _, frame in eye]
         assert len(stamps_ns) > 10 and stamps_ns == sorted(set(stamps_ns))

@@ -27,7 +27,7 @@ class Loopback:
         pix = asked.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = *size_px, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
         v4l2.call(self._fd, v4l2.S_FMT, asked)
-        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Number(OUTPUT))  # else its writer is never seen to go
+        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Int32(OUTPUT))  # else its writer is never seen to go
 
     def write(self, image: bytes) -> None:
         """Shows the image; the kernel stamps it now."""

@@ -32,7 +32,7 @@ class World:
     """What is before the cameras: the log, forwards and backwards, one step after each pose that was told of it."""
 
     def __init__(self) -> None:
-        images = LogImages.of(SAMPLE / "log.mcap")
+        images = LogImages.load(SAMPLE / "log.mcap")
         self._data = [[bytes(timed[1].data) for timed in eye] for eye in (images.lower, images.upper)]
         self._last = min(map(len, self._data)) - 1
         self._step, self._moved = 0, threading.Event()

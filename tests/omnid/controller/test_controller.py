@@ -13,7 +13,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.motors.serial_motor import Late, SerialMotor
+from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller, ControllerPose, ControllerSettings, TimedSetpoint
 from omnid.controller.statistics import ControllerStatistics
@@ -280,7 +280,7 @@ def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
     send = driving.wheels.send
 
     def late(_: VelocityCommand) -> MotorStatus:
-        raise Late("motor on /dev/x gave no answer")
+        raise LateReplyError("motor on /dev/x gave no answer")
 
     for wheels in (late, send):
         driving.wheels.send = wheels  # type: ignore[method-assign]
@@ -293,7 +293,7 @@ def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
 def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) -> None:
     """The stop that was told without an answer is a step of the ramp, and the next goes on from there."""
     def late(_: VelocityCommand) -> MotorStatus:
-        raise Late("motor on /dev/x gave no answer")
+        raise LateReplyError("motor on /dev/x gave no answer")
 
     send, driving.wheels.send = driving.wheels.send, late  # type: ignore[method-assign]
     driving.helm.end()
@@ -383,7 +383,7 @@ def run_until(helm: Controller, twin: SimulatedMotor, setpoint: Setpoint, happen
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
         assert time.monotonic() < deadline_s, "it did not happen"
-        state = twin.state
+        state = twin.base
         helm.see(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
         helm.command(TimedSetpoint(time.monotonic_ns(), setpoint))
         helm()
@@ -399,10 +399,10 @@ def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoin
             run_until(helm, twin, setpoint, lambda: abs(twin.pose[2] - goal_rad) < 0.02)
         else:
             run_until(helm, twin, setpoint, lambda: twin.pose[2] > 0.4)
-            assert twin.state.yaw_rate_radps == pytest.approx(0.4, abs=0.2)
+            assert twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2)
         helm.stop(time.monotonic_ns())
         heading_rad, slowed = twin.pose[2], time.monotonic() + PATIENCE_S
-        while not (is_stop(twin.last_command) and twin.state.yaw_rate_radps == 0) and time.monotonic() < slowed:
+        while not (is_stop(twin.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
             helm()
             time.sleep(0.02)
         assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not go on to where nobody wants it any more"

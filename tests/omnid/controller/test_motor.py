@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from omnid.config import Config, MotorConfig
 from omnid.controller.motor import open_motor
 from omnid.settings import parse
@@ -25,8 +25,8 @@ def test_every_protocol_can_be_simulated(protocol: str) -> None:
         driver, twin = open_motor(config, closing)
         driver.send(VelocityCommand(0, 0.4, 0.0, 0.2))
         assert twin is not None and twin.errors == 0
-        assert twin.state.told_mps == pytest.approx([0.35, 0.45], rel=0.02)
-    assert twin.state.told_mps == [0.0, 0.0], "closing stops the wheels"
+        assert twin.state.commanded_mps == pytest.approx([0.35, 0.45], rel=0.02)
+    assert twin.state.commanded_mps == [0.0, 0.0], "closing stops the wheels"
 
 
 def test_a_watchdog_of_fewer_than_four_ticks_is_refused() -> None:

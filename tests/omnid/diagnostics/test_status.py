@@ -12,7 +12,7 @@ import pytest
 
 from calib import se3
 from calib.rig import Rig
-from drivers.cameras.v4l2_buffers import CameraState
+from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from omnid.config import PairConfig

@@ -18,7 +18,7 @@ import pytest
 
 from calib.rig_file import read_rig, write_rig
 from drivers.cameras.v4l2_devices import CaptureDevice
-from drivers.cameras.v4l2_modes import Mode, Sizes
+from drivers.cameras.v4l2_modes import Mode, SizeRange
 from drivers.cameras.v4l2_settings import V4l2Settings
 from omnid.cli import main
 from omnid.config import RecordConfig
@@ -32,8 +32,8 @@ from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
 NOBODY = 65534
-FORMATS = (Mode("YUYV", Sizes(640, 640), Sizes(480, 480), (30.0,)),
-           Mode("MJPG", Sizes(1280, 1280), Sizes(960, 960), (30.0, 15.0)))
+FORMATS = (Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0,)),
+           Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)))
 
 
 class Robot:

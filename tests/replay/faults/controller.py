@@ -47,15 +47,15 @@ def only_garbage(place: Place) -> Outcome:
     """The controller's answers are noise, as at a wrong baud rate."""
     noise = random.Random(6)
     with driving(place) as (_, operator, base):
-        base.twin.deaf = True
+        base.twin.drop_input = True
         for _ in range(60):
-            base.twin.say(noise.randbytes(80))
+            base.twin.send(noise.randbytes(80))
             time.sleep(0.03)
         wait_until(lambda: int(operator.values("wheels").get("errors", 0)) > 3, "errors counted")
         said = f"wheels: {operator.message('wheels')}"
         assert base.line.base.velocity_mps == 0, "the watchdog's stop"
         operator.cease()
-        base.twin.deaf = False
+        base.twin.drop_input = False
         stands(base)
         operator.drive()
         goes_on(base)
@@ -80,12 +80,12 @@ def line_garbage(place: Place) -> Outcome:
 def silent(place: Place) -> Outcome:
     """The controller neither hears nor answers."""
     with driving(place) as (_, operator, base):
-        base.twin.deaf = True
+        base.twin.drop_input = True
         wait_until(lambda: int(operator.values("wheels").get("errors", 0)) > 3, "errors counted")
         wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
         said = f"wheels: {operator.message('wheels')}"
         operator.cease()
-        base.twin.deaf = False
+        base.twin.drop_input = False
         stands(base)
         operator.drive()
         goes_on(base)

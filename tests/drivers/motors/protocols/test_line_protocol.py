@@ -11,27 +11,27 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.line_protocol import (
     MAX_LINE,
-    LineAssembler,
-    LineStatus,
-    Message,
+    LineFramer,
+    LineMessage,
     ProtocolError,
-    SetWatchdog,
-    Velocity,
-    WatchdogSet,
+    StatusMessage,
+    VelocityMessage,
+    WatchdogReply,
+    WatchdogRequest,
     crc16,
     decode,
     encode,
 )
 
 STATUS = MotorStatus(0.25, -1.5, 0.125, watchdog_expired=True, fault=7, battery_v=12.6)
-MESSAGES: list[Message] = [
-    Velocity(0, stop_command(0)),
-    Velocity(65535, VelocityCommand(0, -10.0, 3.142, -20.0)),
-    Velocity(1, VelocityCommand(0, 10.0, -3.142, 20.0)),
-    LineStatus(65535, STATUS),
-    LineStatus(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
-    SetWatchdog(20),
-    WatchdogSet(10_000),
+MESSAGES: list[LineMessage] = [
+    VelocityMessage(0, stop_command(0)),
+    VelocityMessage(65535, VelocityCommand(0, -10.0, 3.142, -20.0)),
+    VelocityMessage(1, VelocityCommand(0, 10.0, -3.142, 20.0)),
+    StatusMessage(65535, STATUS),
+    StatusMessage(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
+    WatchdogRequest(20),
+    WatchdogReply(10_000),
 ]
 
 
@@ -45,13 +45,13 @@ def test_checksum_is_ccitt_false() -> None:
 
 def test_known_lines() -> None:
     command = VelocityCommand(99, 0.3, -1.571, 0.0504)
-    assert encode(Velocity(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
-    assert encode(LineStatus(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
-    assert encode(SetWatchdog(500)) == sealed(b"W,500")
+    assert encode(VelocityMessage(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
+    assert encode(StatusMessage(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
+    assert encode(WatchdogRequest(500)) == sealed(b"W,500")
 
 
 @pytest.mark.parametrize("message", MESSAGES)
-def test_comes_back(message: Message) -> None:
+def test_comes_back(message: LineMessage) -> None:
     line = encode(message)
     assert decode(line) == message
     assert decode(line.rstrip() + b"\r\n") == decode(line.rstrip()) == message
@@ -59,10 +59,10 @@ def test_comes_back(message: Message) -> None:
 
 
 def test_unknown_battery_is_nan() -> None:
-    line = encode(LineStatus(3, MotorStatus(0.0, 0.0, 0.0, False, 0, math.nan)))
+    line = encode(StatusMessage(3, MotorStatus(0.0, 0.0, 0.0, False, 0, math.nan)))
     assert b",-1,0,0*" in line
     back = decode(line)
-    assert isinstance(back, LineStatus) and math.isnan(back.status.battery_v)
+    assert isinstance(back, StatusMessage) and math.isnan(back.status.battery_v)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308, 10.001, -10.001, 20.001, -20.001])
@@ -72,12 +72,12 @@ def test_numbers_without_a_place_never_encode(field: str, bad: float) -> None:
         bad *= 3
     numbers = {"velocity_mps": 0.1, "heading_rad": 0.1, "yaw_rate_radps": 0.1, field: bad}
     with pytest.raises(ProtocolError):
-        encode(Velocity(0, VelocityCommand(0, **numbers)))
+        encode(VelocityMessage(0, VelocityCommand(0, **numbers)))
 
 
-@pytest.mark.parametrize("message", [Velocity(-1, stop_command(0)), Velocity(65536, stop_command(0)),
-                                     SetWatchdog(0), SetWatchdog(19), SetWatchdog(10_001)])  # fmt: skip
-def test_counts_and_times_stay_inside(message: Message) -> None:
+@pytest.mark.parametrize("message", [VelocityMessage(-1, stop_command(0)), VelocityMessage(65536, stop_command(0)),
+                                     WatchdogRequest(0), WatchdogRequest(19), WatchdogRequest(10_001)])  # fmt: skip
+def test_counts_and_times_stay_inside(message: LineMessage) -> None:
     with pytest.raises(ProtocolError, match="keep it inside"):
         encode(message)
 
@@ -94,7 +94,7 @@ def test_well_sealed_nonsense_is_refused(body: bytes) -> None:
 
 
 def test_every_changed_byte_is_noticed() -> None:
-    line = encode(Velocity(17, VelocityCommand(0, 0.3, -1.571, 0.05)))
+    line = encode(VelocityMessage(17, VelocityCommand(0, 0.3, -1.571, 0.05)))
     for i in range(len(line) - 1):
         for value in set(range(256)) - {line[i], line[i] ^ 0x20}:  # hexadecimal digits may be small letters
             with pytest.raises(ProtocolError):
@@ -109,7 +109,7 @@ def test_errors_are_driver_errors_in_one_line() -> None:
 
 def test_any_bytes() -> None:
     rng = random.Random(3)
-    assembler = LineAssembler()
+    assembler = LineFramer()
     for _ in range(3000):
         noise = bytes(rng.choice(b"$V,S*W0123456789-AF\r\n\xff\x00") for _ in range(rng.randint(0, 90)))
         for line in [noise, *assembler.feed(noise)]:
@@ -120,7 +120,7 @@ def test_any_bytes() -> None:
 def test_assembler_takes_any_pieces() -> None:
     rng = random.Random(4)
     stream = b"".join(encode(message) for message in MESSAGES * 20)
-    assembler, lines = LineAssembler(), []
+    assembler, lines = LineFramer(), []
     while stream:
         size = rng.randint(1, 40)
         lines += assembler.feed(stream[:size])
@@ -135,14 +135,14 @@ def test_assembler_takes_any_pieces() -> None:
      (b"\r\n\r\n", 0)],
 )  # fmt: skip
 def test_assembler_finds_the_next_line(noise: bytes, garbage: int) -> None:
-    assembler = LineAssembler()
-    (line,) = assembler.feed(noise + encode(SetWatchdog(500)))
-    assert decode(line) == SetWatchdog(500)
+    assembler = LineFramer()
+    (line,) = assembler.feed(noise + encode(WatchdogRequest(500)))
+    assert decode(line) == WatchdogRequest(500)
     assert assembler.garbage == garbage
 
 
 def test_assembler_stays_small() -> None:
-    assembler = LineAssembler()
+    assembler = LineFramer()
     for _ in range(100):
         assert assembler.feed(b"$" + b"1" * 5000) == []
     assert len(assembler._line) <= MAX_LINE

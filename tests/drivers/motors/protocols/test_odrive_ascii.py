@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand, stop_command
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.odrive_ascii import ODriveAscii, sealed
-from tests.drivers.motors.scripts import Unfinished, result, told
+from tests.drivers.motors.transactions import Unfinished, result, told
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, gear=10.0)  # 10 turns of the motor a metre
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)

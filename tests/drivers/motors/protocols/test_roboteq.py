@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.roboteq import MIXED, POWER, Roboteq
-from tests.drivers.motors.scripts import Unfinished, result, told
+from tests.drivers.motors.transactions import Unfinished, result, told
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, gear=10.0, max_wheel_mps=2.0)  # 600 rpm at 1 m/s
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)

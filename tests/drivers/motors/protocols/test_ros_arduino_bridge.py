@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.ros_arduino_bridge import RosArduinoBridge
-from tests.drivers.motors.scripts import Unfinished, result, told
+from tests.drivers.motors.transactions import Unfinished, result, told
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, ticks_per_turn=4000.0)  # 4000 ticks a metre
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)

@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import MASK, PacketFramer, Vesc, packet
-from tests.drivers.motors.scripts import Unfinished, result, told
+from tests.drivers.motors.transactions import Unfinished, result, told
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, pole_pairs=7, can_id=9)  # 420 erpm at 1 m/s
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)

@@ -9,7 +9,7 @@ import pytest
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.waveshare_json import WaveshareJson
-from tests.drivers.motors.scripts import Unfinished, result, told
+from tests.drivers.motors.transactions import Unfinished, result, told
 
 DRIVE = DifferentialDrive(track_m=0.5, max_wheel_mps=5.0)
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)

@@ -22,7 +22,7 @@ class _Held(NamedTuple):
     image: RosImage
 
 
-class StampOrder:
+class ReorderBuffer:
     """Holds up to `window` frames and 256 MiB, and gives the oldest when there are more.
 
     A frame older than one already given is dropped and counted as 'late', a second one with the stamp of its camera's

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from drivers.motors.motor_protocol import Script, T
+from drivers.motors.motor_protocol import T, Transaction
 
 
 class Unfinished(Exception):  # noqa: N818 - it is what was found
     """The script wants to hear more."""
 
 
-def result(script: Script[T], *frames: bytes) -> T:
+def result(script: Transaction[T], *frames: bytes) -> T:
     """What a script returns once it has heard the frames; Unfinished where it goes on waiting."""
     next(script)
     try:
@@ -20,6 +20,6 @@ def result(script: Script[T], *frames: bytes) -> T:
     raise Unfinished
 
 
-def told(script: Script[T]) -> bytes:
+def told(script: Transaction[T]) -> bytes:
     """The first bytes that a script writes."""
     return next(script)

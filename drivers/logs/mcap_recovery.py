@@ -15,17 +15,17 @@ from mcap.records import ChunkIndex, Header
 from mcap.writer import CompressionType, Writer
 
 from drivers.errors import DriverError
-from drivers.logs.file_lock import hold, is_held
-from drivers.logs.mcap_copy import Copy
+from drivers.logs.file_lock import is_locked, lock
 from drivers.logs.mcap_index import has_footer, read_summary, summary_section
+from drivers.logs.mcap_record_copier import RecordCopier
 from drivers.logs.mcap_records import (
     MAGIC,
     PARSE_ERRORS,
     LogFile,
     Record,
     RecordError,
-    content,
-    parsing,
+    parser,
+    read_content,
     records,
 )
 
@@ -53,12 +53,12 @@ def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recove
     Raises DriverError, and leaves no file, where `path` is no log, is still being written or holds nothing that can
     be read, and where `out` exists or cannot be written.
     """
-    if is_held(path):
+    if is_locked(path):
         raise DriverError(f"cannot mend {str(path)!r}: it is being written; stop the recording first")
     file = LogFile(path)
     try:
         with _created(Path(out)) as target:
-            hold(target)
+            lock(target)
             return _written(file, target, Path(out))
     finally:
         file.close()
@@ -93,21 +93,22 @@ def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
     header = _header(file)
     writer = Writer(target, _CHUNK_BYTES, _compression(file))
     writer.start(header.profile, header.library)
-    copy, trail = Copy(writer), _Trail(file)
-    copy.define(file)
-    for record in trail.records():
+    copier, source = RecordCopier(writer), _RecoverableRecords(file)
+    copier.copy_definitions(file)
+    for record in source.records():
         if record.opcode == Opcode.CHUNK:
-            copy.chunk(file, record)
+            copier.copy_chunk(file, record)
         else:
-            copy.single(file, record)
+            copier.copy_record(file, record)
     writer.finish()  # type: ignore[no-untyped-call]
     target.flush()
     os.fsync(target.fileno())
     summary = read_summary(file)
     known = sum(summary.message_counts.values()) if summary else 0
-    lost = max(0, known - copy.messages) if known else None
-    whole = trail.ended and not (trail.jumps or copy.broken or lost) and summary is not None and has_footer(file)
-    return Recovery(copy.messages, copy.attachments, 0 if whole else lost, copy.broken + trail.jumps, trail.end, whole)
+    lost = max(0, known - copier.messages) if known else None
+    whole = source.ended and not (source.skips or copier.broken or lost) and summary is not None and has_footer(file)
+    return Recovery(copier.messages, copier.attachments, 0 if whole else lost, copier.broken + source.skips,
+                    source.end, whole)
 
 
 def _header(file: LogFile) -> Header:
@@ -115,7 +116,7 @@ def _header(file: LogFile) -> Header:
     first = next(records(file, len(MAGIC), file.size), None)
     if first is not None and first.opcode == Opcode.HEADER and first.size < _CHUNK_BYTES:
         try:
-            header: Header = Header.read(parsing(content(file, first)))
+            header: Header = Header.read(parser(read_content(file, first)))
             return header
         except (RecordError, *PARSE_ERRORS):
             pass
@@ -133,7 +134,7 @@ def _compression(file: LogFile) -> CompressionType:
     return CompressionType.NONE
 
 
-class _Trail:
+class _RecoverableRecords:
     """The records of a log's data section; where one is longer than it can be, on from the next chunk that is indexed.
 
     After its end: end is the byte reached, ended whether that was the proper end, jumps how often something was
@@ -144,7 +145,7 @@ class _Trail:
         self._file = file
         self._chunks = _indexed_chunks(file)
         self.ended = False
-        self.jumps = 0
+        self.skips = 0
         self.end = len(MAGIC)
 
     def records(self) -> Iterator[Record]:
@@ -153,7 +154,7 @@ class _Trail:
         while start is not None:
             yield from self._run(start)
             start = None if self.ended else self._next_chunk(max(start, self.end))
-            self.jumps += start is not None
+            self.skips += start is not None
 
     def _run(self, start: int) -> Iterator[Record]:
         for record in records(self._file, start, self._file.size):
@@ -178,5 +179,5 @@ def _indexed_chunks(file: LogFile) -> list[int]:
         for record in records(section, 0, section.size):
             if record.opcode == Opcode.CHUNK_INDEX:
                 with suppress(RecordError, *PARSE_ERRORS):
-                    places.append(int(ChunkIndex.read(parsing(content(section, record))).chunk_start_offset))
+                    places.append(int(ChunkIndex.read(parser(read_content(section, record))).chunk_start_offset))
     return sorted(places)

@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable, Iterator
 
 from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Framer, Script, T
-from drivers.motors.protocols.registry import PROTOCOLS
+from drivers.motors.motor_protocol import Framer, T, Transaction
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
-from drivers.motors.simulated.controllers import TWINS
-from drivers.motors.simulated.simulated_base import TwinLimits
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
+from drivers.motors.simulated.simulated_base import MotionLimits
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
 from drivers.motors.simulated.simulated_vesc import SimulatedVesc
@@ -21,14 +21,14 @@ PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing is measured agai
 ANSWER_S = 2.0
 LONG_MS = 10_000
 BASE = DifferentialDrive(track_m=0.4, wheel_radius_m=0.08, max_wheel_mps=1.0, gear=12.0, ticks_per_turn=300.0)
-INSTANT = TwinLimits(acceleration_mps2=1e4, yaw_acceleration_radps2=1e5)
+INSTANT = MotionLimits(acceleration_mps2=1e4, yaw_acceleration_radps2=1e5)
 
 
 def controller_of(name: str, drive: DifferentialDrive = BASE, watchdog_ms: int = LONG_MS) -> SimulatedController:
     """The twin; it follows the yaw rate even where it could steer to a heading."""
     if name == "vesc":
         return SimulatedVesc(drive, watchdog_ms)
-    return SimulatedLine(drive, heading_input=False) if name == "line" else TWINS[name](drive)
+    return SimulatedLine(drive, heading_input=False) if name == "line" else SIMULATED_CONTROLLERS[name](drive)
 
 
 def shortest_watchdog_ms(name: str) -> int:
@@ -36,7 +36,7 @@ def shortest_watchdog_ms(name: str) -> int:
     return 2000 if name == "ros_arduino_bridge" else 100
 
 
-def answer(script: Script[T], controller: SimulatedController, framer: Framer) -> T:
+def answer(script: Transaction[T], controller: SimulatedController, framer: Framer) -> T:
     """What a script returns that talks to a twin directly."""
     try:
         data = next(script)
@@ -49,7 +49,7 @@ def answer(script: Script[T], controller: SimulatedController, framer: Framer) -
 
 
 @contextlib.contextmanager
-def motor_and_twin(
+def connected_motor(
     name: str, drive: DifferentialDrive = BASE, *, watchdog_ms: int = LONG_MS, timeout_s: float = ANSWER_S
 ) -> Iterator[tuple[SerialMotor, SimulatedMotor]]:
     """Both ends of a pty, connected."""

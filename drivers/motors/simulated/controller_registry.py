@@ -15,7 +15,7 @@ from drivers.motors.simulated.simulated_roboteq import SimulatedRoboteq
 from drivers.motors.simulated.simulated_vesc import SimulatedVesc
 from drivers.motors.simulated.simulated_waveshare import SimulatedWaveshare
 
-TWINS: Mapping[str, Callable[[DifferentialDrive], SimulatedController]] = {
+SIMULATED_CONTROLLERS: Mapping[str, Callable[[DifferentialDrive], SimulatedController]] = {
     "line": SimulatedLine,
     "roboteq": SimulatedRoboteq,
     "roboteq_power": partial(SimulatedRoboteq, mode=POWER),

@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError
 from drivers.logs.mcap_reader import LogReader
 from drivers.logs.mcap_records import MAGIC
-from drivers.logs.mcap_recover import Recovery, recover
+from drivers.logs.mcap_recovery import Recovery, recover
 from drivers.logs.mcap_writer import LogWriter
 from tests.drivers.logs.mcap_logs import BARE, START_NS, Entry, pairs, text, write_log
 from tests.drivers.logs.test_mcap_damage import HOSTILE, LAYOUTS

@@ -18,8 +18,8 @@ from drivers.logs.mcap_records import (
     LogFile,
     Record,
     RecordError,
-    content,
-    parsing,
+    parser,
+    read_content,
     records,
     unpack_chunk,
 )
@@ -29,7 +29,7 @@ _MAX_DEFINITIONS: Final = 4096
 _MAX_DEFINITION_BYTES: Final = 64 * 2**20  # of all together
 
 
-class Copy:
+class RecordCopier:
     """Puts records into a writer, with channels and schemas under new numbers; counts what cannot be read as broken."""
 
     def __init__(self, writer: Writer) -> None:
@@ -46,45 +46,45 @@ class Copy:
             Opcode.METADATA: self._metadata,
         }
 
-    def define(self, file: LogFile) -> None:
+    def copy_definitions(self, file: LogFile) -> None:
         """Takes channels and schemas from the summary, for the chunk that defines them may be lost."""
         section = summary_section(file)
         if section is not None:
             for record in records(section, 0, section.size):
                 if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self.single(section, record)
+                    self.copy_record(section, record)
 
-    def chunk(self, file: LogFile, record: Record) -> None:
+    def copy_chunk(self, file: LogFile, record: Record) -> None:
         """Takes what is in a chunk."""
         try:
-            chunk = unpack_chunk(content(file, record))
+            chunk = unpack_chunk(read_content(file, record))
         except RecordError:
             self.broken += 1
             return
         end = 0
         for inner in records(chunk, 0, chunk.size):
             end = inner.at + inner.size
-            self.single(chunk, inner)
+            self.copy_record(chunk, inner)
         self.broken += end != chunk.size
 
-    def single(self, source: ByteSource, record: Record) -> None:
+    def copy_record(self, source: ByteSource, record: Record) -> None:
         """Takes one record; what belongs to an index is made anew."""
         take = self._takers.get(record.opcode)
         if take is None:
             return
         try:
-            take(content(source, record))
+            take(read_content(source, record))
         except (RecordError, *PARSE_ERRORS):
             self.broken += 1
 
     def _schema(self, body: memoryview) -> None:
-        schema = Schema.read(parsing(body))
+        schema = Schema.read(parser(body))
         if self._is_new(Opcode.SCHEMA, schema.id, body):
             number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
             self._ids[Opcode.SCHEMA, schema.id] = number
 
     def _channel(self, body: memoryview) -> None:
-        channel = Channel.read(parsing(body))
+        channel = Channel.read(parser(body))
         schema = self._ids.get((Opcode.SCHEMA, channel.schema_id)) if channel.schema_id else 0
         if schema is None:
             raise RecordError("a channel of an unknown schema")
@@ -115,10 +115,10 @@ class Copy:
         crc = int.from_bytes(body[-4:], "little")
         if crc and zlib.crc32(body[:-4]) != crc:
             raise RecordError("an attachment does not match its CRC")
-        found = Attachment.read(parsing(body))
+        found = Attachment.read(parser(body))
         self._writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
         self.attachments += 1
 
     def _metadata(self, body: memoryview) -> None:
-        found = Metadata.read(parsing(body))
+        found = Metadata.read(parser(body))
         self._writer.add_metadata(found.name, found.metadata)
