@@ -7,6 +7,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from omnid.commands.config import add_settings
+from omnid.commands.replay import replay_and_print
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -23,16 +24,16 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import load_config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
-    from omnid.runs.replay import Options, ReplayRun
+    from omnid.runs.replay import ReplayOptions
 
     _make(args.output)
     tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
-    options = Options(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
-                      bus_optional=True, realtime=True, quiet=args.quiet, settings=args.config)
+    options = ReplayOptions(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
+                            bus_optional=True, realtime=True, settings=args.config)
     config = load_config(args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
-        code = ReplayRun(log, config, options).run(rig=None, topics=(None, None))
+        code = replay_and_print(log, config, options, quiet=args.quiet)
         if code == 0:
             print(f"\nagainst the truth:\n{format_metrics(evaluate(read_tum(tum), read_tum(truth)))}")
     print(f"\nfiles: {', '.join(str(path) for _, path in options.files)}")

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from omnid.config import Config
+    from omnid.runs.replay import ReplayOptions
+    from omnid.runs.run_result import RunResult
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -44,14 +51,43 @@ def _add_manner(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replays the log."""
+    """Replay the log and print its summary; return 1 where no pose was found."""
     from omnid.config import load_config
-    from omnid.runs.replay import Options, ReplayRun
+    from omnid.runs.replay import ReplayOptions
 
-    options = Options(tum=args.tum, map=args.map, plan=args.plan, record=args.record, publish=args.publish,
-                      inline=args.inline, realtime=args.realtime, quiet=args.quiet, settings=args.config)
+    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map=args.map, plan=args.plan,
+                            record=args.record, publish=args.publish, inline=args.inline, realtime=args.realtime,
+                            settings=args.config)
     config = load_config(args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
-    return ReplayRun(args.log, config, options).run(rig=args.rig, topics=(args.lower, args.upper))
+    return replay_and_print(args.log, config, options, quiet=args.quiet)
+
+
+def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet: bool) -> int:
+    """Replay a log, print its warnings and its summary, and return the exit code; quiet: without progress."""
+    from dataclasses import replace
+
+    from omnid.diagnostics.progress import Progress
+    from omnid.runs.replay import run_log
+    from omnid.runs.run_result import RunFailedError
+
+    try:
+        result = run_log(log, config, options if quiet else replace(options, progress=Progress))
+    except RunFailedError as error:
+        _print_result(error.result, options)
+        raise
+    _print_result(result, options)
+    return 128 + result.signal if result.signal else int(result.counters.no_pose)
+
+
+def _print_result(result: RunResult, options: ReplayOptions) -> None:
+    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
+    from omnid.diagnostics.run_summary import run_summary
+    from omnid.sinks.files import on_stdout
+
+    for warning in result.warnings:
+        print(f"omnid: warning: {warning}", file=sys.stderr)
+    stream = sys.stderr if on_stdout(options.files) else sys.stdout
+    print(run_summary(result.counters, result.timings.values()), file=stream)
 
 
 def _presets(args: argparse.Namespace) -> list[str]:

@@ -13,7 +13,7 @@ from omnid.commands.config import add_settings
 if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
     from calib.rig import Rig
     from omnid.config import Config
-    from omnid.runs.live import Opener
+    from omnid.runs.live import OpenCamera
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -55,14 +55,14 @@ def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
         raise OmnidError("--once and --pace are for the images of a log: give one with --log, or leave them out")
 
 
-def _devices(config: Config) -> Opener:
+def _devices(config: Config) -> OpenCamera:
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import say
 
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=say)
 
 
-def _recorded(args: argparse.Namespace) -> Opener:
+def _recorded(args: argparse.Namespace) -> OpenCamera:
     from drivers.cameras.log_camera import LogCamera, LogImages
 
     images = LogImages.load(args.log)

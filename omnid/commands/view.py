@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.replay import replay_and_print
 
 if TYPE_CHECKING:  # whoever asks for another command loads none of this
     from omnid.config import Config
@@ -62,10 +63,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
+    from functools import partial
+
     from omnid.viewer.view import Log, show_log
 
-    log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.quiet)
-    return show_log(log, config, args.config, place)
+    log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.config)
+    return show_log(log, config, place, partial(replay_and_print, quiet=args.quiet))
 
 
 def _robot(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:

@@ -1,4 +1,4 @@
-"""How old images are when something has come of them."""
+"""Latency from the capture of images to the pose found in them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from omnid.messages import OdometryUpdate
 
 
 class Latency:
-    """A sink that measures from the capture of a pose's images to the pose; for stamps of CLOCK_MONOTONIC."""
+    """A sink of poses whose stamps are CLOCK_MONOTONIC; `to_pose` holds the latencies [s]."""
 
     def __init__(self) -> None:
         self.to_pose = Histogram()
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Takes the time."""
+        """Add the latency of a pose."""
         self.to_pose.add((time.monotonic_ns() - odometry.stamp_ns) * 1e-9)

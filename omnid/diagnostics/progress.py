@@ -18,8 +18,8 @@ COLUMNS = 80  # of a terminal that does not say
 class Progress:
     """Draws a bar, or writes a line where stderr is no terminal; called at a fixed rate."""
 
-    def __init__(self, tally: RunStatistics, expected: int | None, stream: TextIO | None = None) -> None:
-        self._tally, self._expected = tally, expected
+    def __init__(self, statistics: RunStatistics, expected: int | None, stream: TextIO | None = None) -> None:
+        self._statistics, self._expected = statistics, expected
         self._stream = stream or sys.stderr
         self._terminal = self._stream.isatty()
         self._start_s = time.monotonic()
@@ -32,7 +32,7 @@ class Progress:
 
     def __call__(self) -> None:
         """Shows the state now."""
-        if self._tally.poses:
+        if self._statistics.poses:
             self._show(self._line())
 
     def close(self) -> None:
@@ -41,10 +41,10 @@ class Progress:
             self._write("\r" + " " * self._drawn + "\r")
 
     def _line(self) -> str:
-        done, newest = self._tally.poses, self._tally.newest
+        done, newest = self._statistics.poses, self._statistics.newest
         rate = done / max(1e-3, time.monotonic() - self._start_s)
         state = newest.state if newest is not None else "starting"
-        return f"{self._share(done)} {rate:5.1f} pairs/s  {self._tally.length_m:8.2f} m  {state}"
+        return f"{self._share(done)} {rate:5.1f} pairs/s  {self._statistics.length_m:8.2f} m  {state}"
 
     def _share(self, done: int) -> str:
         if not self._expected:

@@ -1,17 +1,20 @@
-"""What a run came to: counts, the way travelled, the states."""
+"""Statistics of a run: poses, path length, states, resets; and the counters that a finished run reports."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.messages import OdometryUpdate
+from omnid.tracking_state import TrackingState
 
 
 class RunStatistics:
-    """A sink that adds up; other threads may read what it has."""
+    """A sink that counts poses; other threads may read its attributes meanwhile."""
 
     def __init__(self) -> None:
         self.poses = 0
@@ -22,7 +25,7 @@ class RunStatistics:
         self._position: NDArray[np.float64] | None = None
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Counts a pose."""
+        """Count a pose."""
         position = odometry.T_odom_rig[:3, 3]
         if self._position is not None:
             self.length_m += float(np.linalg.norm(position - self._position))
@@ -30,3 +33,28 @@ class RunStatistics:
         self.states[odometry.state] += 1
         self.resets = odometry.reset_counter
         self.poses += 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunCounters:
+    """Counts of a run over a log."""
+
+    pairs: int  # of images
+    poses: int
+    length_m: float  # of the path
+    states: Mapping[TrackingState, int]  # poses in each state
+    resets: int  # gaps in the trajectory after which tracking began again
+    drops: Mapping[str, int]  # messages lost, by reason; zeros too
+    map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
+    motor: Mapping[str, int] = field(default_factory=dict)  # of the simulated controller; empty without one
+
+    @property
+    def no_pose(self) -> bool:
+        """True if not one pose was measured: there is none, or all are predictions."""
+        return self.poses == self.states[TrackingState.LOST]
+
+    @classmethod
+    def of(cls, statistics: RunStatistics, pairs: int, drops: Mapping[str, int]) -> RunCounters:
+        """Return the counters of a run from its statistics."""
+        states = {state: statistics.states[state] for state in TrackingState}
+        return cls(pairs, statistics.poses, statistics.length_m, states, statistics.resets, drops)

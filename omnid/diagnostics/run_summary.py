@@ -1,32 +1,37 @@
-"""What is said at the end of a run."""
+"""The summary of a run as text: its counters, and a table of the times of its stages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_statistics import RunCounters
 from omnid.engine.telemetry import SummaryRow
 
-QUIET_BOXES = ("progress", "tally")
+
+def summary_entries(counters: RunCounters) -> dict[str, str]:
+    """Return the counters as texts, by name."""
+    states = ", ".join(f"{state} {_share(count, counters.poses)}" for state, count in counters.states.items())
+    entries = {"pairs": str(counters.pairs), "poses": str(counters.poses), "length": f"{counters.length_m:.4f} m",
+               "states": states, "resets": str(counters.resets), "drops": _listed(counters.drops)}
+    if counters.map:
+        entries["map"] = _listed(counters.map)
+    if counters.motor:
+        entries["motor"] = f"{counters.motor['commands']} commands received, {counters.motor['errors']} errors"
+    return entries
 
 
-def counters(tally: RunStatistics, dropped: Mapping[str, int]) -> dict[str, str]:
-    """The counts of a run, by name."""
-    states = {name: tally.states[name] for name in ("tracking", "degraded", "lost")}
-    share = ", ".join(f"{name} {_share(count, tally.poses)}" for name, count in states.items())
-    drops = ", ".join(f"{name} {count}" for name, count in dropped.items())
-    return {"poses": str(tally.poses), "length": f"{tally.length_m:.4f} m", "states": share,
-            "resets": str(tally.resets), "drops": drops}
-
-
-def run_summary(values: Mapping[str, str], rows: Iterable[SummaryRow]) -> str:
-    """The counters, and a table of the stages' times."""
-    lines = [f"{name:<9} {value}" for name, value in values.items()]
+def run_summary(counters: RunCounters, timings: Iterable[SummaryRow]) -> str:
+    """Return the counters, one a line, and a table with one row for each stage that processed messages."""
+    lines = [f"{name:<9} {text}" for name, text in summary_entries(counters).items()]
     lines += ["", f"{'stage':<11}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
-    shown = (row for row in rows if row.stage not in QUIET_BOXES and row.n)
-    lines += [f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in shown]
+    lines += [f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}"
+              for r in timings if r.n]
     return "\n".join(lines)
 
 
-def _share(count: int, of: int) -> str:
-    return f"{count / of:.1%}" if of else "0 %"
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _share(count: int, total: int) -> str:
+    return f"{count / total:.1%}" if total else "0 %"

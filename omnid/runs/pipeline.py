@@ -1,4 +1,4 @@
-"""The wiring: light comes in at the top and leaves as a pose and a motor command at the bottom."""
+"""The wiring of the stages: image pairs in, poses, maps and velocity commands out."""
 
 from __future__ import annotations
 
@@ -23,61 +23,61 @@ from omnid.stages.stereo import Stereo
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """Where the flow goes; what nobody wants is not computed."""
+    """The consumers of a run; a map that no sink takes is not computed."""
 
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
-    recorder: Sink[Any] | None = None  # of all that is said, and of the images
+    recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
-    motor: MotorTick | None = None  # of a replay: guidance asks, the tick sends
-    helm: ControllerLink | None = None  # of a live robot: it decides by itself, at its own rate, in its own process
-    rig: Sink[Panoramas] | None = None  # looks now and then whether the cameras stand as calibrated
+    motor: MotorTick | None = None  # of a replay: guidance sets the command, the tick sends it
+    helm: ControllerLink | None = None  # of a live run: the controller has its own process and rate
+    rig_monitor: Sink[Panoramas] | None = None
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
-    images: tuple[Stream[Frame], ...] = ()  # that are recorded as well
+    recorded_frames: tuple[Stream[Frame], ...] = ()
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
 
 
 class WiredStages(NamedTuple):
-    """The stages that know what the input is worth and what was left out."""
+    """The stages that are asked for counts and warnings at the end of a run."""
 
     stereo: Stereo
     mapping: Mapping | None
 
 
-def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, ends: Sinks) -> WiredStages:
-    """Joins the stages from the pairs on; gives those that are asked at the end."""
+def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
+    """Join the stages from the pairs on; return those that are asked at the end."""
     stereo = Stereo(geometry, config.stereo)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
-    if ends.rig:
-        graph.sink("rig", ends.rig, panoramas, policy=NEWEST, depth=1)
+    if sinks.rig_monitor:
+        graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
     depths = graph.stage("stereo", stereo, panoramas)
     odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
-    spoken: dict[str, Stream[Outgoing]] = {
-        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, ends)}
-    mapping = Mapping(config.mapping, ends.map_every_s) if ends.maps or ends.recorder or ends.bus else None
+    outgoing: dict[str, Stream[Outgoing]] = {
+        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
+    mapping = Mapping(config.mapping, sinks.map_every_s) if sinks.maps or sinks.recorder or sinks.bus else None
     if mapping:
         maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
-        spoken["bus-map"] = maps
-        for name, file in ends.maps.items():
-            graph.sink(name, file, maps)
-    for name, sink in ends.poses.items():
-        graph.sink(name, sink, odometry)
-    if ends.recorder:
-        graph.sink("record", ends.recorder, *ends.images, *spoken.values(), depth=ends.record_depth)
-    if ends.bus:
-        for name, stream in spoken.items():  # one each, for a map takes longer than a pose may wait
-            graph.sink(name, ends.bus, stream, policy=NEWEST)
+        outgoing["bus-map"] = maps
+        for name, map_sink in sinks.maps.items():
+            graph.sink(name, map_sink, maps)
+    for name, pose_sink in sinks.poses.items():
+        graph.sink(name, pose_sink, odometry)
+    if sinks.recorder:
+        graph.sink("record", sinks.recorder, *sinks.recorded_frames, *outgoing.values(), depth=sinks.record_depth)
+    if sinks.bus:
+        for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
+            graph.sink(name, sinks.bus, stream, policy=NEWEST)
     return WiredStages(stereo, mapping)
 
 
-def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, ends: Sinks
+def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
               ) -> Stream[VelocityCommand]:
-    """What the wheels are told. Their deadline waits for nobody: the newest pose or command lies in a slot."""
-    if ends.helm:
-        graph.sink("helm", ends.helm, odometry, policy=NEWEST, depth=1)
-        return graph.source("drive", ends.helm.told, wake=ends.helm.end)
+    """Join the controller; return its commands. Its deadline never waits: it takes the newest pose from a slot."""
+    if sinks.helm:
+        graph.sink("helm", sinks.helm, odometry, policy=NEWEST, depth=1)
+        return graph.source("drive", sinks.helm.told, wake=sinks.helm.end)
     commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
-    if ends.motor:
-        graph.sink("commands", ends.motor, commands)
-        graph.ticker("motor", 1.0 / config.motor.rate_hz, ends.motor)
+    if sinks.motor:
+        graph.sink("commands", sinks.motor, commands)
+        graph.ticker("motor", 1.0 / config.motor.rate_hz, sinks.motor)
     return commands

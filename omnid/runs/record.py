@@ -1,10 +1,11 @@
-"""A run that records and does nothing else: two cameras, a folder, until it is told to end."""
+"""A run that only records: two cameras, a folder, until a signal ends it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from drivers.events import NOTICE, WARNING, EventCallback
 from drivers.frame import Camera, FrameSource
@@ -15,45 +16,51 @@ from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.signals import ended_by_signals
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
-from omnid.sinks.frame_recorder import FrameRecorder
+from omnid.sinks.recorder import Recorder
 
-PERIOD_S = 15.0  # between two lines about how it goes
+PERIOD_S: Final = 15.0  # between two lines about the progress
 
 
 def open_recorder(
     config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, offset_ns: int = 0
-) -> FrameRecorder:
-    """The recorder that the settings describe; every file has them attached, and the rig's TOML where there is one.
+) -> Recorder:
+    """Return a recorder to the folder of the configuration; the first message makes the first file.
 
-    No file is made before the first message. offset_ns, encode: as FrameRecorder has them.
+    rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
+    report: takes severity and text of problems. encode, offset_ns: see Recorder.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = LogFolder(Path(config.record.folder), config.bus.robot)
     log = RotatingLog(folder, config.record.rotation(), attachments, on_event=report)
-    return FrameRecorder(log, config.bus.robot, encode, offset_ns=offset_ns)
+    return Recorder(log, config.bus.robot, encode, offset_ns=offset_ns, skip_invalid=True)
 
 
-def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> FrameRecorder:
-    """Records until the sources end or a signal comes; their stamps are CLOCK_MONOTONIC. Gives what became of it."""
+def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> Recorder:
+    """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     recorder = open_recorder(config, rig, report, offset_ns=offset_ns)
     graph = Graph(policy=NEWEST, depth=config.record.queue)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     graph.sink("record", recorder, *frames)
-    graph.ticker("progress", PERIOD_S, lambda: report(NOTICE, told(recorder, graph)) if recorder.state.files else None)
+
+    def report_progress() -> None:
+        if recorder.state.files:
+            report(NOTICE, progress_line(recorder, graph))
+
+    graph.ticker("progress", PERIOD_S, report_progress)
     try:
-        with ended_by_signals(lambda *_: graph.stop()):  # a second one ends it at once
+        with ended_by_signals(lambda *_: graph.stop()):  # a second signal ends it at once
             graph.run()
     finally:
         recorder.close()
-    report(NOTICE if recorder.state.messages else WARNING, told(recorder, graph))
+    report(NOTICE if recorder.state.messages else WARNING, progress_line(recorder, graph))
     return recorder
 
 
-def told(recorder: FrameRecorder, graph: Graph) -> str:
-    """How the recording goes, on one line."""
+def progress_line(recorder: Recorder, graph: Graph) -> str:
+    """Return one line with the counts of the recording."""
     state = recorder.state
     dropped = sum(stage.dropped for stage in graph.telemetry.stages if stage.name == "record")
-    kept = state.messages - state.lost - state.refused
-    return (f"recording: {kept} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-            f"refused {state.refused + recorder.unfit}, oldest files deleted {state.deleted}, {state.status}")
+    written = state.messages - state.lost - state.refused
+    return (f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
+            f"refused {state.refused + recorder.invalid}, oldest files deleted {state.deleted}, {state.status}")

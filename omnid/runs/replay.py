@@ -1,17 +1,16 @@
-"""A run over a recorded log, from the opening of its files to the summary."""
+"""A run over a recorded log: opens inputs and outputs, runs the stages, returns the result."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
-from typing import TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 import cv2
 
+from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
@@ -19,197 +18,262 @@ from drivers.logs.mcap_reader import LogReader
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.motor import MotorTick, open_motor
-from omnid.diagnostics.input_warnings import input_warnings, no_pose
-from omnid.diagnostics.progress import Progress
-from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.diagnostics.run_summary import QUIET_BOXES, counters, run_summary
+from omnid.diagnostics.input_warnings import input_warnings
+from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import summary_entries
 from omnid.diagnostics.status import stage_status
+from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import PlaybackClock
-from omnid.engine.signals import ended_by_signals
-from omnid.engine.telemetry import Telemetry
+from omnid.engine.telemetry import SummaryRow, Telemetry
 from omnid.errors import OmnidError
+from omnid.messages import MapUpdate
 from omnid.runs.log_rig import attached_rig
 from omnid.runs.pipeline import Sinks, WiredStages, wire
+from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.runs.session import Session
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
-from omnid.sinks.encoder import Encoder, Outgoing, clouds_of
-from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, on_stdout
-from omnid.sinks.recorder import Recorder
-from omnid.stages.geometry import Geometry, geometry, with_rims
+from omnid.sinks.encoder import Outgoing
+from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs
+from omnid.sinks.pose_collector import PoseCollector
+from omnid.sinks.recorder import Recorder, SingleLog
+from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.bus import Bus
 from omnid.transport.codec import OK, DiagnosticStatus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
-TICKERS = ("progress", "motor", "router")  # what they drop are deadlines, not messages
-Watch: TypeAlias = Callable[[Geometry, Telemetry], Sink[Outgoing]]
-READER_DROPS = ("late", "duplicate", "broken", "broken_records")
+READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
+BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
+
+
+class ProgressDisplay(Protocol):
+    """An action that shows how far a run is; it is called every period_s and closed at the end."""
+
+    @property
+    def period_s(self) -> float:
+        """Time between two calls."""
+
+    def __call__(self) -> None:
+        """Show the progress now."""
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """What is wanted of a run."""
+class ReplayOptions:
+    """Inputs and outputs of a run over a log."""
 
+    rig: Path | Rig | None = None  # None: the rig.toml that is attached to the log
+    topics: Topics = (None, None)  # of the images; None: those of the rig, else by their names
     tum: Path | None = None
     map: Path | None = None
     plan: Path | None = None
     record: Path | None = None
+    collect: bool = False  # keep poses and map in memory for the result: see PoseCollector for how much that is
     publish: bool = False
-    bus_optional: bool = False  # without a bus, go on without
+    bus_optional: bool = False  # without a bus, warn and go on
     inline: bool = False
     realtime: bool = False
-    quiet: bool = False
-    settings: Path | None = None  # where the configuration was read, so that nothing is written over it
-    watch: Watch | None = None  # makes one who is told everything, in the place of a recorder
+    settings: Path | None = None  # file of the configuration, so that no output overwrites it
+    progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
+    observer: Callable[[Geometry, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
     def files(self) -> list[tuple[str, Path]]:
-        """The files that will be written, by option."""
+        """The files that are written, each with its option."""
         named = (("--tum", self.tum), ("--map", self.map), ("--plan", self.plan), ("--record", self.record))
         return [(name, path) for name, path in named if path is not None]
 
 
-class ReplayRun:
-    """One run over one log."""
+def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> RunResult:
+    """Run a log (an MCAP file or a folder of them) through the stages and return the result.
 
-    def __init__(self, log: Path, config: Config, options: Options) -> None:
+    Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result;
+    a second one raises KeyboardInterrupt. Raises OmnidError, DriverError or CalibError for wrong input and outputs that
+    cannot be written, and RunFailedError, which holds the result so far, for such an error after the first pose.
+    """
+    return _Replay(log, config, options or ReplayOptions()).run()
+
+
+class _Replay:
+    def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
         self._log, self._config, self._options = log, config, options
-        self._graph = Graph(policy=NEWEST if options.realtime else LOSSLESS, threaded=not options.inline,
-                            depth=config.graph.depth)
-        self._tally = RunStatistics()
-        self._twin: SimulatedMotor | None = None
-        self._signal = 0
+        self._poses = PoseCollector()
+        self._map: Slot[MapUpdate] = Slot()
+        self._simulated_motor: SimulatedMotor | None = None
         self._warnings: list[str] = []
 
-    def run(self, rig: Path | None, topics: Topics) -> int:
-        """The exit code, 1 where not one pose was found; prints warnings and the summary."""
-        check_outputs(self._options.files, self._inputs(rig))
-        cv2.setNumThreads(self._config.graph.opencv_threads)
-        with ExitStack() as closing:
-            reader = self._reader(rig, topics)
-            closing.callback(reader.close)
-            place = self._geometry(reader, rig)
-            ends = self._ends(place, closing)
-            pair = Synchronise(place.rig, self._config.pair)
-            pairs = self._graph.stage("pair", pair, self._frames(reader))
-            watched = wire(self._graph, pairs, place, self._config, ends)
-            if isinstance(ends.recorder, Recorder):
-                ends.recorder.report = lambda tally: self._report(counters(tally, self._dropped(reader, pair)))
-            self._show_progress(reader)
+    def run(self) -> RunResult:
+        check_outputs(self._options.files, self._inputs())
+        graph = Graph(policy=NEWEST if self._options.realtime else LOSSLESS, threaded=not self._options.inline,
+                      depth=self._config.graph.depth)
+        with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:
+            session = Session(self._config, graph, outputs, self._warnings.append)
+            reader = self._reader()
+            outputs.callback(reader.close)
+            geometry = session.geometry(self._rig(reader), reader.frames())
+            sinks = self._sinks(session, geometry)
+            pairing = Synchronise(geometry.rig, self._config.pair)
+            pairs = graph.stage("pair", pairing, self._frames(graph, reader))
+            stages = wire(graph, pairs, geometry, self._config, sinks)
+            result = _Results(session, reader, pairing, stages)
+            if isinstance(sinks.recorder, Recorder):
+                sinks.recorder.final_status = result.final_status
+            self._add_progress(session, reader)
             try:
-                with ended_by_signals(self._on_signal):
-                    self._graph.run()
-            except (OmnidError, DriverError):
-                if self._tally.poses:  # what there was until then is whole
-                    self._conclude(reader, pair, watched)
-                raise
-            self._conclude(reader, pair, watched)
-        return 128 + self._signal if self._signal else int(no_pose(self._tally))
+                with session.signals(self._on_signal):
+                    graph.run()
+            except (OmnidError, DriverError) as error:
+                if not session.statistics.poses:
+                    raise
+                raise RunFailedError(str(error), self._result(session, result)) from error
+            return self._result(session, result)
 
-    def _inputs(self, rig: Path | None) -> list[tuple[str, Path]]:
+    def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
+        rig = self._options.rig if isinstance(self._options.rig, Path) else None
         named = (("the log that is read", self._log), ("the rig that is read", rig),
                  ("the configuration that is read", self._options.settings))
         in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]
         return [(what, path) for what, path in named if path is not None] + in_folder
 
-    def _reader(self, rig: Path | None, topics: Topics) -> LogReader:
-        """The log; which camera is which say the options, else the rig's topics, else the topics' own names."""
-        window = self._config.log.reorder_frames
-        named = read_rig(rig).topics if rig and not all(topics) else ("", "")
+    def _reader(self) -> LogReader:
+        """Open the log; the topics are those of the options, else of the rig, else found by their names."""
+        lower, upper = self._options.topics
+        rig, window = self._options.rig, self._config.log.reorder_frames
+        named = ("", "")
+        if rig and not (lower and upper):
+            named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
         if all(named):
-            with suppress(DriverError):  # the log's topics may have other names than when the rig was calibrated
-                return LogReader(self._log, topics[0] or named[0], topics[1] or named[1], window=window)
-        return LogReader(self._log, *topics, window=window)
+            with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
+                return LogReader(self._log, lower or named[0], upper or named[1], window=window)
+        return LogReader(self._log, lower, upper, window=window)
 
-    def _geometry(self, reader: LogReader, path: Path | None) -> Geometry:
-        rig = read_rig(path) if path else attached_rig(reader, self._log)
-        rimmed = with_rims(rig, reader.frames())
-        for name, camera in (("lower", rimmed.lower), ("upper", rimmed.upper)):
-            if camera.mask is None:
-                self._warnings.append(f"no rim was found in the first images of the {name} camera, so all of each "
-                                      f"image is used: the rig may say otherwise in [{name}.mask]")
-        return geometry(rimmed, self._config.panorama)
+    def _rig(self, reader: LogReader) -> Rig:
+        rig = self._options.rig
+        if rig is None:
+            return attached_rig(reader, self._log)
+        return read_rig(rig) if isinstance(rig, Path) else rig
 
-    def _frames(self, reader: LogReader) -> Stream[Frame]:
+    def _frames(self, graph: Graph, reader: LogReader) -> Stream[Frame]:
         if not self._options.realtime:
-            return self._graph.source("read", reader.frames)
-        pace = PlaybackClock()
-        return self._graph.source("read", lambda: pace.frames(reader.frames()), wake=pace.wake)
+            return graph.source("read", reader.frames)
+        clock = PlaybackClock()
+        return graph.source("read", lambda: clock.frames(reader.frames()), wake=clock.wake)
 
-    def _ends(self, place: Geometry, closing: ExitStack) -> Sinks:
-        """Opens all outputs: what cannot be opened is said now."""
+    def _sinks(self, session: Session, geometry: Geometry) -> Sinks:
+        """Open all outputs before the run, so that one that cannot be opened ends it now."""
         options, config = self._options, self._config
-        encode = Encoder(place.rig.T_base_rig, clouds_of(config, config.record.cloud_points))
-        motor = None
-        recorder = options.watch(place, self._graph.telemetry) if options.watch else None
-        bus = self._bus(encode, closing) if options.publish else None
+        sinks = Sinks(poses={"statistics": session.statistics}, map_every_s=options.map_every_s,
+                      recorder=options.observer(geometry, session.graph.telemetry) if options.observer else None,
+                      bus=self._bus(session, geometry) if options.publish else None)
         if config.motor.port:
-            driver, self._twin = open_motor(config.motor, closing)
-            motor = MotorTick(driver, config.motor.stale_s)
+            driver, self._simulated_motor = open_motor(config.motor, session.outputs)
+            sinks = replace(sinks, motor=MotorTick(driver, config.motor.stale_s))
         if options.record:
-            attachments = {"rig.toml": rig_toml(place.rig).encode(), "omnid.toml": dump(config).encode()}
-            recorder = Recorder(options.record, attachments, config.bus.robot, encode)
-            closing.callback(recorder.close)
-        ends = Sinks({"tally": self._tally}, {}, recorder, bus, motor, map_every_s=options.map_every_s)
+            sinks = replace(sinks, recorder=self._recorder(session, geometry, options.record))
+        if options.collect:
+            sinks.poses["collect-poses"] = self._poses
+            sinks.maps["collect-map"] = self._map
         if options.tum:
-            ends.poses["trajectory"] = TrajectoryFile(options.tum)
+            sinks.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map:
-            ends.maps["map"] = MapFile(options.map)
+            sinks.maps["map"] = MapFile(options.map)
         if options.plan:
-            ends.maps["plan"] = PlanFile(options.plan)
-        return ends
+            sinks.maps["plan"] = PlanFile(options.plan)
+        return sinks
 
-    def _bus(self, encode: Encoder, closing: ExitStack) -> BusSink | None:
+    def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
         try:
-            bus = Bus(self._config.bus)
+            bus = session.open_bus(geometry.rig)
         except OmnidError as error:
             if not self._options.bus_optional:
                 raise
-            print(f"omnid: warning: going on without a bus: {error}", file=sys.stderr)
+            session.warn(f"the run goes on without a bus: {error}")
             return None
-        closing.callback(bus.close)
-        bus.serve("config", dump(self._config))
-        if bus.needs_router:
-            self._graph.ticker("router", self._config.bus.retry_s, bus.connect)
-        return BusSink(bus, encode)
+        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points))
 
-    def _show_progress(self, reader: LogReader) -> None:
-        if not self._options.quiet:
-            progress = Progress(self._tally, reader.pair_estimate())
-            self._graph.ticker("progress", progress.period_s, progress)
+    def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
+        config = self._config
+        attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
+        encode = session.encoder(geometry.rig, config.record.cloud_points)
+        recorder = Recorder(SingleLog(path, attachments), config.bus.robot, encode)
+        session.outputs.callback(recorder.close)
+        return recorder
 
-    def _conclude(self, reader: LogReader, pair: Synchronise, watched: WiredStages) -> None:
-        found = self._tally.poses or not self._signal
-        doubtful = input_warnings(pair, watched.stereo, self._tally, self._config.pair) if found else ()
-        for warning in [*self._warnings, *reader.warnings, *doubtful]:
-            print(f"omnid: warning: {warning}", file=sys.stderr)
-        values = {"pairs": str(pair.counts["pairs"]), **counters(self._tally, self._dropped(reader, pair))}
-        if watched.mapping is not None:
-            values["map"] = ", ".join(f"{name} {count}" for name, count in watched.mapping.counts.items())
-        if self._twin is not None:
-            values["motor"] = f"{self._twin.commands} commands received, {self._twin.errors} errors"
-        spoken = sys.stderr if on_stdout(self._options.files) else sys.stdout
-        print(run_summary(values, self._graph.telemetry.summary()), file=spoken)
+    def _add_progress(self, session: Session, reader: LogReader) -> None:
+        if self._options.progress is not None:
+            progress = self._options.progress(session.statistics, reader.pair_estimate())
+            session.graph.ticker("progress", progress.period_s, progress)
 
-    def _report(self, values: dict[str, str]) -> list[DiagnosticStatus]:
-        """The counts of the run and of its stages, for the log."""
-        boxes = (stats for stats in self._graph.telemetry.stages if stats.name not in QUIET_BOXES)
-        return [DiagnosticStatus("omnid: summary", OK, "the run has ended", values), *map(stage_status, boxes)]
+    def _on_signal(self, number: int, again: bool) -> None:
+        if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread
+            raise KeyboardInterrupt
 
-    def _dropped(self, reader: LogReader, pair: Synchronise) -> dict[str, int]:
-        """Everything that was lost on the way, by reason; zeros too."""
-        drops = {name: reader.counts[name] for name in READER_DROPS}
-        drops |= {name: count for name, count in pair.counts.items() if name.startswith("unpaired")}
-        drops["broken"] += pair.counts["broken"]
-        drops["queue"] = sum(stage.dropped for stage in self._graph.telemetry.stages if stage.name not in TICKERS)
+    def _result(self, session: Session, results: _Results) -> RunResult:
+        counters = results.counters(session.statistics)
+        if self._simulated_motor is not None:
+            motor = self._simulated_motor
+            counters = replace(counters, motor={"commands": motor.commands, "errors": motor.errors})
+        newest = self._map.get()
+        return RunResult(
+            self._poses.stamps_ns,
+            self._poses.T_odom_rig,
+            self._poses.covariances,
+            self._poses.states,
+            counters,
+            results.timings(),
+            (*self._warnings, *results.warnings()),
+            None if newest is None else newest.points,
+            session.signal,
+        )
+
+
+class _Results:
+    """Counters, timings and warnings of a wired run, from its parts."""
+
+    def __init__(self, session: Session, reader: LogReader, pairing: Synchronise, stages: WiredStages) -> None:
+        self._session, self._reader, self._pairing, self._stages = session, reader, pairing, stages
+
+    def counters(self, statistics: RunStatistics) -> RunCounters:
+        """Return the counters of the run with the given statistics."""
+        counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
+        mapping = self._stages.mapping
+        return counters if mapping is None else replace(counters, map=mapping.counts)
+
+    def timings(self) -> dict[str, SummaryRow]:
+        """Return the times of the stages."""
+        rows = self._session.graph.telemetry.summary()
+        return {row.stage: row for row in rows if row.stage not in BOOKKEEPING}
+
+    def warnings(self) -> Iterator[str]:
+        """Return warnings about the log and the images."""
+        yield from self._reader.warnings
+        statistics = self._session.statistics
+        if statistics.poses or not self._session.signal:
+            yield from input_warnings(self._pairing, self._stages.stereo, statistics, self._session.config.pair)
+
+    def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
+        """Return the counters of the run and of its stages, for the log."""
+        stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
+        summary = summary_entries(self.counters(statistics))
+        return [DiagnosticStatus("omnid: summary", OK, "the run has ended", summary), *map(stage_status, stages)]
+
+    def _drops(self) -> dict[str, int]:
+        """Return all that was lost, by reason; zeros too."""
+        drops = {name: self._reader.counts[name] for name in READER_DROPS}
+        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith("unpaired")}
+        drops["broken"] += self._pairing.counts["broken"]
+        drops["queue"] = self._session.dropped_messages()
         return drops
 
-    def _on_signal(self, number: int, _: FrameType | None) -> None:
-        """The first signal ends the run whole; a second one ends it at once."""
-        again, self._signal = self._signal, number
-        self._graph.stop()
-        if again and self._options.inline:  # nothing else reaches a stage that this thread is stuck in
-            raise KeyboardInterrupt
+
+@contextmanager
+def opencv_threads(count: int) -> Iterator[None]:
+    """Let OpenCV use so many threads in this block, then as many as before."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -104,14 +104,14 @@ class Service:
 class StatusLine:
     """One line about the run: state, poses per second since the last look, what was lost."""
 
-    def __init__(self, tally: RunStatistics, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
+    def __init__(self, statistics: RunStatistics, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
         """tickers: the names whose `dropped` are deadlines, not messages."""
-        self._tally, self._telemetry, self._tickers = tally, telemetry, frozenset(tickers)
-        self._poses, self._looked_ns = tally.poses, time.monotonic_ns()
+        self._statistics, self._telemetry, self._tickers = statistics, telemetry, frozenset(tickers)
+        self._poses, self._looked_ns = statistics.poses, time.monotonic_ns()
 
     def __call__(self) -> str:
         """The line now."""
-        now_ns, poses, newest = time.monotonic_ns(), self._tally.poses, self._tally.newest
+        now_ns, poses, newest = time.monotonic_ns(), self._statistics.poses, self._statistics.newest
         rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._looked_ns) * 1e-9)
         self._poses, self._looked_ns = poses, now_ns
         state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"

@@ -1,4 +1,4 @@
-"""Commands from the network, obeyed or not, written down as they came."""
+"""Recording of the commands that arrive from the network, as they came, whether they were executed or refused."""
 
 from __future__ import annotations
 
@@ -8,30 +8,33 @@ from typing import Final
 
 from omnid.errors import OmnidError
 from omnid.sinks.encoder import OutgoingMessage
-from omnid.sinks.frame_recorder import FrameRecorder
+from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import message_from_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD
 from omnid.transport.topics import EMPTY_SCHEMA, SUBSCRIBED
 
-_EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the head, and the one byte that stands for nothing
+_EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the encapsulation header and one byte
 
 
-def keeper_of_commands(recorder: FrameRecorder, offset_ns: int) -> Callable[[str, bytes], None]:
-    """What records key and payload of a command at the time of its arrival; from any thread, never raises.
+def command_recorder(recorder: Recorder, offset_ns: int) -> Callable[[str, bytes], None]:
+    """Return a function that records a command, by key and payload, at the time of its arrival.
 
-    offset_ns: from CLOCK_MONOTONIC to Unix time.
+    It may be called in any thread and never raises. offset_ns: from CLOCK_MONOTONIC to Unix time.
     """
 
-    def keep(key: str, payload: bytes) -> None:
-        said = command_as_logged(key, payload)
-        if said is not None:
-            recorder.add(said, time.monotonic_ns() + offset_ns)
+    def record(key: str, payload: bytes) -> None:
+        message = logged_command(key, payload)
+        if message is not None:
+            recorder.add(message, time.monotonic_ns() + offset_ns)
 
-    return keep
+    return record
 
 
-def command_as_logged(key: str, payload: bytes) -> OutgoingMessage | None:
-    """The message of a log, whatever came with a stop; None for what no reader could decode. Any bytes may come."""
+def logged_command(key: str, payload: bytes) -> OutgoingMessage | None:
+    """Return the message for the log; None for a payload that no reader could decode. Any bytes may come.
+
+    A stop is recorded as an empty message, whatever its payload.
+    """
     schema = SUBSCRIBED.get(key)
     if schema is None or len(payload) > LONGEST_PAYLOAD:
         return None

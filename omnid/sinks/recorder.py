@@ -1,57 +1,162 @@
-"""A log of what the daemon made of its input, for ROS 2, Foxglove, Rerun and evo."""
+"""Recording of a run to MCAP logs: images as they came, poses, commands, maps and states, for ROS 2, Foxglove, evo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Final, Protocol, TypeAlias
 
+from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
+from drivers.logs.rotating_log import RotatingLogState
 from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.image_codec import image_cdr, image_topic
 
-Report: TypeAlias = Callable[[RunStatistics], list[DiagnosticStatus]]
+Recorded: TypeAlias = Frame | Outgoing
+FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
+
+_PENDING: Final = 256  # messages of other threads that may wait
+_HELD: Final = 128  # beyond so many, they are written before their time: the clock may have been set
+_POSE_AGE_NS: Final = 10**9  # a pose is recorded after it has been found, seldom later than that after its images
+
+
+class MessageLog(Protocol):
+    """The file or files of a recorder: SingleLog, or drivers.logs.rotating_log.RotatingLog."""
+
+    state: RotatingLogState
+
+    def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
+        """Add a message."""
+
+    def close(self) -> None:
+        """Complete the last file."""
+
+
+class SingleLog:
+    """One log file that is opened for the first message: a run without messages leaves an existing file as it was.
+
+    `write` raises DriverError where the file cannot be written.
+    """
+
+    def __init__(self, path: Path, attachments: Mapping[str, bytes]) -> None:
+        """attachments: name -> content, written at the start of the file."""
+        self.state = RotatingLogState()
+        self._path, self._attachments = path, attachments
+        self._writer: LogWriter | None = None
+
+    def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
+        """Add a message, CDR with its encapsulation header."""
+        if self._writer is None:
+            self._writer = LogWriter(self._path, self._attachments)
+            self.state.files, self.state.file, self.state.status = 1, str(self._path), "recording"
+        self._writer.write(topic, schema_name, data, stamp_ns)
+        self.state.messages += 1
+
+    def close(self) -> None:
+        """Complete the file; a second call does nothing."""
+        if self._writer is not None:
+            self._writer.close()
+        self.state.status = "closed"
 
 
 class Recorder:
-    """Writes every message under `/<robot>/`, and the report of the run at the end; `attachments` come first.
+    """A sink that writes every message under `/<robot>/`.
 
-    The file is opened for the first message: a run that has none leaves what was there.
+    A live run gives it an inbox that drops (policy NEWEST), so that no stage waits for the disk, a RotatingLog, which
+    never raises, and skip_invalid=True; then `invalid` counts what could not be encoded. A replay loses nothing: a
+    message that cannot be encoded or written raises OmnidError or DriverError.
+
+    Without an encoder only frames are recorded. `final_status` is asked at the end of the run for statuses, which are
+    the last message of the log.
     """
 
-    def __init__(self, path: Path, attachments: Mapping[str, bytes], robot: str, encode: Encoder) -> None:
-        self._path, self._attachments = path, attachments
-        self._writer: LogWriter | None = None
-        self._robot, self._encode, self._states = robot, encode, StateReports()
+    def __init__(
+        self, log: MessageLog, robot: str, encode: Encoder | None = None, *, offset_ns: int = 0,
+        skip_invalid: bool = False
+    ) -> None:
+        """offset_ns: from the stamps of the messages to Unix time; the encoder has the same."""
+        self._log, self._robot, self._encode = log, robot, encode
+        self._offset_ns, self._skip_invalid = offset_ns, skip_invalid
+        self._states = StateReports()
+        self._added: deque[tuple[OutgoingMessage, int]] = deque(maxlen=_PENDING)
+        self._files = 0
         self._newest_ns = 0
-        self._tally = RunStatistics()  # its own: the end of the run may reach others later
-        self.report: Report = lambda _: []
+        self._statistics = RunStatistics()  # its own: the last messages may reach the other sinks later
+        self.invalid = 0
+        self.final_status: FinalStatus | None = None
 
-    def process(self, message: Outgoing) -> None:
-        """Adds what there is to say about a message."""
-        self._newest_ns = max(self._newest_ns, message.stamp_ns)
-        self._write(self._encode(message), message.stamp_ns)
-        if isinstance(message, OdometryUpdate):
-            self._tally.process(message)
-            self._write(self._states(message), message.stamp_ns)
+    @property
+    def state(self) -> RotatingLogState:
+        """The state of the files."""
+        return self._log.state
+
+    def status(self) -> DiagnosticStatus:
+        """Return the state as a diagnostic status, with counts of all that was lost after the inbox."""
+        state = self.state
+        counts = {name: str(getattr(state, name)) for name in
+                  ("messages", "lost", "refused", "files", "deleted", "stops")}
+        values = {"file": state.file, **counts, "invalid": str(self.invalid)}
+        level = ERROR if state.status == "stopped" else OK
+        return DiagnosticStatus("omnid: recording", level, state.problem or state.status, values)
+
+    def process(self, message: Recorded) -> None:
+        """Record a message and, for a pose, the state of the odometry where it has changed."""
+        stamp_ns = message.stamp_ns + self._offset_ns
+        is_pose = isinstance(message, OdometryUpdate)
+        self._write_added(stamp_ns if is_pose else stamp_ns - _POSE_AGE_NS)
+        try:
+            self._write(self._encoded(message, stamp_ns), stamp_ns)
+            if isinstance(message, OdometryUpdate) and self._encode is not None:
+                self._statistics.process(message)
+                self._write(self._state_reports(replace(message, stamp_ns=stamp_ns)), stamp_ns)
+            self._newest_ns = max(self._newest_ns, stamp_ns)
+        except OmnidError:  # for example a stamp that is not a time
+            if not self._skip_invalid:
+                raise
+            self.invalid += 1
+
+    def add(self, message: OutgoingMessage, stamp_ns: int) -> None:
+        """Record an encoded message at its Unix time, once the poses have reached that time; from any thread.
+
+        The state of the odometry is recorded at the time of its images: statuses in the log keep the order of time.
+        """
+        self._added.append((message, stamp_ns))
 
     def finish(self) -> None:
-        """Makes the file whole."""
-        if self._writer is None:
-            return
-        self._write([status_report(self._newest_ns, self.report(self._tally))], self._newest_ns)
+        """Write the final status and complete the last file."""
+        if self.final_status is not None and self.state.messages:
+            self._write([status_report(self._newest_ns, self.final_status(self._statistics))], self._newest_ns)
         self.close()
 
     def close(self) -> None:
-        """Ends the file as it is; a second call does nothing."""
-        if self._writer is not None:
-            self._writer.close()
+        """Write the messages that were added and complete the last file; a second call does nothing."""
+        self._write_added()
+        self._log.close()
+
+    def _write_added(self, until_ns: int | None = None) -> None:
+        """Write the messages that were added, up to a Unix time."""
+        while self._added and (until_ns is None or self._added[0][1] <= until_ns or len(self._added) > _HELD):
+            message, stamp_ns = self._added.popleft()
+            self._write([message], stamp_ns)
+
+    def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[OutgoingMessage]:
+        if isinstance(message, Frame):
+            return [OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))]
+        return self._encode(message) if self._encode is not None else []
+
+    def _state_reports(self, odometry: OdometryUpdate) -> Iterable[OutgoingMessage]:
+        """The state of the odometry when it changes, and once in every file."""
+        if self._files != self.state.files:
+            self._files, self._states = self.state.files, StateReports()
+        return self._states(odometry)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
-        if self._writer is None:
-            self._writer = LogWriter(self._path, self._attachments)
         for topic, schema, payload in messages:
             name = topic if topic.startswith("/") else f"/{self._robot}/{topic}"
-            self._writer.write(name, schema, payload, stamp_ns)
+            self._log.write(name, schema, payload, stamp_ns)

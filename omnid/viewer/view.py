@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from drivers.logs.mcap_info import LogInfo, read_log_info
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.runs.replay import Options, ReplayRun, Topics
+from omnid.runs.replay import ReplayOptions, Topics
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.viewer.layout import layout
@@ -23,6 +23,7 @@ from omnid.viewer.rerun_scene import RerunScene
 from omnid.viewer.targets import ClosedError, RrdFile, Viewer, ViewerTarget
 
 PANORAMA: Final = "Panorama"
+Replay: TypeAlias = Callable[[Path, Config, ReplayOptions], int]  # runs a log and returns the exit code
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,7 @@ class Log:
     replay: bool = False  # from its images, though it has poses
     rig: Path | None = None
     topics: Topics = (None, None)
-    quiet: bool = False
+    settings: Path | None = None  # file of the configuration
 
 
 def place_for(out: Path | None, web: bool) -> ViewerTarget:
@@ -48,7 +49,7 @@ def check_file(out: Path | None, *read: tuple[str, Path | None]) -> None:
         check_outputs([("-o", out)], [(what, path) for what, path in read if path is not None])
 
 
-def show_log(log: Log, config: Config, settings: Path | None, place: ViewerTarget) -> int:
+def show_log(log: Log, config: Config, place: ViewerTarget, replay: Replay) -> int:
     """Shows a log: the poses that are recorded in it, else what can be computed from its images; the exit code."""
     found = read_log_info(log.path)
     topic = None if log.replay else poses_topic(found, log.robot)
@@ -56,7 +57,7 @@ def show_log(log: Log, config: Config, settings: Path | None, place: ViewerTarge
     board = RerunScene(place, layout(image, depth=topic is None), _most_messages(found, topic))
     code = 0
     with _closing(board, place):
-        code = _recorded(found, topic, board) if topic else _computed(log, config, settings, board)
+        code = _recorded(found, topic, board) if topic else _computed(log, config, board, replay)
     return _ended(board, place, code)
 
 
@@ -89,10 +90,10 @@ def _closing(board: RerunScene, place: ViewerTarget) -> Iterator[None]:
             board.close()
 
 
-def _computed(log: Log, config: Config, settings: Path | None, board: RerunScene) -> int:
-    options = Options(quiet=log.quiet, settings=settings, map_every_s=MAP_EVERY_S,
-                      watch=lambda place, telemetry: ReplayedRunView(board, place, telemetry))
-    return ReplayRun(log.path, config, options).run(log.rig, log.topics)
+def _computed(log: Log, config: Config, board: RerunScene, replay: Replay) -> int:
+    options = ReplayOptions(rig=log.rig, topics=log.topics, settings=log.settings, map_every_s=MAP_EVERY_S,
+                            observer=lambda place, telemetry: ReplayedRunView(board, place, telemetry))
+    return replay(log.path, config, options)
 
 
 def _recorded(found: LogInfo, topic: str, board: RerunScene) -> int:

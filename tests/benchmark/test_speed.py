@@ -14,8 +14,8 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.diagnostics.run_summary import counters, run_summary
+from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import run_summary
 from omnid.engine.graph import Graph
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
@@ -40,15 +40,16 @@ def recording() -> tuple[LogReader, Rig]:
 @pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
 def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
     reader, rig = recording()
-    config, frames, tally = Config(), list(reader.frames()), RunStatistics()
+    config, frames, statistics = Config(), list(reader.frames()), RunStatistics()
     cv2.setNumThreads(config.graph.opencv_threads)
     place = geometry(with_rims(rig, frames), config.panorama)
     graph = Graph(threaded=threaded)
-    ends = Sinks({"tally": tally, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")})
+    sinks = Sinks({"statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "t")},
+                  {"map": MapFile(tmp_path / "m")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
+    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)
-    print(f"\n{rate_hz:.1f} pairs/s\n{run_summary(counters(tally, {}), graph.telemetry.summary())}")
+    print(f"\n{rate_hz:.1f} pairs/s\n{run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary())}")
     assert not threaded or rate_hz >= WANTED_HZ

@@ -33,7 +33,7 @@ def test_a_rig_upside_down_knows_its_topics(omnid: Command, tmp_path: Path, scen
     np.testing.assert_allclose(a[:, :3, 3], b[:, :3, 3], atol=0.02)
 
 
-@pytest.mark.parametrize(("apart_ns", "said"), [(12_000_000, "ms apart at best"), (3600 * 10**9, "clocks")])
+@pytest.mark.parametrize(("apart_ns", "said"), [(12_000_000, "ms apart"), (3600 * 10**9, "clocks")])
 def test_stamps_apart(omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, said: str) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
@@ -73,4 +73,4 @@ def test_a_rim_that_is_not_found_is_said(omnid: Command, tmp_path: Path, scene: 
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, mask=None)))
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=tmp_path / "rig.toml")
-    assert "no rim" in result.err and "[upper.mask]" in result.err and "[lower.mask]" not in result.err
+    assert "no mirror rim" in result.err and "[upper.mask]" in result.err and "[lower.mask]" not in result.err

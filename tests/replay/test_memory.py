@@ -55,14 +55,14 @@ def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
     reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
     config, frames = Config(), list(reader.frames())
     place = geometry(with_rims(parse_rig(reader.attachments()["rig.toml"]), frames), config.panorama)
-    watch, tally = Watch(), RunStatistics()
-    poses = {"watch": watch, "tally": tally, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
+    watch, statistics = Watch(), RunStatistics()
+    poses = {"watch": watch, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
     ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
     wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
     graph.run()
-    print(tally.states, watch.mib)
-    assert tally.poses == PAIRS
+    print(statistics.states, watch.mib)
+    assert statistics.poses == PAIRS
     later = np.array([mib for seq, mib in watch.mib.items() if seq >= SETTLED])
     assert later.max() - later[0] < GROWTH_MIB

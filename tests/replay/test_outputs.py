@@ -17,7 +17,7 @@ from omnid.config import Config, load_config
 from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.replay import Options, ReplayRun
+from omnid.runs.replay import ReplayOptions, run_log
 from omnid.settings import parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import decode_diagnostics, decode_map
@@ -143,15 +143,16 @@ def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: P
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
 
 
-def test_a_taken_port_silences_the_demo_only(omnid: Command, tmp_path: Path, scene: Path, taken_port: int,
-                                             capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_port_ends_a_replay_but_not_the_demo(
+    omnid: Command, tmp_path: Path, scene: Path, taken_port: int
+) -> None:
     listen = f'bus.listen=["tcp/127.0.0.1:{taken_port}"]'
     words = ("--rig", scene / "rig.toml", "--quiet", "--publish", "--set", listen)
     assert "bus" in omnid.refused("replay", scene / "log.mcap", *words)
-    options = Options(tum=tmp_path / "est.txt", publish=True, bus_optional=True, quiet=True)
-    code = ReplayRun(scene / "log.mcap", load_config(None, [listen]), options).run(scene / "rig.toml", (None, None))
-    assert code == 0 and len(rows(tmp_path / "est.txt")) == PAIRS
-    assert "going on without a bus" in capsys.readouterr().err
+    options = ReplayOptions(rig=scene / "rig.toml", tum=tmp_path / "est.txt", publish=True, bus_optional=True)
+    result = run_log(scene / "log.mcap", load_config(None, [listen]), options)
+    assert result.counters.poses == len(rows(tmp_path / "est.txt")) == PAIRS
+    assert any("goes on without a bus" in warning for warning in result.warnings)
 
 
 def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -254,13 +254,13 @@ def test_a_run_tells_systemd_from_its_first_tick_to_its_end(manager: Manager) ->
 
 
 def test_the_status_counts_messages_and_deadlines_apart() -> None:
-    telemetry, tally = Telemetry(), RunStatistics()
+    telemetry, statistics = Telemetry(), RunStatistics()
     for name, dropped in (("pair", 3), ("stereo", 4), ("motor", 5)):
         telemetry.add(StageStats(name, dropped=dropped))
-    status = StatusLine(tally, telemetry, ("motor",))
+    status = StatusLine(statistics, telemetry, ("motor",))
     assert status() == "waiting for images, 0.0 poses/s, 7 messages dropped, 5 deadlines missed"
-    tally.newest = SimpleNamespace(state="tracking")  # type: ignore[assignment]
-    tally.poses = 10**6
+    statistics.newest = SimpleNamespace(state="tracking")  # type: ignore[assignment]
+    statistics.poses = 10**6
     assert status().startswith("tracking, ")
     assert status().startswith("waiting for images, 0.0 poses/s")
 

@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 
 from omnid.config import Config
 from omnid.runs.record import open_recorder
-from omnid.sinks.command_log import command_as_logged, keeper_of_commands
+from omnid.sinks.command_log import command_recorder, logged_command
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD
 
@@ -25,7 +25,7 @@ def test_commands_are_recorded_as_they_came(tmp_path: Path) -> None:
     config = replace(config, record=replace(config.record, folder=str(tmp_path / "log"), free_mb=0, file_mb=1))
     recorder = open_recorder(config, "", lambda *_: None)
     offset_ns = NOW_NS - time.monotonic_ns()
-    keep = keeper_of_commands(recorder, offset_ns)
+    keep = command_recorder(recorder, offset_ns)
     keep("cmd/heading", codec.heading_cdr(NOW_NS, 0.3, -1.2))
     keep("cmd/twist", codec.twist_stamped_cdr(NOW_NS, "base_link", 0.4, 0.5))
     keep("cmd/stop", b"whatever")
@@ -42,12 +42,12 @@ def test_commands_are_recorded_as_they_came(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["cmd", "cmd/", "cmd/speed", "odom", "cmd/heading/more", ""])
 def test_other_keys_are_left_out(key: str) -> None:
-    assert command_as_logged(key, codec.heading_cdr(NOW_NS, 0.3, -1.2)) is None
+    assert logged_command(key, codec.heading_cdr(NOW_NS, 0.3, -1.2)) is None
 
 
 def test_any_bytes_may_come() -> None:
     numbers = np.random.default_rng(1)
     for key in ("cmd/heading", "cmd/twist", "cmd/stop"):
         for size in (0, 1, 3, 4, 5, 40, 64, 200, LONGEST_PAYLOAD):
-            command_as_logged(key, numbers.bytes(size))
-        assert command_as_logged(key, os.urandom(LONGEST_PAYLOAD + 1)) is None
+            logged_command(key, numbers.bytes(size))
+        assert logged_command(key, os.urandom(LONGEST_PAYLOAD + 1)) is None

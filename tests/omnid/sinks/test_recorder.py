@@ -24,7 +24,7 @@ from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Clouds, Encoder, status_report
-from omnid.sinks.frame_recorder import FrameRecorder
+from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
 from tests.drivers.logs.mcap_logs import STORE, jpeg
@@ -171,7 +171,7 @@ def test_no_message_ends_the_run(tmp_path: Path) -> None:
         recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
         recorder.process(replace(odometry(0), stamp_ns=stamp_ns))
     recorder.finish()
-    assert recorder.unfit == 6 and recorder.state.messages == 5 and recorder.state.lost == 0
+    assert recorder.invalid == 6 and recorder.state.messages == 5 and recorder.state.lost == 0
 
 
 class Given:
@@ -216,7 +216,7 @@ def test_how_it_goes_is_told(tmp_path: Path) -> None:
 class Late:
     """A recorder whose disk stands still for half a second."""
 
-    def __init__(self, recorder: FrameRecorder) -> None:
+    def __init__(self, recorder: Recorder) -> None:
         self._recorder, self.until_s = recorder, time.monotonic() + 0.5
         self.finish = recorder.finish
 

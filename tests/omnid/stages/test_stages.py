@@ -261,7 +261,7 @@ def test_a_slow_map_drops_no_pose(place: Geometry, frames: list[Frame]) -> None:
 
 def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
     """Return the messages dropped by each box, with a bus that holds messages of a type until all poses are there."""
-    graph, tally, complete = Graph(), RunStatistics(), threading.Event()
+    graph, statistics, complete = Graph(), RunStatistics(), threading.Event()
 
     class Complete:
         def process(self, message: OdometryUpdate) -> None:
@@ -273,10 +273,10 @@ def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
             if isinstance(message, slow):
                 assert complete.wait(60.0), "the poses waited for the bus"
 
-    sinks = Sinks({"tally": tally, "complete": Complete()}, bus=SlowBus(), map_every_s=0.5)
+    sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus(), map_every_s=0.5)
     wire(graph, paired(graph, place, frames)[1], place, CONFIG, sinks)
     graph.run()
-    assert tally.poses == PAIRS
+    assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
 
 

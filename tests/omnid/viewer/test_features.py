@@ -9,7 +9,7 @@ import pytest
 
 from omnid.config import Config
 from omnid.messages import OdometryUpdate
-from omnid.runs.replay import Options, ReplayRun
+from omnid.runs.replay import ReplayOptions, run_log
 from tests.conftest import PAIRS
 
 
@@ -27,8 +27,8 @@ class Watcher:
 @pytest.fixture(scope="module")
 def poses(scene: Path) -> list[OdometryUpdate]:
     watcher = Watcher()
-    options = Options(inline=True, quiet=True, watch=lambda place, telemetry: watcher)
-    assert ReplayRun(scene / "log.mcap", Config(), options).run(scene / "rig.toml", (None, None)) == 0
+    options = ReplayOptions(rig=scene / "rig.toml", inline=True, observer=lambda place, telemetry: watcher)
+    assert run_log(scene / "log.mcap", Config(), options).counters.poses == PAIRS
     return watcher.poses
 
 

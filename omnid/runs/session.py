@@ -1,0 +1,81 @@
+"""What live runs and replays share: graph, statistics, geometry, bus, encoders, and signals that end the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from types import FrameType
+from typing import Final
+
+from calib.rig import Rig
+from calib.rig_file import rig_toml
+from drivers.frame import Camera, Frame
+from omnid.config import Config
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.engine.graph import Graph
+from omnid.engine.signals import ended_by_signals
+from omnid.settings import dump
+from omnid.sinks.encoder import Encoder, clouds_of
+from omnid.stages.geometry import Geometry, geometry, with_rims
+from omnid.transport.bus import Bus
+
+CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
+TICKERS: Final = frozenset({"motor", "progress", "router", "status", "watchdog"})  # they drop deadlines, not messages
+
+
+class Session:
+    """One run: its graph, its statistics and its outputs, which are closed in reverse order when `outputs` closes."""
+
+    def __init__(
+        self, config: Config, graph: Graph, outputs: ExitStack, warn: Callable[[str], None], *, offset_ns: int = 0
+    ) -> None:
+        """warn: takes a line for the user; offset_ns: from the stamps of the frames to Unix time."""
+        self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
+        self.offset_ns = offset_ns
+        self.statistics = RunStatistics()
+        self.signal = 0  # number of the signal that ended the run
+
+    def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
+        """Return the geometry of the rig; its missing masks are found in the frames, which are read only for that."""
+        rig = with_rims(rig, frames)
+        for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
+            if camera.mask is None:
+                self.warn(f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
+                          f"the mask can be given in the rig's file under [{name}.mask]")
+        return geometry(rig, self.config.panorama)
+
+    def open_bus(self, rig: Rig) -> Bus:
+        """Open the bus; it answers queries for the configuration and the rig."""
+        bus = Bus(self.config.bus)
+        self.outputs.callback(bus.close)
+        bus.serve("config", dump(self.config))
+        bus.serve("rig", rig_toml(rig))
+        if bus.needs_router:
+            self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
+        return bus
+
+    def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
+        """Return an encoder that gives at most so many points of the map."""
+        return Encoder(rig.T_base_rig, clouds_of(self.config, cloud_points), self.offset_ns)
+
+    def dropped_messages(self) -> int:
+        """Return the number of messages that were dropped in front of the stages and sinks."""
+        return sum(stats.dropped for stats in self.graph.telemetry.stages if stats.name not in TICKERS)
+
+    @contextmanager
+    def signals(self, on_signal: Callable[[int, bool], None]) -> Iterator[None]:
+        """Stop the graph on SIGINT, SIGTERM and SIGHUP in this block, a second signal stops it at once.
+
+        on_signal: called in the handler with the number of the signal and whether it is the second one or later.
+        Outside the main thread, where Python has no signal handlers, the block leaves signals as they are.
+        """
+
+        def handle(number: int, _: FrameType | None) -> None:
+            again, self.signal = self.signal != 0, number
+            self.graph.stop()
+            on_signal(number, again)
+
+        with ExitStack() as handlers:
+            with suppress(ValueError):
+                handlers.enter_context(ended_by_signals(handle))
+            yield
