@@ -203,7 +203,7 @@ def _connected(config: BusConfig, timeout_s: float) -> zenoh.Session:
 
 
 class Driver:
-    """Sender of commands. Each is valid for a moment only (helm.deadlines.command_s): keep sending, or the wheels stop.
+    """Sender of commands. Each is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
 
     Drive from one waypoint to the next:
 

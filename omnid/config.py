@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from os import PathLike
 from types import MappingProxyType
 from typing import Final
 
 from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
 from drivers.logs.log_folder import RotationSettings
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from omnid.core.control.heading_controller import HeadingLimits
-from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.controller.motor_settings import MotorSettings
+from omnid.core.control.control_law import ControllerSettings
 from omnid.core.odometry.odometry import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.stereo.matcher import MatchingSettings
+from omnid.engine.realtime import RealtimeSettings
 from omnid.settings import knob, load
 from omnid.transport.bus_config import BusConfig
 
@@ -58,14 +56,6 @@ class CamerasConfig:
         """The settings of the lower or the upper camera; DriverError where they contradict each other."""
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
-
-
-@dataclass(frozen=True, slots=True)
-class ControllerConfig:
-    """When the wheels of a live robot must stand, and what they may be told at most."""
-
-    deadlines: Deadlines = field(default_factory=Deadlines)
-    limits: VelocityLimits = field(default_factory=VelocityLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,58 +125,6 @@ class MappingConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class GuidanceConfig:
-    """What the base is to do, and what it may be asked for."""
-
-    velocity_mps: float = knob(0.0, "forward speed, m/s", low=-10, high=10)
-    heading_deg: float = knob(0.0, "heading in odom, counter-clockwise, deg", low=-360, high=360)
-    limits: HeadingLimits = field(default_factory=HeadingLimits)
-
-
-@dataclass(frozen=True, slots=True)
-class DriveConfig:
-    """Geometry and wiring of a base with two driven sides."""
-
-    track_m: float = knob(
-        0.3,
-        "between the left and the right wheels, m; where they skid, what makes measured turns right",
-        low=0.01,
-        high=10,
-    )
-    wheel_radius_m: float = knob(0.05, "radius of the wheels, m", low=0.001, high=5)
-    max_wheel_mps: float = knob(
-        1.0, "no wheel is told to roll faster, m/s; for roboteq_power and _mixed: at full power", low=0.001, high=20
-    )
-    gear: float = knob(1.0, "turns of the motor for one of the wheel", low=0.001, high=10_000)
-    ticks_per_turn: float = knob(
-        1000.0, "ros_arduino_bridge: ticks of the encoder for a turn of the motor", low=1, high=1_000_000
-    )
-    pole_pairs: int = knob(7, "vesc: pole pairs of the motor", low=1, high=100)
-    reverse_left: bool = knob(False, "the left motor turns the other way round")
-    reverse_right: bool = knob(False, "the right motor turns the other way round")
-    swapped: bool = knob(False, "the controller's first motor is the right one")
-    can_id: int = knob(1, "vesc: id of the second motor's controller", low=0, high=253)
-
-    def geometry(self) -> DifferentialDrive:
-        """Return the same numbers for the protocols; DriverError for a size that is not finite and above 0."""
-        return DifferentialDrive(**asdict(self))
-
-
-@dataclass(frozen=True, slots=True)
-class MotorConfig:
-    """The controller of the wheels."""
-
-    port: str = knob("", "serial port of the controller, or simulated; empty: none")
-    protocol: str = knob("line", "what the controller speaks", choices=tuple(PROTOCOLS))
-    baud: int = knob(0, "bits per second; 0: the protocol's own", low=0, high=4_000_000)
-    rate_hz: float = knob(20.0, "commands per second", low=1, high=200)
-    stale_s: float = knob(0.5, "the wheels are stopped when the newest command is older, s", low=0.05, high=10)
-    watchdog_ms: int = knob(500, "the controller stops the wheels by itself after so long without a command, ms",
-                            low=50, high=10_000)
-    drive: DriveConfig = field(default_factory=DriveConfig)
-
-
-@dataclass(frozen=True, slots=True)
 class RecordConfig:
     """What `omnid run`, `omnid record` and `--record` write."""
 
@@ -228,21 +166,6 @@ class ServiceConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class RealtimeConfig:
-    """What the live daemon asks of the kernel and of Python, so that nothing makes a deadline wait."""
-
-    lock_memory: bool = knob(True, "nothing is swapped out; needs LimitMEMLOCK=infinity")
-    freeze_gc: bool = knob(True, "what exists at the start is never looked at again by the garbage collector")
-    switch_interval_ms: float = knob(1.0, "after so long a thread lets others into Python, ms; 0: Python's own 5 ms",
-                                     low=0, high=100)
-    motor_priority: int = knob(20, "SCHED_FIFO priority of the motor's tick, needs LimitRTPRIO; 0: none", low=0,
-                               high=99)
-    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take images; 0: none", low=0, high=99)
-    longest_run_ms: int = knob(500, "a SCHED_FIFO thread that runs for longer without a wait ends the daemon, ms; "
-                               "0: never", low=0, high=10_000)
-
-
-@dataclass(frozen=True, slots=True)
 class Config:
     """All of it."""
 
@@ -253,19 +176,22 @@ class Config:
     stereo: StereoConfig = field(default_factory=StereoConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
-    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    motor: MotorConfig = field(default_factory=MotorConfig)
-    helm: ControllerConfig = field(default_factory=ControllerConfig)
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
+    motor: MotorSettings = field(default_factory=MotorSettings)
     live: LiveConfig = field(default_factory=LiveConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
-    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
+    realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
 
 # Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.
 RENAMED: Final[Mapping[str, str]] = MappingProxyType({
+    "guidance": "controller.setpoint",
+    "guidance.limits": "controller.heading",
+    "helm": "controller",
+    "motor.stale_s": "controller.deadlines.command_s",
     "stereo.matching.rival": "stereo.matching.runner_up_ratio",
     "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
 })

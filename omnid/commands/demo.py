@@ -30,7 +30,8 @@ def run(args: argparse.Namespace) -> int:
     tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
     options = ReplayOptions(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
                             bus_optional=True, realtime=True, settings=args.config)
-    config = load_config(args.config, ["motor.port=simulated", "guidance.velocity_mps=0.3", *args.overrides])
+    config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3",
+                                       *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
         code = replay_and_print(log, config, options, quiet=args.quiet)

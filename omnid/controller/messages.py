@@ -4,34 +4,38 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from omnid.config import MotorConfig, RealtimeConfig
-from omnid.controller.controller import ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.controller.motor_settings import MotorSettings
+from omnid.core.control.control_law import ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.engine.realtime import RealtimeSettings
 
-LONGEST_RAMP_S: Final = 3.0  # at the end: whatever has not stood still by then is stopped at once
+LONGEST_RAMP_S: Final = 3.0  # at the end: wheels that have not come to a stop within it are stopped at once
 
 
 class ControllerStart(NamedTuple):
-    """What the process is to do."""
+    """The settings of the process: the first message to it."""
 
-    motor: MotorConfig
-    settings: ControllerSettings
-    realtime: RealtimeConfig
+    motor: MotorSettings
+    controller: ControllerSettings
+    realtime: RealtimeSettings
 
 
 class ControllerUpdate(NamedTuple):
-    """What the daemon says: something new, or nothing, and always when a stop was asked for last."""
+    """One message of the daemon: a pose or a setpoint, if there is a new one, and always the last stop request.
 
-    stop_ns: int
-    news: ControllerPose | TimedSetpoint | None
+    So a stop arrives with the next message that does, even if its own was lost.
+    """
+
+    stop_ns: int  # 0: none
+    update: ControllerPose | TimedSetpoint | None
 
 
 class StartFailed(NamedTuple):
-    """Why the process cannot steer."""
+    """The process cannot open the motor controller."""
 
-    why: str
+    reason: str
 
 
 class LogRecord(NamedTuple):
-    """A line for the journal; the first one, empty or not, says that the process steers."""
+    """A line for the log of the daemon; the first one, which may be empty, reports that the process is ready."""
 
     text: str

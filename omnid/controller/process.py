@@ -1,7 +1,7 @@
-"""The process that steers. It has one thread, so that no tick waits for what another thread holds.
+"""The process that steers the base. It has one thread, so that no tick waits for a lock, and loads no perception.
 
-The daemon starts it, tells it poses and commands, and hears of each tick. When the daemon dies, however it dies, the
-wheels slow down to a stand; signals that end the daemon do not end this.
+The daemon starts it, sends it poses and setpoints, and receives a report of each tick. When the daemon dies, for
+whatever reason, the wheels slow down to a stop; signals that end the daemon do not end this process.
 """
 
 from __future__ import annotations
@@ -14,95 +14,98 @@ from contextlib import ExitStack
 from typing import Final
 
 from drivers.errors import DriverError
-from omnid.config import RealtimeConfig
-from omnid.controller.controller import NS, Controller, ControllerPose, TimedSetpoint
-from omnid.controller.ipc import NOTHING, Channel
+from omnid.controller.controller import Controller
+from omnid.controller.ipc import NO_MESSAGE, Channel
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
-from omnid.engine.realtime import ThreadStart, prepare
+from omnid.core.control.control_law import S_PER_NS, ControllerPose, TimedSetpoint
+from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
 from omnid.engine.signals import STOPPING
 
-MOST_LATE: Final = 500  # packets heard when a tick is due already: more than may wait on the line
-ORDERS_S: Final = 10.0
-ABORTING: Final = signal.SIGABRT  # that is how systemd ends a daemon that is stuck, and all that belongs to it
+THREAD_NAME: Final = "controller"
+MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
+START_MESSAGE_S: Final = 10.0
+ABORTING: Final = signal.SIGABRT  # systemd ends a daemon that does not respond by this, and all its processes
 
 
 class ControllerLoop:
-    """Ticks in time, and hears in between."""
+    """Tick in time, and receive messages in between."""
 
-    def __init__(self, line: Channel, helm: Controller) -> None:
-        self._line, self._helm = line, helm
-        self._until_ns = 0  # once the daemon has hung up: until when the wheels may slow down
+    def __init__(self, channel: Channel, controller: Controller) -> None:
+        self._channel, self._controller = channel, controller
+        self._until_ns = 0  # once the daemon sends no more: when the wheels must have stopped
 
     def run(self) -> None:
-        """Until the daemon has hung up and the wheels stand."""
+        """Run until the daemon sends no more and the wheels stand."""
         while not self._ended():
-            self._listen()
-            tick = self._helm()
-            self._helm.account.untold = self._line.lost
-            self._line.say(tick)
+            self._receive_until_due()
+            report = self._controller.tick()
+            report.state.lost_reports = self._channel.lost
+            self._channel.send(report)
 
     def _ended(self) -> bool:
-        return bool(self._until_ns) and (self._helm.stands or time.monotonic_ns() > self._until_ns)
+        return bool(self._until_ns) and (self._controller.stands or time.monotonic_ns() > self._until_ns)
 
-    def _listen(self) -> None:
-        """Takes all that is said until the tick is due, and what waits then."""
-        late = 0
-        while late < MOST_LATE:
-            left_s = (self._helm.due_ns - time.monotonic_ns()) * NS
-            late += left_s <= 0
+    def _receive_until_due(self) -> None:
+        """Take all messages until the tick is due, and those that wait then."""
+        overdue = 0
+        while overdue < MOST_OVERDUE:
+            left_s = (self._controller.due_ns - time.monotonic_ns()) * S_PER_NS
+            overdue += left_s <= 0
             if self._until_ns:
                 time.sleep(max(0.0, left_s))
                 return
-            if not self._hears(left_s) and left_s <= 0:
+            if not self._receives(left_s) and left_s <= 0:
                 return
 
-    def _hears(self, timeout_s: float) -> bool:
-        """Whether something was said within the time."""
+    def _receives(self, timeout_s: float) -> bool:
+        """True if a message, or the end of all messages, came within the time."""
         try:
-            heard = self._line.hear(timeout_s)
+            message = self._channel.receive(timeout_s)
         except EOFError:
-            self._helm.end()
-            self._until_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / NS)
+            self._controller.end()
+            self._until_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / S_PER_NS)
             return True
-        if heard is NOTHING:
+        if message is NO_MESSAGE:
             return False
-        self._take(heard)
+        self._take(message)
         return True
 
-    def _take(self, heard: ControllerUpdate) -> None:
-        self._helm.stop(heard.stop_ns)
-        if isinstance(heard.news, ControllerPose):
-            self._helm.see(heard.news)
-        elif isinstance(heard.news, TimedSetpoint):
-            self._helm.command(heard.news)
+    def _take(self, message: ControllerUpdate) -> None:
+        self._controller.stop(message.stop_ns)
+        if isinstance(message.update, ControllerPose):
+            self._controller.set_pose(message.update)
+        elif isinstance(message.update, TimedSetpoint):
+            self._controller.set_command(message.update)
 
 
-def run_controller(line: Channel) -> int:
-    """Does what the daemon orders; 2 where it cannot."""
-    with ExitStack() as ends:
-        ends.callback(line.close)  # last of all, when the wheels stand
-        orders: ControllerStart = line.hear(ORDERS_S)
+def run_controller(channel: Channel) -> int:
+    """Run as the daemon's first message says; return the exit code, 2 where the motor controller cannot be opened."""
+    with ExitStack() as closing:
+        closing.callback(channel.close)  # last of all, when the wheels stand
+        start: ControllerStart = channel.receive(START_MESSAGE_S)
         try:
-            driver, _ = open_motor(orders.motor, ends)
+            driver, _ = open_motor(start.motor, closing)
         except DriverError as error:
-            line.say(StartFailed(str(error)))
+            channel.send(StartFailed(str(error)))
             return 2
-        line.say(LogRecord(settle(orders.realtime)))
-        ControllerLoop(line, Controller(driver, orders.settings, lambda text: line.say(LogRecord(text)))).run()
+        channel.send(LogRecord(prepare_process(start.realtime)))
+        controller = Controller(driver, start.controller, 1.0 / start.motor.rate_hz,
+                                lambda text: channel.send(LogRecord(text)))
+        ControllerLoop(channel, controller).run()
     return 0
 
 
-def settle(config: RealtimeConfig) -> str:
-    """Makes the process as punctual as it may be; what it was refused, or ""."""
-    prepare(config, opencv_threads=1)  # what it refuses to this process it has refused to the daemon
+def prepare_process(settings: RealtimeSettings) -> str:
+    """Make the process as punctual as it is allowed to be; return what was refused, or an empty string."""
+    prepare(settings)  # what it refuses to this process it has refused to the daemon, which logs it
     refused: list[str] = []
-    ThreadStart({"helm": config.motor_priority}, lambda _, line: refused.append(line))("helm")
+    ThreadStart({THREAD_NAME: settings.motor_priority}, lambda _, line: refused.append(line))(THREAD_NAME)
     return " ".join(refused)
 
 
 def main() -> int:
-    """The process; its argument is the descriptor of its end of the line."""
+    """Run the process; its argument is the file descriptor of its end of the channel."""
     for number in (*STOPPING, ABORTING):
         signal.signal(number, signal.SIG_IGN)
     return run_controller(Channel(socket.socket(fileno=int(sys.argv[1]))))

@@ -1,4 +1,4 @@
-"""What the helm says of each of its ticks, and the book that is kept of them."""
+"""Reports of the controller's ticks, and the statistics that the daemon keeps of them."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from omnid.engine.telemetry import Histogram, StageStats
 
 @dataclass(slots=True)
 class ControllerState:
-    """How the wheels have fared so far."""
+    """The state of the controller and its counts since the start."""
 
-    reason: str = IDLE  # why they must stand now; empty: they may turn
-    failed: bool = False  # the controller did not take the last command
-    fault: int = 0  # the controller's own number
-    sent: int = 0
-    late: int = 0  # commands whose answer did not come in time, but soon
-    errors: int = 0
-    expiries: int = 0  # how often the controller had stopped by itself
+    reason: str = IDLE  # why the wheels must stop now; empty: they may turn
+    failed: bool = False  # the motor controller did not take the last command
+    fault: int = 0  # the motor controller's own number
+    sent: int = 0  # commands that were answered
+    late: int = 0  # commands whose answer did not come in time; the wheels go on
+    errors: int = 0  # commands that failed
+    expiries: int = 0  # how often the motor controller had stopped the wheels by itself
     missed: int = 0  # ticks that were left out
-    untold: int = 0  # ticks that nobody could be told of
+    lost_reports: int = 0  # reports of ticks that the daemon was too slow to take
     stops: Counter[str] = field(default_factory=Counter)  # of wheels that turned, by reason
 
 
 class TickReport(NamedTuple):
-    """What came of one tick."""
+    """The result of one tick."""
 
-    command: VelocityCommand | None  # that the controller took
-    late_s: float
+    command: VelocityCommand | None  # that the motor controller took
+    late_s: float  # after the time at which the tick was due
     work_s: float
-    to_wheel_s: float  # from the capture of a pose's images to this, the first command after it; else NaN
-    account: ControllerState
+    to_wheel_s: float  # from the capture of a pose's images to this, the first command that follows from it; else NaN
+    state: ControllerState
 
 
 class ControllerStatistics:
-    """The book: the newest account, and how late, how long and how old things were."""
+    """The newest state, and histograms of lateness and latency."""
 
     def __init__(self, stats: StageStats) -> None:
-        """stats: of the tick among the other stages; since the first it is busy until the next is heard of."""
-        self.account = ControllerState()
+        """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
+        self.state = ControllerState()
         self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
 
     def add(self, tick: TickReport) -> None:
-        """One more tick."""
-        self.account = tick.account
+        """Add the report of one tick."""
+        self.state = tick.state
         self.lateness.add(tick.late_s)
         if math.isfinite(tick.to_wheel_s):
             self.to_wheel.add(tick.to_wheel_s)
         self._stats.wall.add(tick.work_s)
         self._stats.processed += 1
-        self._stats.dropped = tick.account.missed
+        self._stats.dropped = tick.state.missed
         self._stats.busy_since_ns = time.monotonic_ns()
 
     def close(self) -> None:
-        """There will be no more."""
+        """Note that no more reports come."""
         self._stats.busy_since_ns = 0

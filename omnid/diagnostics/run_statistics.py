@@ -46,7 +46,7 @@ class RunCounters:
     resets: int  # gaps in the trajectory after which tracking began again
     drops: Mapping[str, int]  # messages lost, by reason; zeros too
     map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
-    motor: Mapping[str, int] = field(default_factory=dict)  # of the simulated controller; empty without one
+    motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
 
     @property
     def no_pose(self) -> bool:

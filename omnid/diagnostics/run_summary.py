@@ -16,7 +16,8 @@ def summary_entries(counters: RunCounters) -> dict[str, str]:
     if counters.map:
         entries["map"] = _listed(counters.map)
     if counters.motor:
-        entries["motor"] = f"{counters.motor['commands']} commands received, {counters.motor['errors']} errors"
+        motor = counters.motor
+        entries["motor"] = f"{motor['commands']} commands sent, {motor['errors']} errors, {motor['stops']} stops"
     return entries
 
 

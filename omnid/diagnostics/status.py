@@ -50,7 +50,7 @@ class StatusSources(NamedTuple):
     pair: Synchronise
     tally: RunStatistics
     to_pose: Histogram
-    helm: ControllerStatistics | None
+    controller: ControllerStatistics | None
     commands: CommandReceiver | None
     tickers: frozenset[str]  # their `dropped` are missed deadlines
     others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that speak for themselves
@@ -67,9 +67,9 @@ class StatusReport:
         """One status for each part."""
         self._rates.begin()
         w = self._watched
-        helm = [] if w.helm is None else [self._helm(w.helm, w.commands)]
+        wheels = [] if w.controller is None else [self._wheels(w.controller, w.commands)]
         others = [status() for status in w.others]
-        return [self._odometry(), self._pairing(), *self._cameras(), *helm, *others,
+        return [self._odometry(), self._pairing(), *self._cameras(), *wheels, *others,
                 *map(self._stage, w.telemetry.stages)]
 
     def _odometry(self) -> DiagnosticStatus:
@@ -122,17 +122,17 @@ class StatusReport:
             yield DiagnosticStatus(f"omnid: {name} camera", OK if said == state.status else ERROR, said,
                          {"mode": state.mode, "rate_hz": rate, **counts})
 
-    def _helm(self, helm: ControllerStatistics, commands: CommandReceiver | None) -> DiagnosticStatus:
-        account = helm.account  # once, for another thread replaces it
-        counts = ("sent", "late", "errors", "expiries", "fault", "untold")
-        values = {name: str(getattr(account, name)) for name in counts}
-        values |= {f"stopped, {why}": str(count) for why, count in account.stops.items()}
-        values |= _times("capture_to_wheel", helm.to_wheel) | _times("tick_late", helm.lateness)
-        values["tick_late_p999_ms"] = f"{1e3 * helm.lateness.p(0.999):.2f}"
+    def _wheels(self, controller: ControllerStatistics, commands: CommandReceiver | None) -> DiagnosticStatus:
+        state = controller.state  # once, for another thread replaces it
+        counts = ("sent", "late", "errors", "expiries", "fault", "lost_reports")
+        values = {name: str(getattr(state, name)) for name in counts}
+        values |= {f"stopped, {why}": str(count) for why, count in state.stops.items()}
+        values |= _times("capture_to_wheel", controller.to_wheel) | _times("tick_late", controller.lateness)
+        values["tick_late_p999_ms"] = f"{1e3 * controller.lateness.p(0.999):.2f}"
         if commands is not None:
             values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
             values |= {f"refused, {why}": str(count) for why, count in dict(commands.refused).items()}
-        reason, bad = account.reason, account.reason == FAILED or account.failed or account.fault
+        reason, bad = state.reason, state.reason == FAILED or state.failed or state.fault
         return DiagnosticStatus(
             "omnid: wheels", ERROR if bad else OK if reason in CALM else WARN, reason or "driving", values
         )

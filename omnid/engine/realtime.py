@@ -16,13 +16,12 @@ import resource
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import cv2
-
-from omnid.config import RealtimeConfig
 from omnid.engine.logging_setup import WARNING, say
+from omnid.settings import knob
 
 CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23
@@ -34,9 +33,23 @@ _EVERYTHING: Final = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, withou
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
-def prepare(config: RealtimeConfig, opencv_threads: int) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class RealtimeSettings:
+    """Requests to the kernel and to Python, so that deadlines hold."""
+
+    lock_memory: bool = knob(True, "nothing is swapped out; needs LimitMEMLOCK=infinity")
+    freeze_gc: bool = knob(True, "what exists at the start is never looked at again by the garbage collector")
+    switch_interval_ms: float = knob(1.0, "after so long a thread lets others into Python, ms; 0: Python's own 5 ms",
+                                     low=0, high=100)
+    motor_priority: int = knob(20, "SCHED_FIFO priority of the motor's tick, needs LimitRTPRIO; 0: none", low=0,
+                               high=99)
+    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take images; 0: none", low=0, high=99)
+    longest_run_ms: int = knob(500, "a SCHED_FIFO thread that runs for longer without a wait ends the daemon, ms; "
+                               "0: never", low=0, high=10_000)
+
+
+def prepare(config: RealtimeSettings) -> list[str]:
     """Settles the process once all is wired, before the graph runs; gives a line for each thing that was refused."""
-    cv2.setNumThreads(opencv_threads)
     if config.switch_interval_ms > 0:
         sys.setswitchinterval(config.switch_interval_ms * 1e-3)
     if config.freeze_gc:
@@ -68,7 +81,7 @@ class ThreadStart:
                          f"{priority_advice(max(self._priorities.values()))}")
 
 
-def priorities(config: RealtimeConfig, *captures: str) -> dict[str, int]:
+def priorities(config: RealtimeSettings, *captures: str) -> dict[str, int]:
     """The priorities by thread, for ThreadStart; the wheels' tick has a process of its own."""
     return {name: config.capture_priority for name in captures}
 

@@ -9,14 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
+import cv2
+
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
-from omnid.controller.controller import ControllerSettings
 from omnid.controller.link import ControllerLink
-from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.rig_monitor import RigMonitor
 from omnid.diagnostics.status import StatusReport, StatusSources, StatusTick
@@ -24,7 +24,6 @@ from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.logging_setup import WARNING
 from omnid.engine.realtime import ThreadStart, prepare, priorities
-from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
@@ -33,6 +32,7 @@ from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import command_recorder
+from omnid.sinks.drive import LiveDrive
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry
@@ -78,7 +78,8 @@ class LiveRun:
             self._connected = True
             cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
             self._wire(session, geometry, cameras)
-            for refused in prepare(self._config.realtime, self._config.graph.opencv_threads):
+            cv2.setNumThreads(self._config.graph.opencv_threads)
+            for refused in prepare(self._config.realtime):
                 session.warn(refused)
             self._graph.run()
         return 0
@@ -111,7 +112,7 @@ class LiveRun:
 
     def _wire(self, session: Session, geometry: Geometry, cameras: Mapping[Camera, LiveCamera]) -> None:
         config, graph, rig = self._config, self._graph, geometry.rig
-        helm = self._helm(session, rig) if config.motor.port else None
+        controller = session.start_controller() if config.motor.port else None
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
@@ -120,18 +121,19 @@ class LiveRun:
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
-        sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)), helm=helm,
+        sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
+                      live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       rig_monitor=rig_monitor, map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
-        commands = self._commands(session, bus, helm, recorder) if helm else None
+        commands = self._commands(session, bus, controller, recorder) if controller else None
         sources = StatusSources(
             graph.telemetry,
             {name: camera.state for name, camera in cameras.items()},
             pairing,
             session.statistics,
             self._latency.to_pose,
-            helm.logbook if helm else None,
+            controller.statistics if controller else None,
             commands,
             TICKERS,
             tuple(part.status for part in (bus, recorder, rig_monitor) if part),
@@ -147,23 +149,16 @@ class LiveRun:
         service = Service(telemetry, StatusLine(session.statistics, telemetry, TICKERS), self._config.service.hung_s)
         self._graph.ticker("watchdog", service.period_s, service)
 
-    def _helm(self, session: Session, rig: Rig) -> ControllerLink:
-        config = self._config
-        settings = ControllerSettings(1.0 / config.motor.rate_hz, config.helm.deadlines, config.guidance.limits,
-                                      config.helm.limits)
-        helm = ControllerLink(ControllerStart(config.motor, settings, config.realtime), rig.T_base_rig,
-                              self._graph.telemetry.add(StageStats("motor")), session.warn)
-        session.outputs.callback(helm.close)
-        return helm
-
     def _recorder(self, session: Session, rig: Rig) -> Recorder:
         encode = session.encoder(rig, self._config.record.cloud_points)
         recorder = open_recorder(self._config, rig_toml(rig), self._report, encode=encode, offset_ns=session.offset_ns)
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _commands(self, session: Session, bus: Bus, helm: ControllerLink, recorder: Recorder | None) -> CommandReceiver:
-        commands = CommandReceiver(helm.command, helm.stop, self._config.helm.deadlines.command_s)
+    def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None
+                  ) -> CommandReceiver:
+        command_s = self._config.controller.deadlines.command_s
+        commands = CommandReceiver(controller.send_setpoint, controller.stop, command_s)
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns)
 
         def receive(key: str, payload: bytes) -> None:

@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.controller.link import ControllerLink
-from omnid.controller.motor import MotorTick
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas
+from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
-from omnid.stages.guidance import Guidance
+from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.stereo import Stereo
@@ -29,8 +28,8 @@ class Sinks:
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
-    motor: MotorTick | None = None  # of a replay: guidance sets the command, the tick sends it
-    helm: ControllerLink | None = None  # of a live run: the controller has its own process and rate
+    live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
+    replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
     rig_monitor: Sink[Panoramas] | None = None
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     recorded_frames: tuple[Stream[Frame], ...] = ()
@@ -72,12 +71,11 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
               ) -> Stream[VelocityCommand]:
-    """Join the controller; return its commands. Its deadline never waits: it takes the newest pose from a slot."""
-    if sinks.helm:
-        graph.sink("helm", sinks.helm, odometry, policy=NEWEST, depth=1)
-        return graph.source("drive", sinks.helm.told, wake=sinks.helm.end)
-    commands = graph.stage("guidance", Guidance(config.guidance, geometry.rig.T_base_rig), odometry)
-    if sinks.motor:
-        graph.sink("commands", sinks.motor, commands)
-        graph.ticker("motor", 1.0 / config.motor.rate_hz, sinks.motor)
-    return commands
+    """Join the controller; return its commands. It never waits for a stage: it has a process of its own."""
+    if sinks.live_drive:
+        graph.sink("controller", sinks.live_drive, odometry, policy=NEWEST, depth=1)
+        return graph.source("drive", sinks.live_drive.commands, wake=sinks.live_drive.end)
+    if sinks.replay_drive:
+        graph.sink("controller", sinks.replay_drive, odometry)
+    period_s = 1.0 / config.motor.rate_hz
+    return graph.stage("drive", LockstepDrive(config.controller, period_s, geometry.rig.T_base_rig), odometry)

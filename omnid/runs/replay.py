@@ -15,9 +15,7 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import Config
-from omnid.controller.motor import MotorTick, open_motor
 from omnid.diagnostics.input_warnings import input_warnings
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.run_summary import summary_entries
@@ -34,6 +32,7 @@ from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import Session
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
+from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs
 from omnid.sinks.pose_collector import PoseCollector
@@ -100,7 +99,7 @@ class _Replay:
         self._log, self._config, self._options = log, config, options
         self._poses = PoseCollector()
         self._map: Slot[MapUpdate] = Slot()
-        self._simulated_motor: SimulatedMotor | None = None
+        self._drive: ReplayDrive | None = None
         self._warnings: list[str] = []
 
     def run(self) -> RunResult:
@@ -168,8 +167,9 @@ class _Replay:
                       recorder=options.observer(geometry, session.graph.telemetry) if options.observer else None,
                       bus=self._bus(session, geometry) if options.publish else None)
         if config.motor.port:
-            driver, self._simulated_motor = open_motor(config.motor, session.outputs)
-            sinks = replace(sinks, motor=MotorTick(driver, config.motor.stale_s))
+            setpoint, T_base_rig = config.controller.setpoint.setpoint(), geometry.rig.T_base_rig
+            self._drive = ReplayDrive(session.start_controller(), setpoint, T_base_rig)
+            sinks = replace(sinks, replay_drive=self._drive)
         if options.record:
             sinks = replace(sinks, recorder=self._recorder(session, geometry, options.record))
         if options.collect:
@@ -212,9 +212,8 @@ class _Replay:
 
     def _result(self, session: Session, results: _Results) -> RunResult:
         counters = results.counters(session.statistics)
-        if self._simulated_motor is not None:
-            motor = self._simulated_motor
-            counters = replace(counters, motor={"commands": motor.commands, "errors": motor.errors})
+        if self._drive is not None:
+            counters = replace(counters, motor=self._drive.counts())
         newest = self._map.get()
         return RunResult(
             self._poses.stamps_ns,

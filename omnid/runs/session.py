@@ -11,9 +11,12 @@ from calib.rig import Rig
 from calib.rig_file import rig_toml
 from drivers.frame import Camera, Frame
 from omnid.config import Config
+from omnid.controller.link import ControllerLink
+from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.signals import ended_by_signals
+from omnid.engine.telemetry import StageStats
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, clouds_of
 from omnid.stages.geometry import Geometry, geometry, with_rims
@@ -53,6 +56,16 @@ class Session:
         if bus.needs_router:
             self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
         return bus
+
+    def start_controller(self) -> ControllerLink:
+        """Start the controller process; DriverError where the motor cannot be opened.
+
+        The wheels stop, and the process ends, at the latest with `outputs`.
+        """
+        start = ControllerStart(self.config.motor, self.config.controller, self.config.realtime)
+        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
+        self.outputs.callback(link.close)
+        return link
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
         """Return an encoder that gives at most so many points of the map."""

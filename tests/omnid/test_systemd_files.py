@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from drivers.cameras.v4l2_devices import CaptureDevice, udev_rules
-from omnid.config import RealtimeConfig
+from omnid.engine.realtime import RealtimeSettings
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "omnid.service"
@@ -78,7 +78,7 @@ def settings() -> dict[str, str]:
 
 
 def test_the_unit_allows_what_the_configuration_asks_for() -> None:
-    unit, wanted = settings(), RealtimeConfig()
+    unit, wanted = settings(), RealtimeSettings()
     assert int(unit["LimitRTPRIO"]) >= max(wanted.motor_priority, wanted.capture_priority)
     assert wanted.lock_memory and unit["LimitMEMLOCK"] == "infinity"
     assert unit["Type"] == "notify" and float(unit["WatchdogSec"]) > 3 and unit["Restart"] == "on-failure"

@@ -185,7 +185,7 @@ class Daemon:
         """The process that steers."""
         tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
         children = [int(word) for task in tasks for word in (task / "children").read_text().split()]
-        return next(pid for pid in children if "helm_process" in Path(f"/proc/{pid}/cmdline").read_text())
+        return next(pid for pid in children if "omnid.controller.process" in Path(f"/proc/{pid}/cmdline").read_text())
 
     def tell(self, line: str) -> None:
         """One line for its standard input."""

@@ -120,7 +120,7 @@ BAD = {
     "once without a log": (["--once"], "--log"),
     "no motor": (["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing"], "/dev/nothing"),
     "no camera": (["--rig", "{rig}", "--set", "cameras.lower=/dev/nothing"], "/dev/nothing"),
-    "no such setting": (["--set", "helm.speed=1"], "helm.speed"),
+    "no such setting": (["--set", "controller.speed=1"], "controller.speed"),
 }
 
 

@@ -61,7 +61,7 @@ max_gap_s = 60.0
 port = "/dev/omnid/motor"
 rate_hz = 2.0
 watchdog_ms = 5000
-[helm.deadlines]
+[controller.deadlines]
 pose_s = 10.0
 command_s = 5.0
 tick_s = 5.0

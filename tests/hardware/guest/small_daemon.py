@@ -17,11 +17,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from omnid.config import RealtimeConfig
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.logging_setup import WARNING, say
-from omnid.engine.realtime import ThreadStart, prepare, priorities
+from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare, priorities
 from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
 from omnid.transport.bus import Bus, BusConfig
 
@@ -127,7 +126,7 @@ class Reporter:
 def main() -> None:
     """Runs until SIGTERM."""
     show_stacks_at_the_end()
-    config, tally, bus = RealtimeConfig(), RunStatistics(), Bus(BusConfig())
+    config, tally, bus = RealtimeSettings(), RunStatistics(), Bus(BusConfig())
     graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))
     graph.sink("bus", Speaker(bus), graph.stage("image", Image(), graph.source("lower", numbers)))
     graph.ticker("motor", 0.05, lambda: None)
@@ -135,7 +134,7 @@ def main() -> None:
     service = Service(graph.telemetry, StatusLine(tally, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
     graph.ticker("watchdog", service.period_s, service)
     signal.signal(signal.SIGTERM, lambda *_: graph.stop())
-    for line in prepare(config, 1):
+    for line in prepare(config):
         say(WARNING, line)
     graph.run()
     bus.close()

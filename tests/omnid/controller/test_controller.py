@@ -1,4 +1,4 @@
-"""The helm: what stops the wheels, what lets them turn again, and that nothing ever breaks a limit."""
+"""The base controller: what stops the wheels, what lets them turn again, and that nothing ever breaks a limit."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
-from omnid.controller.controller import Controller, ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics
-from omnid.core.control import safety_rules as fail_safe
+from omnid.core.control import safety_rules
+from omnid.core.control.control_law import ControllerPose, ControllerSettings, TimedSetpoint
 from omnid.core.control.heading_controller import LONGEST_TICK_S, HeadingLimits, Setpoint
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -28,7 +29,7 @@ PERIOD_NS = 50_000_000
 PATIENCE_S = 20.0
 LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
                        yaw_acceleration_radps2=4.0)
-SETTINGS = ControllerSettings(PERIOD_S, Deadlines(), HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0), LIMITS)
+SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0))
 AHEAD = Setpoint(0.3, None, 0.0)
 
 
@@ -53,13 +54,13 @@ class Wheels:
 
 
 class Bench:
-    """A helm on a clock that is turned by hand."""
+    """A controller on a clock that is set by hand."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12
         self.wheels = Wheels()
         self.said: list[str] = []
-        self.helm = Controller(self.wheels, SETTINGS, self.said.append, clock_ns=lambda: self.now_ns)
+        self.controller = Controller(self.wheels, SETTINGS, PERIOD_S, self.said.append, clock_ns=lambda: self.now_ns)
         self.logbook = ControllerStatistics(StageStats("motor"))
 
     @property
@@ -68,18 +69,18 @@ class Bench:
 
     def see(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
             age_s: float = 0.0) -> None:
-        self.helm.see(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
+        self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
 
     def ask(self, setpoint: Setpoint = AHEAD) -> None:
         self.now_ns += 1
-        self.helm.command(TimedSetpoint(self.now_ns, setpoint))
+        self.controller.set_command(TimedSetpoint(self.now_ns, setpoint))
 
     def stop(self) -> None:
-        self.helm.stop(self.now_ns)
+        self.controller.stop(self.now_ns)
 
     def tick(self, late_s: float = 0.0) -> None:
         self.now_ns += PERIOD_NS + round(late_s * 1e9)
-        self.logbook.add(self.helm())
+        self.logbook.add(self.controller.tick())
 
     def drive(self, ticks: int = 20, setpoint: Setpoint = AHEAD) -> None:
         for _ in range(ticks):
@@ -96,7 +97,7 @@ def bench() -> Bench:
 @pytest.fixture
 def driving(bench: Bench) -> Bench:
     bench.drive()
-    assert bench.last.velocity_mps == 0.3 and bench.helm.account.reason == ""
+    assert bench.last.velocity_mps == 0.3 and bench.controller.state.reason == ""
     return bench
 
 
@@ -118,18 +119,18 @@ def both(bench: Bench) -> None:
 
 def test_nothing_moves_without_a_pose_or_without_a_command(bench: Bench) -> None:
     bench.tick()
-    assert bench.helm.account.reason == fail_safe.POSE_STALE
+    assert bench.controller.state.reason == safety_rules.POSE_STALE
     bench.ask()
     bench.tick()
-    assert is_stop(bench.last) and bench.helm.account.reason == fail_safe.POSE_STALE
+    assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.POSE_STALE
     bench.see()
     bench.tick()
     assert is_stop(bench.last), "the command came before there was a pose"
-    assert bench.helm.account.reason == fail_safe.IDLE
+    assert bench.controller.state.reason == safety_rules.IDLE
     bench.ask()
     bench.tick()
     assert bench.last.velocity_mps > 0.0
-    assert bench.helm.account.stops == {} and bench.said == [], "nothing that drove was stopped"
+    assert bench.controller.state.stops == {} and bench.said == [], "nothing that drove was stopped"
 
 
 def test_a_stale_pose_stops(driving: Bench) -> None:
@@ -138,8 +139,8 @@ def test_a_stale_pose_stops(driving: Bench) -> None:
         driving.ask()
 
     slows_down(driving, late)
-    assert driving.helm.account.reason == fail_safe.POSE_STALE
-    assert driving.helm.account.stops == {fail_safe.POSE_STALE: 1}
+    assert driving.controller.state.reason == safety_rules.POSE_STALE
+    assert driving.controller.state.stops == {safety_rules.POSE_STALE: 1}
     assert driving.said == ["the wheels stop: the pose is stale"]
 
 
@@ -149,7 +150,7 @@ def test_a_pose_that_is_lost_stops(driving: Bench) -> None:
         driving.ask()
 
     slows_down(driving, lose)
-    assert driving.helm.account.reason == fail_safe.POSE_LOST
+    assert driving.controller.state.reason == safety_rules.POSE_LOST
     both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0, "found again, and asked anew"
@@ -168,7 +169,8 @@ def test_when_commands_cease_the_wheels_stop(driving: Bench) -> None:
         driving.tick()
     assert driving.last.velocity_mps == 0.3, "0.45 s after the last one"
     slows_down(driving, driving.see)
-    assert driving.helm.account.stops == {fail_safe.COMMAND_STALE: 1} and driving.helm.account.reason == fail_safe.IDLE
+    assert driving.controller.state.stops == {safety_rules.COMMAND_STALE: 1}
+    assert driving.controller.state.reason == safety_rules.IDLE
 
 
 def test_a_stop_latches_until_a_command_that_comes_later(driving: Bench) -> None:
@@ -178,13 +180,13 @@ def test_a_stop_latches_until_a_command_that_comes_later(driving: Bench) -> None
     driving.now_ns += 1
     driving.ask()  # within the same tick: the stop counts
     driving.tick()
-    assert driving.helm.account.reason == fail_safe.ASKED
+    assert driving.controller.state.reason == safety_rules.ASKED
     slows_down_from = driving.last.velocity_mps
     assert 0.0 < slows_down_from < 0.3
     for _ in range(10):
         driving.see()
         driving.tick()
-    assert is_stop(driving.last) and driving.helm.account.reason == fail_safe.IDLE
+    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.IDLE
     both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0
@@ -206,7 +208,7 @@ def test_a_stop_that_comes_in_the_middle_of_a_tick_is_not_lost(driving: Bench) -
     driving.wheels.send = send  # type: ignore[method-assign]
     driving.see()
     driving.tick()
-    assert driving.helm.account.reason == fail_safe.ASKED
+    assert driving.controller.state.reason == safety_rules.ASKED
     slower = driving.last.velocity_mps
     driving.see()
     driving.tick()
@@ -220,7 +222,7 @@ def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_v
     for _ in range(10):
         driving.see()
         driving.tick()
-    driving.helm.command(TimedSetpoint(arrival_ns, AHEAD))
+    driving.controller.set_command(TimedSetpoint(arrival_ns, AHEAD))
     driving.tick()
     assert is_stop(driving.last)
 
@@ -228,7 +230,7 @@ def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_v
 def test_an_overloaded_host_stops_and_commands_from_before_are_void(driving: Bench) -> None:
     both(driving)
     driving.tick(late_s=0.26)
-    assert driving.helm.account.reason == fail_safe.OVERLOADED and driving.last.velocity_mps < 0.3
+    assert driving.controller.state.reason == safety_rules.OVERLOADED and driving.last.velocity_mps < 0.3
     slows_down_to: list[float] = []
     for _ in range(10):
         driving.see()
@@ -241,7 +243,7 @@ def test_an_overloaded_host_stops_and_commands_from_before_are_void(driving: Ben
 def test_a_tick_that_is_a_little_late_does_not_stop(driving: Bench) -> None:
     both(driving)
     driving.tick(late_s=0.2)
-    assert driving.helm.account.reason == "" and driving.last.velocity_mps == 0.3
+    assert driving.controller.state.reason == "" and driving.last.velocity_mps == 0.3
 
 
 def test_lateness_is_measured_against_the_rhythm(bench: Bench) -> None:
@@ -251,7 +253,7 @@ def test_lateness_is_measured_against_the_rhythm(bench: Bench) -> None:
         bench.now_ns = 10**12 + PERIOD_NS + bench.logbook.lateness.count * PERIOD_NS + late_ns
         if late_ns == 30_000_000:
             bench.now_ns += 2 * PERIOD_NS  # that were left out
-        bench.logbook.add(bench.helm())
+        bench.logbook.add(bench.controller.tick())
     assert [round(bench.logbook.lateness.p(q), 3) for q in (0.2, 1.0)] == [0.0, 0.12]
     assert bench.logbook.lateness.p(0.6) == pytest.approx(0.005, rel=0.02)
     assert bench.logbook.lateness.p(0.8) == pytest.approx(0.03, rel=0.02)
@@ -262,17 +264,17 @@ def test_a_motor_that_fails_voids_what_was_asked(driving: Bench) -> None:
     for _ in range(3):
         both(driving)
         driving.tick()
-    assert driving.helm.account.errors == 3 and driving.helm.account.failed
+    assert driving.controller.state.errors == 3 and driving.controller.state.failed
     driving.wheels.silent = False
     driving.tick()
-    assert is_stop(driving.last) and driving.helm.account.reason == fail_safe.FAILED
+    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.FAILED
     driving.see()
     driving.tick()
     assert is_stop(driving.last), "what was asked before the stop is void"
     both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stand"
-    assert driving.said == ["motor on /dev/x gave no answer", f"the wheels stop: {fail_safe.FAILED}",
+    assert driving.said == ["motor on /dev/x gave no answer", f"the wheels stop: {safety_rules.FAILED}",
                             "the motor controller is back"]
 
 
@@ -286,8 +288,8 @@ def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
         driving.wheels.send = wheels  # type: ignore[method-assign]
         both(driving)
         driving.tick()
-    assert driving.helm.account.late == 1 and driving.helm.account.errors == 0
-    assert driving.last.velocity_mps == 0.3 and driving.helm.account.reason == "" and driving.said == []
+    assert driving.controller.state.late == 1 and driving.controller.state.errors == 0
+    assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.said == []
 
 
 def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) -> None:
@@ -296,9 +298,9 @@ def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) 
         raise LateReplyError("motor on /dev/x gave no answer")
 
     send, driving.wheels.send = driving.wheels.send, late  # type: ignore[method-assign]
-    driving.helm.end()
+    driving.controller.end()
     driving.tick()
-    assert not driving.helm.stands
+    assert not driving.controller.stands
     driving.wheels.send = send  # type: ignore[method-assign]
     driving.tick()
     assert driving.last.velocity_mps == pytest.approx(0.3 - 2 * LIMITS.deceleration_mps2 * PERIOD_S)
@@ -311,8 +313,8 @@ def test_a_controller_that_stopped_by_itself_starts_from_a_stand(driving: Bench)
     driving.wheels.expired = False
     both(driving)
     driving.tick()
-    assert is_stop(driving.last) and driving.helm.account.stops == {fail_safe.STOPPED: 1}
-    assert driving.helm.account.expiries == 1
+    assert is_stop(driving.last) and driving.controller.state.stops == {safety_rules.STOPPED: 1}
+    assert driving.controller.state.expiries == 1
     both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9
@@ -369,72 +371,72 @@ def test_while_it_slows_down_a_controller_that_steers_keeps_its_heading(bench: B
 
 
 @contextlib.contextmanager
-def real_helm(twin: SimulatedMotor) -> Iterator[Controller]:
+def real_controller(twin: SimulatedMotor) -> Iterator[Controller]:
     driver = SerialMotor(twin.port, timeout_s=2.0, watchdog_ms=10_000)
-    helm = Controller(driver, ControllerSettings(0.02, Deadlines(5.0, 5.0, 5.0), limits=LIMITS))
+    controller = Controller(driver, ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS), 0.02)
     try:
-        yield helm
+        yield controller
     finally:
         driver.close()
 
 
-def run_until(helm: Controller, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
+def run_until(controller: Controller, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
     """Ticks with the twin's own heading as the pose, in odom 0.7 rad further."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
         assert time.monotonic() < deadline_s, "it did not happen"
         state = twin.base
-        helm.see(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
-        helm.command(TimedSetpoint(time.monotonic_ns(), setpoint))
-        helm()
+        controller.set_pose(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
+        controller.set_command(TimedSetpoint(time.monotonic_ns(), setpoint))
+        controller.tick()
         time.sleep(0.02)
 
 
 @pytest.mark.parametrize("setpoint", [Setpoint(0.1, 1.1), Setpoint(0.1, None, 0.4), Setpoint(0.0, None, 0.4)])
 def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoint) -> None:
     """The line protocol's own heading hold gets headings in its count; odom's differ by 0.7 rad."""
-    with contextlib.closing(SimulatedMotor()) as twin, real_helm(twin) as helm:
+    with contextlib.closing(SimulatedMotor()) as twin, real_controller(twin) as controller:
         if setpoint.heading_rad is not None:
             goal_rad = setpoint.heading_rad - 0.7
-            run_until(helm, twin, setpoint, lambda: abs(twin.pose[2] - goal_rad) < 0.02)
+            run_until(controller, twin, setpoint, lambda: abs(twin.pose[2] - goal_rad) < 0.02)
         else:
-            run_until(helm, twin, setpoint, lambda: twin.pose[2] > 0.4)
+            run_until(controller, twin, setpoint, lambda: twin.pose[2] > 0.4)
             assert twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2)
-        helm.stop(time.monotonic_ns())
+        controller.stop(time.monotonic_ns())
         heading_rad, slowed = twin.pose[2], time.monotonic() + PATIENCE_S
         while not (is_stop(twin.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
-            helm()
+            controller.tick()
             time.sleep(0.02)
         assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not go on to where nobody wants it any more"
 
 
 def test_at_the_end_the_wheels_slow_down_whatever_is_asked(driving: Bench) -> None:
-    driving.helm.end()
-    assert not driving.helm.stands
+    driving.controller.end()
+    assert not driving.controller.stands
     slows_down(driving, lambda: both(driving))
-    assert driving.helm.stands and driving.helm.account.reason == fail_safe.ENDS
+    assert driving.controller.stands and driving.controller.state.reason == safety_rules.ENDS
 
 
 def test_a_controller_that_fails_needs_no_ramp(driving: Bench) -> None:
     driving.wheels.silent = True
     driving.tick()
-    assert driving.helm.stands
+    assert driving.controller.stands
 
 
 def test_what_a_tick_came_to(driving: Bench) -> None:
     """A pose counts once on its way to the wheels; what is not sent is not told."""
     driving.see(age_s=0.01)
     driving.now_ns += PERIOD_NS
-    tick = driving.helm()
+    tick = driving.controller.tick()
     assert tick.command == driving.last and tick.to_wheel_s == pytest.approx(0.06)
     driving.now_ns += PERIOD_NS
-    assert math.isnan(driving.helm().to_wheel_s)
+    assert math.isnan(driving.controller.tick().to_wheel_s)
     driving.wheels.silent = True
     driving.see()
     driving.now_ns += 4 * PERIOD_NS
-    tick = driving.helm()
+    tick = driving.controller.tick()
     assert tick.command is None and math.isnan(tick.to_wheel_s)
-    assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.account.missed == 3
+    assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.state.missed == 3
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -459,7 +461,7 @@ def test_whatever_comes_no_limit_breaks_and_nothing_moves_unasked(seed: int) -> 
         bench.wheels.silent, bench.wheels.expired = rng.random() < 0.02, rng.random() < 0.02
         count = len(bench.wheels.told)
         bench.tick(late_s=rng.choice([0.0] * 30 + [0.1, 0.5]))
-        asked = asked and not bench.helm.account.reason
+        asked = asked and not bench.controller.state.reason
         if len(bench.wheels.told) == count or bench.wheels.expired:
             spoken = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)  # the controller stands, or will
             asked = asked and len(bench.wheels.told) > count

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import signal
 import subprocess
@@ -13,25 +12,22 @@ import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
-from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from omnid.config import MotorConfig, RealtimeConfig
-from omnid.controller.controller import ControllerSettings
-from omnid.controller.link import ControllerLink, heading_of
+from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
-from omnid.core.control import safety_rules as fail_safe
+from omnid.controller.motor_settings import MotorSettings
+from omnid.core.control import safety_rules
+from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
 from tests.replay.live import ROOT, Base, wait_until
 
 DEADLINES = Deadlines(pose_s=5.0, command_s=5.0, tick_s=5.0)  # a busy machine is late with everything
@@ -39,19 +35,14 @@ AHEAD = Setpoint(0.4, None, 0.0)
 DECELERATION_MPS2 = 0.8
 
 
-def orders(port: object) -> ControllerStart:
+def start_message(port: object) -> ControllerStart:
     limits = VelocityLimits(deceleration_mps2=DECELERATION_MPS2)
-    motor = MotorConfig(port=str(port), rate_hz=10.0, watchdog_ms=5000)
-    return ControllerStart(motor, ControllerSettings(0.1, DEADLINES, limits=limits), RealtimeConfig(lock_memory=False))
+    motor = MotorSettings(port=str(port), rate_hz=10.0, watchdog_ms=5000)
+    return ControllerStart(motor, ControllerSettings(DEADLINES, limits), RealtimeSettings(lock_memory=False))
 
 
-def odometry(heading_rad: float = 0.0, rate_radps: float = 0.0) -> OdometryUpdate:
-    T = se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [0.0, 0.0, 0.0])
-    velocity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate_radps])
-    nothing_seen: Any = None
-    return OdometryUpdate(
-        0, time.monotonic_ns(), T, np.eye(6), velocity, np.eye(6), "tracking", 0, 99, 99, nothing_seen
-    )
+def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
+    return ControllerPose(time.monotonic_ns(), heading_rad, rate_radps, "tracking")
 
 
 class Robot:
@@ -63,7 +54,7 @@ class Robot:
         self.said: list[str] = []
         self.error: OmnidError | None = None
         self.stats = StageStats("motor")
-        self.link = ControllerLink(orders(base.port), np.eye(4), self.stats, self.said.append)
+        self.link = ControllerLink(start_message(base.port), self.stats, self.said.append)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
@@ -76,8 +67,8 @@ class Robot:
         wait_until(lambda: self._asked() and self.base.line.base.velocity_mps > 0.38, "motion")
 
     def _asked(self) -> bool:
-        self.link.process(odometry())
-        self.link.command(AHEAD, time.monotonic_ns())
+        self.link.send_pose(pose())
+        self.link.send_setpoint(AHEAD, time.monotonic_ns())
         return True
 
     def joined(self) -> None:
@@ -86,7 +77,7 @@ class Robot:
 
     def _read(self) -> None:
         try:
-            self.told.extend(self.link.told())
+            self.told.extend(self.link.commands())
         except OmnidError as error:
             self.error = error
 
@@ -115,12 +106,12 @@ def slowed_down(base: Base) -> None:
 
 def test_poses_and_commands_turn_the_wheels_and_the_book_is_kept(robot: Robot) -> None:
     robot.drive()
-    book = robot.link.logbook
-    wait_until(lambda: book.account.sent > 5 and book.to_wheel.count >= 1, "an entry")
+    book = robot.link.statistics
+    wait_until(lambda: book.state.sent > 5 and book.to_wheel.count >= 1, "an entry")
     assert robot.stats.processed > 5 and robot.stats.busy_since_ns > 0
     robot.link.stop()
     wait_until(lambda: not robot.base.drives, "the stop")
-    wait_until(lambda: book.account.stops[fail_safe.ASKED] == 1, "its count")
+    wait_until(lambda: book.state.stops[safety_rules.ASKED] == 1, "its count")
     assert "the wheels stop: a stop was asked for" in robot.said
     robot.link.end()
     robot.joined()
@@ -130,7 +121,7 @@ def test_poses_and_commands_turn_the_wheels_and_the_book_is_kept(robot: Robot) -
 
 def test_at_the_end_the_wheels_slow_down(robot: Robot) -> None:
     robot.drive()
-    robot.link.finish()
+    robot.link.end()
     robot.joined()
     robot.link.close()
     slowed_down(robot.base)
@@ -141,8 +132,8 @@ def test_at_the_end_the_wheels_slow_down(robot: Robot) -> None:
 def test_signals_for_the_daemon_do_not_end_it(robot: Robot, number: int) -> None:
     robot.drive()
     os.kill(robot.pid, number)
-    count = robot.link.logbook.account.sent
-    wait_until(lambda: robot.link.logbook.account.sent > count + 5, "more ticks")
+    count = robot.link.statistics.state.sent
+    wait_until(lambda: robot.link.statistics.state.sent > count + 5, "more ticks")
 
 
 def test_a_process_that_is_killed_ends_the_run(robot: Robot) -> None:
@@ -151,37 +142,37 @@ def test_a_process_that_is_killed_ends_the_run(robot: Robot) -> None:
     robot.joined()
     assert robot.error is not None and "exit code -9" in str(robot.error) and "\n" not in str(robot.error)
     robot.link.stop()  # whoever does not know it yet
-    robot.link.process(odometry())
+    robot.link.send_pose(pose())
 
 
 def test_a_stop_arrives_though_the_line_was_full(robot: Robot) -> None:
     """The process gets no processor for a while; what is too much for the line is lost, a stop is not."""
     robot.drive()
     os.kill(robot.pid, signal.SIGSTOP)
-    while not robot.link._line.lost:
-        robot.link.command(AHEAD, time.monotonic_ns())
+    while not robot.link._channel.lost:
+        robot.link.send_setpoint(AHEAD, time.monotonic_ns())
     robot.link.stop()
-    assert robot.link._line.lost >= 2, "it went the way of the commands"
+    assert robot.link._channel.lost >= 2, "it went the way of the commands"
     os.kill(robot.pid, signal.SIGCONT)
-    wait_until(lambda: robot.link._line.lost and _says_pose(robot), "the line's room")
+    wait_until(lambda: robot.link._channel.lost and _says_pose(robot), "the line's room")
     wait_until(lambda: not robot.base.drives, "the stop")
-    assert robot.link.logbook.account.stops[fail_safe.ASKED] == 1
+    assert robot.link.statistics.state.stops[safety_rules.ASKED] == 1
 
 
 def _says_pose(robot: Robot) -> bool:
     """Whether a pose went through."""
-    lost = robot.link._line.lost
-    robot.link.process(odometry())
-    return robot.link._line.lost == lost
+    lost = robot.link._channel.lost
+    robot.link.send_pose(pose())
+    return robot.link._channel.lost == lost
 
 
 OWNER = """
 import sys, time
-from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, np, odometry, orders
-link = ControllerLink(orders(sys.argv[1]), np.eye(4), StageStats("motor"), print)
+from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, pose, start_message
+link = ControllerLink(start_message(sys.argv[1]), StageStats("motor"), print)
 while True:
-    link.process(odometry())
-    link.command(AHEAD, time.monotonic_ns())
+    link.send_pose(pose())
+    link.send_setpoint(AHEAD, time.monotonic_ns())
     time.sleep(0.05)
 """
 
@@ -220,16 +211,4 @@ def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch:
 
 def test_a_port_that_is_not_there_gives_the_drivers_own_line() -> None:
     with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
-        ControllerLink(orders("/dev/nothing"), np.eye(4), StageStats("motor"), print)
-
-
-@pytest.mark.parametrize("odd", [{"heading_rad": math.nan}, {"rate_radps": math.nan}])
-def test_a_pose_that_is_no_number_is_lost(odd: dict[str, float]) -> None:
-    assert heading_of(odometry(), np.eye(4)).state == "tracking"
-    assert heading_of(odometry(**odd), np.eye(4)).state == "lost"
-
-
-def test_the_pose_of_the_wheels_is_that_of_the_base() -> None:
-    T_base_rig = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, 0.0, 0.3])
-    heading = heading_of(odometry(0.2, 0.3), T_base_rig)
-    assert heading.heading_rad == pytest.approx(0.2) and heading.yaw_rate_radps == pytest.approx(0.3)
+        ControllerLink(start_message("/dev/nothing"), StageStats("motor"), print)

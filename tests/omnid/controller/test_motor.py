@@ -8,10 +8,10 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from omnid.config import Config, MotorConfig
+from omnid.config import Config
 from omnid.controller.motor import open_motor
+from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.settings import parse
 
 SLOW_HZ = 1.0  # so that a machine under load has a second to answer
@@ -19,21 +19,21 @@ SLOW_HZ = 1.0  # so that a machine under load has a second to answer
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_protocol_can_be_simulated(protocol: str) -> None:
-    drive = DifferentialDrive(track_m=0.5, reverse_right=True)
-    config = MotorConfig(port="simulated", protocol=protocol, rate_hz=SLOW_HZ, watchdog_ms=5000, drive=drive)
+    drive = DriveSettings(track_m=0.5, reverse_right=True)
+    config = MotorSettings(port="simulated", protocol=protocol, rate_hz=SLOW_HZ, watchdog_ms=5000, drive=drive)
     with ExitStack() as closing:
         driver, twin = open_motor(config, closing)
         driver.send(VelocityCommand(0, 0.4, 0.0, 0.2))
         assert twin is not None and twin.errors == 0
-        assert twin.state.commanded_mps == pytest.approx([0.35, 0.45], rel=0.02)
-    assert twin.state.commanded_mps == [0.0, 0.0], "closing stops the wheels"
+        assert twin.base.commanded_mps == pytest.approx([0.35, 0.45], rel=0.02)
+    assert twin.base.commanded_mps == [0.0, 0.0], "closing stops the wheels"
 
 
 def test_a_watchdog_of_fewer_than_four_ticks_is_refused() -> None:
     with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
-        open_motor(MotorConfig(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
+        open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
 
 
 def test_the_drive_comes_from_its_section() -> None:
     config = parse(Config, b"[motor.drive]\ntrack_m = 0.62\nreverse_left = true\ncan_id = 7", origin="test")
-    assert config.motor.drive == DifferentialDrive(track_m=0.62, reverse_left=True, can_id=7)
+    assert config.motor.drive == DriveSettings(track_m=0.62, reverse_left=True, can_id=7)

@@ -16,15 +16,16 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from omnid.config import PairConfig
-from omnid.controller.controller import Controller, ControllerSettings, TimedSetpoint
-from omnid.controller.link import heading_of
+from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics
+from omnid.core.control.control_law import ControllerSettings, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.diagnostics.status import SILENT_S, StatusReport, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
+from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver
@@ -56,11 +57,9 @@ class Daemon:
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
         self.wheels = Wheels()
-        self.helm = Controller(self.wheels, ControllerSettings(0.05))
+        self.controller = Controller(self.wheels, ControllerSettings(), 0.05)
         self.logbook = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(
-            lambda setpoint, arrival_ns: self.helm.command(TimedSetpoint(arrival_ns, setpoint)),
-            lambda: self.helm.stop(time.monotonic_ns()), 0.5)
+        self.commands = CommandReceiver(self._take, lambda: self.controller.stop(time.monotonic_ns()), 0.5)
         self.report = StatusReport(
             StatusSources(
                 self.telemetry,
@@ -73,6 +72,9 @@ class Daemon:
                 frozenset({"motor"}),
             )
         )
+
+    def _take(self, setpoint: Setpoint, arrival_ns: int) -> None:
+        self.controller.set_command(TimedSetpoint(arrival_ns, setpoint))
 
     def asked(self) -> dict[str, DiagnosticStatus]:
         """All that is said, by name, after it has proved fit for the wire."""
@@ -92,10 +94,10 @@ class Daemon:
                             np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
         self.tally.process(odometry)
         self.latency.process(odometry)
-        self.helm.see(heading_of(odometry, np.eye(4)))
+        self.controller.set_pose(controller_pose(odometry, np.eye(4)))
 
     def tick(self) -> None:
-        self.logbook.add(self.helm())
+        self.logbook.add(self.controller.tick())
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +176,7 @@ def test_a_stage_tells_what_a_message_takes_and_what_of_it_is_its_own(daemon: Da
 
 def test_wheels(daemon: Daemon) -> None:
     daemon.pose()
-    daemon.helm.command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
+    daemon.controller.set_command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
     daemon.tick()
     said = daemon.asked()["wheels"]
     assert (said.level, said.message) == (OK, "driving") and said.values["sent"] == "1"

@@ -15,8 +15,7 @@ from calib.panorama import remap_tables
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
 from drivers.logs.mcap_reader import LogReader
-from drivers.motor import is_stop
-from omnid.config import Config, GuidanceConfig, MappingConfig, PairConfig
+from omnid.config import Config, MappingConfig, PairConfig
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import PlaybackClock
@@ -25,7 +24,6 @@ from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, Ster
 from omnid.runs.pipeline import Sinks, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.guidance import Guidance
 from omnid.stages.mapping import Mapping
 from omnid.stages.mapping import Path as Way
 from omnid.stages.odometry import in_axes, of_base
@@ -211,27 +209,6 @@ def test_a_path_takes_no_more_memory_as_it_gets_longer() -> None:
     assert taken(go_on).held < 1000
     assert len(way.xy()) == 9001 and way.xy()[0].tolist() == [0.0, 0.5] and way.xy()[-2].tolist() == [8999.0, 0.5]
     assert Way(100).xy().shape == (0, 2)
-
-
-def test_guidance_turns_towards_the_heading_and_stops_when_lost() -> None:
-    config = GuidanceConfig(velocity_mps=0.3, heading_deg=90.0)
-    guidance = Guidance(config, np.eye(4))
-    for seq in range(20):
-        command = guidance.process(odometry(np.eye(4), seq=seq))
-    assert command.yaw_rate_radps > 0.5 and command.velocity_mps == pytest.approx(0.3)
-    assert command.heading_rad == pytest.approx(np.pi / 2)
-    assert is_stop(guidance.process(odometry(np.eye(4), state="lost", seq=20)))
-    again = guidance.process(odometry(np.eye(4), seq=21))
-    assert 0 < again.velocity_mps < 0.1, "after a stop it speeds up again from standing"
-
-
-def test_guidance_steers_the_base_and_not_the_rig() -> None:
-    """A rig that looks backwards on the base: where the rig has turned left about z, so has the base."""
-    T_base_rig = se3.exp([0, 0, 0, 0, 0, np.pi])
-    turned = se3.exp([0, 0, 0, 0, 0, 0.5])
-    guidance = Guidance(GuidanceConfig(heading_deg=np.degrees(0.5)), T_base_rig)
-    guidance.process(odometry(turned))
-    assert guidance.process(odometry(turned, seq=1)).yaw_rate_radps == pytest.approx(0, abs=1e-9)
 
 
 def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:

@@ -1,0 +1,86 @@
+"""Sinks that bring poses to the controller process: on the robot, and while a log is replayed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DriverError
+from drivers.motor import VelocityCommand
+from omnid.controller.link import ControllerLink
+from omnid.core.control.control_law import S_PER_NS
+from omnid.core.control.heading_controller import Setpoint
+from omnid.messages import OdometryUpdate
+from omnid.stages.lockstep_drive import controller_pose
+
+FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a replay
+
+
+class LiveDrive:
+    """Pass the poses of `omnid run` on; setpoints come from the network."""
+
+    def __init__(self, link: ControllerLink, T_base_rig: NDArray[np.float64]) -> None:
+        self._link, self._T_base_rig = link, T_base_rig
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Send a pose."""
+        self._link.send_pose(controller_pose(odometry, self._T_base_rig))
+
+    def finish(self) -> None:
+        """Have the wheels slow down to a stop: there will be no more poses."""
+        self._link.end()
+
+    def commands(self) -> Iterator[VelocityCommand]:
+        """Yield the commands that the controller sends; OmnidError where its process ends unasked."""
+        return self._link.commands()
+
+    def end(self) -> None:
+        """Have the wheels slow down to a stop and `commands` end; from any thread."""
+        self._link.end()
+
+
+class ReplayDrive:
+    """Drive the base with the poses of a replay and the setpoint of the configuration.
+
+    The controller runs in real time whatever the pace of the replay: a pose counts as captured when it arrives here,
+    and renews the setpoint. A replay that gives no pose for the deadlines' time stops the wheels, as a robot does.
+    """
+
+    def __init__(self, link: ControllerLink, setpoint: Setpoint, T_base_rig: NDArray[np.float64]) -> None:
+        self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
+        self._failed_since_ns = 0  # 0: the motor controller answers
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
+        now_ns = time.monotonic_ns()
+        self._link.send_pose(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
+        self._link.send_setpoint(self._setpoint, now_ns)
+        self._link.receive_waiting()
+        if not self._link.statistics.state.failed:
+            self._failed_since_ns = 0
+            return
+        self._failed_since_ns = self._failed_since_ns or now_ns
+        if (now_ns - self._failed_since_ns) * S_PER_NS > FAILED_S:
+            raise _motor_failed()
+
+    def finish(self) -> None:
+        """Have the wheels slow down to a stop, take the last reports; DriverError where the motor controller failed."""
+        self._link.end()
+        for _ in self._link.commands():
+            pass
+        if self._link.statistics.state.failed:
+            raise _motor_failed()
+
+    def counts(self) -> dict[str, int]:
+        """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
+        state = self._link.statistics.state
+        return {"commands": state.sent, "errors": state.errors, "stops": state.stops.total()}
+
+
+def _motor_failed() -> DriverError:
+    return DriverError("the motor controller does not answer any more; its own watchdog stops the wheels: "
+                       "check its power and its cable")
