@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
-EventCallback: TypeAlias = Callable[[int, str], None]  # severity and one line of text
-WARNING: Final = 4  # severities of syslog and journald (RFC 5424, section 6.2.1)
-NOTICE: Final = 5
+EventCallback: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line of text
 
 
-def ignore_event(severity: int, text: str) -> None:
+def ignore_event(level: int, text: str) -> None:
     """Drop an event."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -54,15 +55,16 @@ def _parser(words: Sequence[str]) -> Parser:
 def _guarded(args: argparse.Namespace) -> int:
     from calib.errors import CalibError
     from drivers.errors import DriverError
-    from omnid.engine.logging_setup import ERROR, tell
+    from omnid.engine.logging_setup import configure_logging, log_unlimited
     from omnid.errors import OmnidError
 
+    configure_logging()
     try:
         code = int(args.run(args))
         sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:
-        tell(ERROR, str(error))
+        log_unlimited(logging.ERROR, str(error))
         return WRONG
     except KeyboardInterrupt:
         return 130
@@ -70,7 +72,7 @@ def _guarded(args: argparse.Namespace) -> int:
         _hush()
         return 141
     except OSError as error:  # what no command has foreseen: a disk that is full, a name that is too long
-        tell(ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
+        log_unlimited(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _hush()
         return WRONG
 

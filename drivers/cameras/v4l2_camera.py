@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import time
@@ -18,7 +19,7 @@ from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.cameras.v4l2_stamps import StampValidator
 from drivers.cameras.v4l2_stream import V4l2Stream, device_error
 from drivers.errors import DriverError
-from drivers.events import NOTICE, WARNING, EventCallback, ignore_event
+from drivers.events import EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
 _FIRST_RETRY_S: Final = 0.1
@@ -112,7 +113,7 @@ class V4l2Camera:
     def _counted(self) -> int:
         """Return the number of the next frame; the first one after a loss is reported."""
         if self.state.status == "lost":
-            self._on_event(NOTICE, f"{self._name}: back, {self.state.mode}")
+            self._on_event(logging.INFO, f"{self._name}: back, {self.state.mode}")
         self.state.status, self.state.problem = "streaming", ""
         self.state.frames += 1
         return self.state.frames - 1
@@ -125,7 +126,7 @@ class V4l2Camera:
         if self.state.status != "lost":
             self.state.status = "lost"
             self.state.losses += 1
-            self._on_event(WARNING, f"{self._name}: lost, and tried again until it is back: {reason}")
+            self._on_event(logging.WARNING, f"{self._name}: lost, and tried again until it is back: {reason}")
 
     def _reopened(self) -> V4l2Stream:
         """Open the device again; raise DriverError too where its name now belongs to another camera."""

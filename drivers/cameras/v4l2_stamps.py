@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_state import CameraState
-from drivers.events import WARNING, EventCallback
+from drivers.events import EventCallback
 
 _MAX_AGE_NS: Final = 10 * 10**9  # no driver keeps a buffer for longer; an older stamp is from another clock
 
@@ -43,4 +44,4 @@ class StampValidator:
     def _report_once(self, kind: str, text: str) -> None:
         if kind not in self._reported:
             self._reported.add(kind)
-            self._on_event(WARNING, f"{self._name}: {text}")
+            self._on_event(logging.WARNING, f"{self._name}: {text}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.errors import DriverError
-from drivers.events import NOTICE, WARNING, EventCallback, ignore_event
+from drivers.events import EventCallback, ignore_event
 from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, delete_file
 from drivers.logs.mcap_writer import LogWriter
 
@@ -122,14 +123,14 @@ class RotatingLog:
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
         if self.state.refused == 1:
-            self._on_event(WARNING, f"recording: refused a message, and counts others: {reason}")
+            self._on_event(logging.WARNING, f"recording: refused a message, and counts others: {reason}")
 
     def _stop(self, error: DriverError) -> None:
         """Lets go of the file at hand; what of it has reached the disk stays for `omnid log recover`."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
             self.state.stops += 1
-            self._on_event(WARNING, f"recording: stopped, and tried again until it works: {error}")
+            self._on_event(logging.WARNING, f"recording: stopped, and tried again until it works: {error}")
         writer, self._writer = self._writer, None
         if writer is not None:
             self.state.lost += writer.messages - writer.persisted
@@ -144,7 +145,7 @@ class RotatingLog:
         """There is a file again, and it takes what is written."""
         lost = self.state.lost - self._lost_before
         self.state.status, self.state.problem, self._retry_s = "recording", "", _FIRST_RETRY_S
-        self._on_event(NOTICE, f"recording: goes on in {str(self._path)!r}; {lost} messages were lost")
+        self._on_event(logging.INFO, f"recording: goes on in {str(self._path)!r}; {lost} messages were lost")
 
     def _tend(self, writer: LogWriter) -> None:
         """Brings the file to the disk now and then, and looks whether there is still room."""

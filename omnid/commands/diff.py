@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Prints what there is to say; 0 where the runs agree, 1 where they part."""
-    from omnid.engine.logging_setup import WARNING, tell
+    from omnid.engine.logging_setup import log_unlimited
     from omnid.monitor.robot_state import plain
     from omnid.recordings.comparison import RunComparison, Tolerance
     from omnid.recordings.run_reader import read_run
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     tolerance = Tolerance(limits[0] * 1e-3, math.radians(limits[1]), limits[2] * 1e-2)
     comparison = RunComparison(a, b, tolerance, align=args.align)
     for warning in (*a.warnings, *b.warnings):
-        tell(WARNING, warning)
+        log_unlimited(logging.WARNING, warning)
     print("\n".join(map(plain, comparison.lines())))
     return PART if comparison.parted else AGREE
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,9 +38,9 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as closing:
         sources: dict[Camera, V4l2Camera] = {}
         for name in cameras:
-            sources[name] = V4l2Camera(config.cameras.settings(name), name, on_event=_say)
+            sources[name] = V4l2Camera(config.cameras.settings(name), name, on_event=_log)
             closing.callback(sources[name].close)
-        state = record(sources, config, rig, _say).state
+        state = record(sources, config, rig, _log).state
     return 0 if state.messages > state.lost + state.refused else 1
 
 
@@ -49,12 +50,12 @@ def _rig(config: Config, *, wanted: bool) -> str:
 
     path = Path(config.cameras.rig)
     if not (wanted or path.exists()):
-        _say(4, f"no rig is attached, {path} is missing: replay will ask for one with --rig")
+        _log(logging.WARNING, f"no rig is attached, {path} is missing: replay will ask for one with --rig")
         return ""
     return rig_toml(read_rig(path))
 
 
-def _say(severity: int, text: str) -> None:
-    from omnid.engine.logging_setup import say
+def _log(level: int, text: str) -> None:
+    from omnid.engine.logging_setup import log
 
-    say(severity, text)
+    log(level, text)

@@ -32,11 +32,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Runs until it is told to end."""
-    from omnid.engine.malloc_settings import share_heap
+    from omnid.engine.malloc_settings import use_one_malloc_arena
 
-    share_heap()  # before anything else: the next line loads numpy, which starts threads
+    use_one_malloc_arena()  # before anything else: the next line loads numpy, which starts threads
     from omnid.config import load_config
-    from omnid.engine.logging_setup import say
+    from omnid.engine.logging_setup import log
     from omnid.runs.live import LiveRun
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config, [*args.overrides, *shortcuts])
     if args.log is None:
         _refuse_what_needs_a_log(args)
-        return LiveRun(config, _devices(config), say).run()
-    return LiveRun(config, _recorded(args), say, None if args.rig else _rig_of(args.log)).run()
+        return LiveRun(config, _devices(config), log).run()
+    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log)).run()
 
 
 def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
@@ -57,9 +57,9 @@ def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
 
 def _devices(config: Config) -> OpenCamera:
     from drivers.cameras.v4l2_camera import V4l2Camera
-    from omnid.engine.logging_setup import say
+    from omnid.engine.logging_setup import log
 
-    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=say)
+    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
 def _recorded(args: argparse.Namespace) -> OpenCamera:

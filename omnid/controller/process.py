@@ -20,7 +20,7 @@ from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, Controlle
 from omnid.controller.motor import open_motor
 from omnid.core.control.control_law import S_PER_NS, ControllerPose, TimedSetpoint
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
-from omnid.engine.signals import STOPPING
+from omnid.engine.signals import STOP_SIGNALS
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
@@ -106,7 +106,7 @@ def prepare_process(settings: RealtimeSettings) -> str:
 
 def main() -> int:
     """Run the process; its argument is the file descriptor of its end of the channel."""
-    for number in (*STOPPING, ABORTING):
+    for number in (*STOP_SIGNALS, ABORTING):
         signal.signal(number, signal.SIG_IGN)
     return run_controller(Channel(socket.socket(fileno=int(sys.argv[1]))))
 

@@ -1,4 +1,4 @@
-"""What a graph is made of, threads left out: the boxes, the wires between them and the newest-wins slot."""
+"""Elements of a graph, without threads: stages, sinks, sources, the streams between them, the newest-wins slot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ In_contra = TypeVar("In_contra", contravariant=True)
 
 
 class Policy(Enum):
-    """What a full inbox does: LOSSLESS lets the writer wait, NEWEST forgets the oldest message and counts it."""
+    """Policy of a full inbox: LOSSLESS lets the writer wait, NEWEST drops the oldest message and counts it."""
 
     LOSSLESS = "lossless"
     NEWEST = "newest"
@@ -27,69 +27,69 @@ END: Final = object()
 
 
 class Stage(Protocol[In_contra, Out_co]):
-    """One box of the flow; may also have `finish() -> Iterable[Out]` for what is in hand at the end of the stream."""
+    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end."""
 
     def process(self, message: In_contra, /) -> Out_co | None:
-        """What follows from the message, if anything."""
+        """Return the result of the message, None without one."""
 
 
 class Sink(Protocol[In_contra]):
     """An end of the flow; may also have `finish() -> None`."""
 
     def process(self, message: In_contra, /) -> None:
-        """Takes the message out of the graph."""
+        """Take a message out of the graph."""
 
 
 class Reader(Protocol):
-    """Where a wire ends."""
+    """Receiving end of a stream."""
 
     def put(self, message: object) -> None:
-        """Takes one message."""
+        """Take one message."""
 
     def end(self) -> None:
-        """One writer less; after the last one comes the end."""
+        """Count one writer less; after the last one comes the end of the stream."""
 
 
 class Stream(Generic[T_co]):
-    """What a source or a stage gives: a wire with any number of readers."""
+    """Output of a source or a stage, with any number of readers."""
 
     def __init__(self) -> None:
         self.readers: list[Reader] = []
 
     def push(self, message: object) -> None:
-        """Hands the message to every reader."""
+        """Pass the message to every reader."""
         for reader in self.readers:
             reader.put(message)
 
     def end(self) -> None:
-        """Hands the end to every reader."""
+        """Pass the end of the stream to every reader."""
         for reader in self.readers:
             reader.end()
 
 
 class Slot(Generic[T]):
-    """The newest value put, for a reader that never waits; also a sink."""
+    """Holds the newest value for a reader that never waits; also a sink."""
 
     def __init__(self) -> None:
         self._value: T | None = None
 
     def put(self, value: T, /) -> None:
-        """Replaces the value: one reference store, atomic, so that a signal handler may call it too."""
+        """Replace the value: one atomic reference store, safe in a signal handler."""
         self._value = value
 
     process = put
 
     def get(self) -> T | None:
-        """The newest value; None before the first."""
+        """Return the newest value; None before the first."""
         return self._value
 
 
 def nothing(*_: object) -> None:
-    """Stands for a method that a box does not have."""
+    """Do nothing: stands in for a method that a stage does not have."""
 
 
 class Node:
-    """A stage or a sink with its counters and the stream that leaves it."""
+    """A stage or a sink with its counters and its output stream."""
 
     def __init__(self, stats: StageStats, work: object) -> None:
         self.name = stats.name
@@ -99,21 +99,21 @@ class Node:
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
     def handle(self, message: object) -> None:
-        """Processes the message and passes on what follows from it."""
+        """Process the message and pass its result on."""
         result = self.stats.timed(self._process, message)
         if result is not None:
             self.stream.push(result)
 
     def finish(self) -> None:
-        """Passes on what is still in hand."""
+        """Pass on the results that remain at the end of the stream."""
         for result in self._finish() or ():
             self.stream.push(result)
 
 
 class Direct:
-    """The inline reader: the work happens within the writer's call.
+    """Inline reader: the work happens within the writer's call.
 
-    `succeeds(name, work, *args)` does the work and says whether it came to its end; `finish(node)` ends the node.
+    `succeeds(name, work, *args)` does the work and is True if no error was raised; `finish(node)` finishes the node.
     """
 
     def __init__(
@@ -123,14 +123,14 @@ class Direct:
         self._alive = True
 
     def put(self, message: object) -> None:
-        """Handles the message, unless the node has failed: then it is counted as dropped."""
+        """Handle the message; after a failure of the node it is counted as dropped instead."""
         if self._alive:
             self._alive = self._succeeds(self._node.name, self._node.handle, message)
         else:
             self._node.stats.dropped += 1
 
     def end(self) -> None:
-        """One writer less; the last one finishes the node and ends its stream."""
+        """Count one writer less; the last one finishes the node and ends its stream."""
         self._writers -= 1
         if self._writers == 0:
             if self._alive:
@@ -139,7 +139,7 @@ class Direct:
 
 
 class Source:
-    """A box without an inbox: its messages come from outside."""
+    """Input of the graph: messages of an iterable."""
 
     def __init__(self, stats: StageStats, messages: Callable[[], Iterable[object]], wake: Callable[[], None]) -> None:
         self.name = stats.name
@@ -152,7 +152,7 @@ class Source:
         self._close: Callable[[], object] = nothing
 
     def step(self) -> None:
-        """Passes on the next message, or notes the end."""
+        """Pass on the next message, or set `ended`."""
         if self._messages is None:
             messages = iter(self._open())
             self._close = getattr(messages, "close", nothing)
@@ -164,5 +164,5 @@ class Source:
             self.stream.push(message)
 
     def close(self) -> None:
-        """Closes the iterable where it can be closed (a generator's `finally` runs here)."""
+        """Close the iterable if it can be closed (a generator's `finally` runs here)."""
         self._close()

@@ -1,8 +1,8 @@
-"""The wiring and the threads that carry it: the only module that imports threading.
+"""The graph of stages and its threads; the only module that imports threading.
 
-Wiring is assignment, so a cycle cannot be written. Messages flow down through bounded inboxes that belong to their
-readers; the end of a stream flows down the same way. Inline, the same stages run in the caller's thread, each message
-depth first, and give the same numbers. Where streams merge, or sources are several, only the inline order is fixed.
+A stream exists before it is read, so a cycle cannot be wired. Messages flow through bounded inboxes that belong to
+their readers; the end of a stream flows the same way. Inline, the same stages run in the caller's thread, each message
+depth first, with the same results. With several sources, or where streams merge, only the inline order is fixed.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ __all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "St
 T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
-_WAIT_S: Final = 0.1  # a signal that lands in a foreign thread wakes nobody: the main thread looks up this often
+_POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
 
 
 class _Inbox:
-    """A reader's bounded queue for a number of writers; gives the end once all of them have ended."""
+    """Bounded queue of a reader for a number of writers; it ends when all of them have ended."""
 
     def __init__(self, stats: StageStats, writers: int, capacity: int, policy: Policy) -> None:
         self._stats, self._writers, self._capacity, self._policy = stats, writers, capacity, policy
@@ -54,8 +54,8 @@ class _Inbox:
     def put(self, message: object) -> None:
         with self._changed:
             if self._policy is LOSSLESS:
-                self._changed.wait_for(lambda: len(self._messages) < self._capacity)  # closing makes room as well
-            if self._closed:  # the reader is gone: nobody waits for it
+                self._changed.wait_for(lambda: len(self._messages) < self._capacity)  # or closed, which empties it
+            if self._closed:  # the reader has ended
                 self._stats.dropped += 1
                 return
             if len(self._messages) >= self._capacity:
@@ -67,7 +67,7 @@ class _Inbox:
 
     def get(self) -> object:
         with self._changed:
-            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0  # what was in hand is finished
+            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0  # the last message is finished
             self._changed.wait_for(lambda: self._closed or self._messages or not self._writers)
             if not self._messages:
                 return END
@@ -80,7 +80,7 @@ class _Inbox:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Forgets what waits, counts it and refuses the rest: for a reader that is gone."""
+        """Drop and count all messages, those to come too: the reader has ended."""
         with self._changed:
             self._closed = True
             self._stats.dropped += len(self._messages)
@@ -90,9 +90,9 @@ class _Inbox:
 
 
 class Ticker:
-    """An action at a fixed rate that waits for nobody.
+    """Calls an action at a fixed rate, independent of the stages.
 
-    The graph calls the action's optional `close` once, whatever ended the ticking. `stats.dropped`: missed deadlines.
+    The graph calls the action's optional `close` once, also after an error. `stats.dropped` counts missed deadlines.
     """
 
     def __init__(self, name: str, period_s: float, action: Callable[[], object]) -> None:
@@ -105,11 +105,11 @@ class Ticker:
         self._halt = threading.Event()
 
     def halt(self) -> None:
-        """Ends `run` before its next tick."""
+        """End `run` before its next tick."""
         self._halt.set()
 
     def run(self, stopping: Callable[[], bool]) -> None:
-        """Ticks until halted or stopping."""
+        """Tick until halted or stopping."""
         deadline_ns = time.monotonic_ns()
         while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
             skipped = skipped_deadlines(deadline_ns, time.monotonic_ns(), self._period_ns)
@@ -120,20 +120,20 @@ class Ticker:
             deadline_ns += (1 + skipped) * self._period_ns
 
     def close(self) -> None:
-        """Closes the action."""
+        """Close the action."""
         getattr(self._action, "close", nothing)()
 
 
 def skipped_deadlines(deadline_ns: int, now_ns: int, period_ns: int) -> int:
-    """How many deadlines to leave out so that the newest one that has passed is served now: no drift and no burst."""
+    """Return how many deadlines to skip so that the newest one passed is served now, without drift and burst."""
     return max(0, now_ns - deadline_ns) // period_ns
 
 
 class Graph:
     """The wiring of one run, and the run itself.
 
-    `policy` holds for all inboxes, a sink may overrule it; `depth` is an inbox's room for messages of each input.
-    `on_thread` is called with the name of each thread, in it, before its work; it must not raise.
+    `policy` is that of all inboxes unless a sink has its own; `depth` is the capacity of an inbox.
+    `on_thread` is called in each thread, with its name, before its work; it must not raise.
     """
 
     def __init__(
@@ -153,15 +153,15 @@ class Graph:
         self._ended: set[str] = set()  # names of threads
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
-        self._bell: SimpleQueue[None] = SimpleQueue()  # its put is reentrant: safe in a signal handler
+        self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
         self._ran = False
 
     def source(
         self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = nothing
     ) -> Stream[T]:
-        """The messages of an iterable that is opened, read and closed in the source's own thread.
+        """Add a source: an iterable that is opened, read and closed in the source's own thread.
 
-        `wake` is called once when a threaded run is to end early: it must end this read and all later ones.
+        `wake` is called once to end a threaded run early: it must end the current read and all later ones.
         """
         source = Source(self._add(StageStats(name)), messages, wake)
         self._sources.append(source)
@@ -169,20 +169,20 @@ class Graph:
         return source.stream
 
     def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In]) -> Stream[Out]:
-        """What the stage makes of its inputs, which merge into its one inbox."""
+        """Add a stage, whose inputs merge into its one inbox; return its output."""
         return self._node(Node(self._add(StageStats(name)), stage), inputs, self._policy, self._depth)
 
     def sink(
         self, name: str, sink: Sink[In], *inputs: Stream[In], policy: Policy | None = None, depth: int | None = None
     ) -> None:
-        """Ends streams in a sink, with its own policy or depth where given."""
+        """Add a sink, with its own policy or depth if given."""
         node = Node(self._add(StageStats(name)), sink)
         self._node(node, inputs, policy or self._policy, self._depth if depth is None else depth)
 
     def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> Ticker:
-        """Calls the action at a fixed rate in a thread of its own, also inline, until the run ends.
+        """Add an action that is called at a fixed rate in its own thread, also inline, until the run ends.
 
-        A stop or a failure ends it at once, before the inboxes have drained.
+        A stop or a failure ends it at once, before the inboxes are empty.
         """
         ticker = Ticker(name, period_s, action)
         self._add(ticker.stats)
@@ -190,41 +190,41 @@ class Graph:
         return ticker
 
     def stop(self) -> None:
-        """Ends the sources and lets the rest drain; a second call forgets what waits and finishes nothing.
+        """End the sources and process what is in the inboxes; a second call drops the inboxes and finishes nothing.
 
-        Takes no lock: any thread or signal handler may call it.
+        Takes no lock, so any thread or signal handler may call it.
         """
         self._stops.append(None)
-        self._bell.put(None)
+        self._wakeup.put(None)
 
     def run(self) -> None:
-        """Runs until the sources have ended, the inboxes are empty and the threads joined; only once.
+        """Run until the sources have ended, the inboxes are empty and the threads have joined; only once.
 
-        Ctrl-C means `stop`. Raises the first error of any box, later ones in its notes, and KeyboardInterrupt after a
-        second stop.
+        Ctrl-C calls `stop`. Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt
+        after a second stop.
         """
         self._require_fresh()
         self._ran = True
         with self._ctrl_c_stops():
-            self._carry()
+            self._execute()
         for error in self._errors[1:]:
             self._errors[0].add_note(f"and then: {error!r}")
         if self._errors:
             raise self._errors[0]
-        if self._hard:
-            raise KeyboardInterrupt("stopped twice: what waited in the inboxes is lost")
+        if self._aborting:
+            raise KeyboardInterrupt("stopped twice: messages that were still in the inboxes are lost")
 
     @property
     def _stopping(self) -> bool:
         return bool(self._stops or self._errors)
 
     @property
-    def _hard(self) -> bool:
+    def _aborting(self) -> bool:
         return len(self._stops) > 1
 
     def _require_fresh(self) -> None:
         if self._ran:
-            raise OmnidError("a graph runs once and is wired before: make a new one")
+            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
 
     def _add(self, stats: StageStats) -> StageStats:
         self._require_fresh()
@@ -247,19 +247,19 @@ class Graph:
             self._on_thread(name)
             body(*args)
             self._ended.add(name)
-            self._bell.put(None)
+            self._wakeup.put(None)
 
         if self._threaded:
             self._threads.append(threading.Thread(target=run, name=name))
 
     def _succeeds(self, name: str, work: Callable[..., object], *args: object) -> bool:
-        """Whether the work came to its end; its error ends the run."""
+        """True if the work raised no error; an error ends the run."""
         try:
             work(*args)
         except BaseException as error:
             error.add_note(f"in '{name}'")
             self._errors.append(error)
-            self._bell.put(None)
+            self._wakeup.put(None)
             return False
         return True
 
@@ -268,7 +268,7 @@ class Graph:
             pass
 
     def _advances(self, source: Source) -> bool:
-        """Whether the source took a step; otherwise it is closed and its end flows down."""
+        """True if the source took a step; otherwise it is closed and its stream ends."""
         if not (source.ended or self._stopping) and self._succeeds(source.name, source.step):
             return True
         self._succeeds(source.name, source.close)
@@ -286,42 +286,44 @@ class Graph:
         self._finish(node)
 
     def _finish(self, node: Node) -> None:
-        if not self._hard:
+        if not self._aborting:
             node.finish()
 
     def _run_inline(self) -> None:
-        turns = deque(self._sources)
-        while turns:
-            source = turns.popleft()
+        active = deque(self._sources)
+        while active:  # round robin
+            source = active.popleft()
             if self._advances(source):
-                turns.append(source)
+                active.append(source)
 
-    def _beat(self, ticker: Ticker) -> None:
+    def _run_ticker(self, ticker: Ticker) -> None:
         self._on_thread(ticker.name)
         self._succeeds(ticker.name, ticker.run, lambda: self._stopping)
         self._succeeds(ticker.name, ticker.close)
 
-    def _carry(self) -> None:
-        beats = [threading.Thread(target=self._beat, args=(ticker,), name=ticker.name) for ticker in self._tickers]
+    def _execute(self) -> None:
+        ticker_threads = [
+            threading.Thread(target=self._run_ticker, args=(ticker,), name=ticker.name) for ticker in self._tickers
+        ]
         try:
-            for thread in beats + self._threads:
+            for thread in ticker_threads + self._threads:
                 thread.start()
             self._wait() if self._threaded else self._run_inline()
-        except BaseException as error:  # from a signal handler of the caller's, or no thread to be had
+        except BaseException as error:  # from the caller's signal handler, or no thread could be started
             self._errors.insert(0, error)
             self._stops.extend((None, None))
             self._wait()
         finally:
             for ticker in self._tickers:
                 ticker.halt()
-            for thread in filter(_started, beats):
+            for thread in filter(_started, ticker_threads):
                 thread.join()
 
     def _wait(self) -> None:
         started = list(filter(_started, self._threads))
         while any(thread.name not in self._ended for thread in started):
             with suppress(Empty):
-                self._bell.get(timeout=_WAIT_S)
+                self._wakeup.get(timeout=_POLL_S)
             self._pass_on_stop()
         for thread in started:
             thread.join()
@@ -333,13 +335,13 @@ class Graph:
             for source in self._sources:
                 wake, source.wake = source.wake, nothing
                 self._succeeds(source.name, wake)
-        if self._hard:
+        if self._aborting:
             for inbox in self._inboxes:
                 inbox.close()
 
     @contextmanager
     def _ctrl_c_stops(self) -> Iterator[None]:
-        """Ctrl-C as a stop: an exception in the main thread could tear a lock or the state of a stage."""
+        """Make Ctrl-C a stop: a KeyboardInterrupt could leave a lock or the state of a stage inconsistent."""
         in_main = threading.current_thread() is threading.main_thread()
         if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
             yield
@@ -352,7 +354,7 @@ class Graph:
 
     def _on_ctrl_c(self, *_: object) -> None:
         self.stop()
-        if self._hard and not self._threaded:  # nothing else reaches a stage that the main thread is stuck in
+        if self._aborting and not self._threaded:  # nothing else interrupts a stage in the main thread
             raise KeyboardInterrupt
 
 

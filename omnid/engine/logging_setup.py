@@ -1,7 +1,8 @@
-"""What the daemon says: a line each on stderr, with the journal's priorities where the journal reads it.
+"""Logging of the programs: one line per record on stderr, with the priorities of journald where it reads them.
 
-The same line again and again is written a few times a minute, and the rest is counted: a fault that repeats itself at
-the rate of the images fills no disk.
+Modules log by `log(level, text)` or a logger of `logging`; a program calls `configure_logging` once. Lines that differ
+in their numbers only are written a few times a minute and then counted: a fault that repeats at the rate of the images
+does not fill the disk.
 """
 
 from __future__ import annotations
@@ -16,111 +17,125 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TextIO
 
-ERROR: Final = 3  # the numbers of syslog and journald (RFC 5424), as the drivers' reports have them
-WARNING: Final = 4
-NOTICE: Final = 5
+LOGGER: Final = logging.getLogger("omnid")
+
+# Levels of logging and the priorities of syslog and journald (RFC 5424, section 6.2.1).
+_PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+_DEBUG_PRIORITY: Final = 7
 
 _BURST: Final = 5  # lines of a kind that are written within a period
 _PERIOD_S: Final = 60.0
-_KINDS: Final = 256  # of which is known when they were last written
-_LONGEST: Final = 4000  # characters of a line
+_MAX_KINDS: Final = 256  # whose counts are kept
+_MAX_LENGTH: Final = 4000  # characters of a line
 _NUMBER = re.compile(r"\d+")
+
+
+def log(level: int, text: str) -> None:
+    """Log a line, rate limited; level as in `logging`. For any thread, not for signal handlers."""
+    LOGGER.log(level, "%s", text)
+
+
+def log_unlimited(level: int, text: str) -> None:
+    """Log a line without rate limit: for messages that a program gives once, such as why it ends."""
+    LOGGER.log(level, "%s", text, extra={"unlimited": True})
+
+
+def configure_logging() -> None:
+    """Write the records of omnid from INFO on, and of libraries from WARNING on, to stderr; may be called again."""
+    root = logging.getLogger()
+    if HANDLER not in root.handlers:
+        root.addHandler(HANDLER)
+    LOGGER.setLevel(logging.INFO)
 
 
 @dataclass(slots=True)
 class _Kind:
-    """Lines that differ in nothing but their numbers."""
+    """Count of the lines that differ in their numbers only."""
 
     since_s: float
     written: int = 0
-    held_back: int = 0  # since the last that was written
+    suppressed: int = 0  # since the last line written
 
 
-class Journal(logging.Handler):
-    """Writes lines; any thread may, but no signal handler. What libraries log comes here too, from warnings on."""
+class StderrHandler(logging.Handler):
+    """Writes records as single lines with a rate limit per kind of line."""
 
     def __init__(self, stream: TextIO | None = None, clock_s: Callable[[], float] = time.monotonic) -> None:
-        """stream: where to, else what sys.stderr is at the time."""
-        super().__init__(logging.WARNING)
+        """stream: None for sys.stderr at the time of writing."""
+        super().__init__()
         self._stream, self._clock_s = stream, clock_s
-        self._kinds: dict[str, _Kind] = {}  # the one that was spoken of last comes last
-        self.held_back = 0  # lines in all
-
-    def say(self, priority: int, text: str) -> None:
-        """Writes the text as one line, unless too many have been that differ in nothing but their numbers."""
-        self.acquire()
-        try:
-            self._judge(priority, _one_line(text))
-        finally:
-            self.release()
-
-    def tell(self, priority: int, text: str) -> None:
-        """Writes the text as one line, whatever has been said."""
-        self.acquire()
-        try:
-            self._write(priority, _one_line(text))
-        finally:
-            self.release()
+        self._kinds: dict[str, _Kind] = {}  # the most recent one is the last
+        self.suppressed = 0  # lines in all
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Says a record of `logging`."""
-        self.say(ERROR if record.levelno >= logging.ERROR else WARNING, f"{record.name}: {record.getMessage()}")
+        """Write the record, unless too many of its kind were written within the period."""
+        text = record.getMessage()
+        if record.name != LOGGER.name:
+            text = f"{record.name}: {text}"
+        line = _single_line(text)
+        if getattr(record, "unlimited", False):
+            self._write(record.levelno, line)
+        else:
+            self._write_limited(record.levelno, line)
 
     def flush(self) -> None:
-        """Tells how much of each kind has been held back; `logging` calls this at the end of the program."""
+        """Report how many lines of each kind were suppressed; `logging` calls this at the end of the program."""
         self.acquire()
         try:
             for key, kind in self._kinds.items():
-                if kind.held_back:
-                    self._write(NOTICE, f"{kind.held_back} more of this kind: {key}")
-                    kind.held_back = 0
+                if kind.suppressed:
+                    self._write(logging.INFO, f"{kind.suppressed} more of this kind: {key}")
+                    kind.suppressed = 0
         finally:
             self.release()
 
-    def _judge(self, priority: int, line: str) -> None:
+    def _write_limited(self, level: int, line: str) -> None:
         kind = self._kind(_NUMBER.sub("#", line), self._clock_s())
         if kind.written == _BURST:
-            kind.held_back += 1
-            self.held_back += 1
+            kind.suppressed += 1
+            self.suppressed += 1
             return
-        self._write(priority, f"{line} (and {kind.held_back} more of this kind)" if kind.held_back else line)
-        kind.written, kind.held_back = kind.written + 1, 0
+        self._write(level, f"{line} (and {kind.suppressed} more of this kind)" if kind.suppressed else line)
+        kind.written, kind.suppressed = kind.written + 1, 0
 
     def _kind(self, key: str, now_s: float) -> _Kind:
         kind = self._kinds.pop(key, None) or _Kind(now_s)
         if now_s - kind.since_s > _PERIOD_S:
             kind.since_s, kind.written = now_s, 0
         self._kinds[key] = kind
-        if len(self._kinds) > _KINDS:
+        if len(self._kinds) > _MAX_KINDS:
             del self._kinds[next(iter(self._kinds))]
         return kind
 
-    def _write(self, priority: int, line: str) -> None:
+    def _write(self, level: int, line: str) -> None:
         stream = self._stream or sys.stderr
-        with suppress(OSError, ValueError):  # nobody reads it any more: no reason to end anything
-            stream.write(f"<{priority}>{line}\n" if _is_journal(stream) else f"omnid: {_word(priority)}{line}\n")
+        prefix = f"<{priority(level)}>" if _is_journal(stream) else f"omnid: {_label(level)}"
+        with suppress(OSError, ValueError):  # a closed stream or a full disk must not end the program
+            stream.write(f"{prefix}{line}\n")
             stream.flush()
 
 
-def _one_line(text: str) -> str:
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text[:_LONGEST]).split())
+def priority(level: int) -> int:
+    """Return the priority of syslog and journald for a level of `logging`."""
+    return next((number for least, number in _PRIORITIES if level >= least), _DEBUG_PRIORITY)
 
 
-def _word(priority: int) -> str:
-    return "warning: " if priority == WARNING else ""
+def _single_line(text: str) -> str:
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text[:_MAX_LENGTH]).split())
+
+
+def _label(level: int) -> str:
+    return "warning: " if level == logging.WARNING else ""
 
 
 def _is_journal(stream: TextIO) -> bool:
-    """Whether journald reads the stream, which it says by its device and inode (systemd.exec(5), $JOURNAL_STREAM)."""
-    told = os.environ.get("JOURNAL_STREAM")
+    """True if journald reads the stream: $JOURNAL_STREAM is then its device and inode (systemd.exec(5))."""
+    expected = os.environ.get("JOURNAL_STREAM")
     try:
-        found = os.fstat(stream.fileno()) if told else None
-    except (OSError, ValueError):  # it has no number
+        found = os.fstat(stream.fileno()) if expected else None
+    except (OSError, ValueError):  # no file descriptor
         return False
-    return found is not None and told == f"{found.st_dev}:{found.st_ino}"
+    return found is not None and expected == f"{found.st_dev}:{found.st_ino}"
 
 
-JOURNAL: Final = Journal()
-say: Final = JOURNAL.say
-tell: Final = JOURNAL.tell
-logging.lastResort = JOURNAL
+HANDLER: Final = StderrHandler()

@@ -1,4 +1,4 @@
-"""Where the threads of the daemon get their memory; imports nothing that starts a thread."""
+"""Settings of the C library's memory allocator; imports nothing that starts a thread."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Final
 _M_ARENA_MAX: Final = -8  # malloc.h of glibc
 
 
-def share_heap() -> None:
-    """Has all threads that start from now on allocate from one heap; to be called before numpy starts its own.
+def use_one_malloc_arena() -> None:
+    """Let all threads share one malloc arena; to be called before numpy starts its threads.
 
-    glibc gives each thread one of its own otherwise, of which locked pages never go back to the kernel: every thread
-    keeps the most that it ever needed. The one heap shrinks, locked or not.
+    Otherwise glibc gives each thread its own arena, whose locked pages never return to the kernel, so every thread
+    keeps the most memory it ever needed. The main arena shrinks, locked or not.
     """
-    with suppress(AttributeError):  # another C library
+    with suppress(AttributeError):  # not glibc
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)

@@ -1,4 +1,4 @@
-"""A log at the pace at which it was recorded."""
+"""Playback of a log at the rate at which it was recorded."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Iterable, Iterator
 
 from drivers.frame import Frame
 
-_NAP_S = 0.05
+_POLL_S = 0.05  # longest sleep, so that `wake` takes effect soon
 
 
 class PlaybackClock:
-    """Frames no earlier than their stamps say, counted from the first; `wake` ends all waiting."""
+    """Delays frames to the intervals of their stamps; `wake` ends all waiting."""
 
     def __init__(self) -> None:
         self._awake = False
 
     def wake(self) -> None:
-        """Nobody waits any more."""
+        """End all waiting: the rest of the frames comes without delay."""
         self._awake = True
 
     def frames(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The same frames in time."""
+        """Yield the frames, each when its stamp is due; the first one at once."""
         offset_ns: int | None = None
         for frame in frames:
             if offset_ns is None:
@@ -31,4 +31,4 @@ class PlaybackClock:
 
     def _wait(self, until_ns: int) -> None:
         while not self._awake and (left_s := (until_ns - time.monotonic_ns()) * 1e-9) > 0:
-            time.sleep(min(left_s, _NAP_S))
+            time.sleep(min(left_s, _POLL_S))

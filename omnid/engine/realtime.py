@@ -1,16 +1,17 @@
-"""What the live daemon asks of the kernel and of Python so that its deadlines hold, and what it was refused.
+"""Real-time settings of the live daemon: scheduling priorities, locked memory, garbage collection, switch interval.
 
-Only threads that mostly wait become SCHED_FIFO, never the process: a FIFO thread that runs on keeps its core from
-everybody else. Three things guard against one: threads it starts are ordinary ones again (SCHED_RESET_ON_FORK), the
-kernel ends the daemon when one runs for too long without a wait (RLIMIT_RTTIME, SIGXCPU), and by default it leaves
-5 % of each second to the others (sched_rt_runtime_us). A FIFO thread still waits for Python's lock, up to the switch
-interval, which is therefore short.
+Only threads that mostly wait become SCHED_FIFO, never the process: a FIFO thread that does not wait blocks its core
+for all others. Three safeguards: threads that it starts are ordinary ones (SCHED_RESET_ON_FORK), the kernel ends the
+daemon when such a thread runs for too long without a wait (RLIMIT_RTTIME, SIGXCPU), and by default it leaves 5 % of
+each second to other threads (sched_rt_runtime_us). A FIFO thread still waits for Python's global lock, up to the
+switch interval, which is therefore short.
 """
 
 from __future__ import annotations
 
 import ctypes
 import gc
+import logging
 import os
 import resource
 import sys
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from omnid.engine.logging_setup import WARNING, say
+from omnid.engine.logging_setup import log
 from omnid.settings import knob
 
 CAP_IPC_LOCK: Final = 14
@@ -29,7 +30,8 @@ LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimi
                       "realtime.lock_memory = false")
 _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
-_EVERYTHING: Final = 1 | 2 | 4  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT, without which untouched stacks take 400 MB
+# MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
+_MCL_ALL: Final = 1 | 2 | 4
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -49,45 +51,45 @@ class RealtimeSettings:
 
 
 def prepare(config: RealtimeSettings) -> list[str]:
-    """Settles the process once all is wired, before the graph runs; gives a line for each thing that was refused."""
+    """Apply the settings of the process, after the wiring and before the run; return a line per refused setting."""
     if config.switch_interval_ms > 0:
         sys.setswitchinterval(config.switch_interval_ms * 1e-3)
     if config.freeze_gc:
         gc.collect()
         gc.freeze()
-    limit_runs(config.longest_run_ms)
+    limit_realtime_runs(config.longest_run_ms)
     refused = lock_memory() if config.lock_memory else ""
     return [refused] if refused else []
 
 
 class ThreadStart:
-    """What each thread of the graph does first: tells the kernel its name, and asks for its priority.
+    """Sets name and priority of a thread; called in the thread itself, before its work.
 
-    Called in the thread itself. A refusal is said once for all threads: they go on as ordinary ones.
+    A refused priority is reported once for all threads, which then run as ordinary ones.
     """
 
-    def __init__(self, priorities: Mapping[str, int], report: Callable[[int, str], object] = say) -> None:
-        """priorities: of SCHED_FIFO by thread, 1 to 99; 0, or no entry, is an ordinary thread."""
+    def __init__(self, priorities: Mapping[str, int], report: Callable[[int, str], object] = log) -> None:
+        """priorities: of SCHED_FIFO by name of the thread, 1 to 99; 0 or no entry for an ordinary thread."""
         self._priorities, self._report = dict(priorities), report
         self.refused = False
 
     def __call__(self, name: str) -> None:
-        """Names and raises the calling thread."""
+        """Set name and priority of the calling thread."""
         name_thread(name)
         priority = self._priorities.get(name, 0)
-        if priority and not raise_thread(priority) and not self.refused:
+        if priority and not set_realtime_priority(priority) and not self.refused:
             self.refused = True
-            self._report(WARNING, f"thread '{name}' cannot have real-time priority {priority}, nor can others: "
+            self._report(logging.WARNING, f"thread '{name}' cannot have real-time priority {priority}, nor can others: "
                          f"{priority_advice(max(self._priorities.values()))}")
 
 
 def priorities(config: RealtimeSettings, *captures: str) -> dict[str, int]:
-    """The priorities by thread, for ThreadStart; the wheels' tick has a process of its own."""
+    """Return the priorities by thread, for ThreadStart; the controller has a process of its own."""
     return {name: config.capture_priority for name in captures}
 
 
-def raise_thread(priority: int) -> bool:
-    """Makes the calling thread SCHED_FIFO; False where that is not allowed."""
+def set_realtime_priority(priority: int) -> bool:
+    """Make the calling thread SCHED_FIFO; False if that is not allowed."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))  # 0: this thread
         return True
@@ -95,46 +97,46 @@ def raise_thread(priority: int) -> bool:
 
 
 def name_thread(name: str) -> None:
-    """Names the calling thread for the kernel, as `top -H` shows it, by the first 15 bytes."""
+    """Set the kernel's name of the calling thread, which `top -H` shows, to the first 15 bytes."""
     _LIBC.prctl(_PR_SET_NAME, name.encode()[:_NAME_BYTES], 0, 0, 0)
 
 
-def limit_runs(longest_ms: int) -> None:
-    """Has the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs so long without a wait; 0: never.
+def limit_realtime_runs(max_run_ms: int) -> None:
+    """Let the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs so long without a wait; 0: never.
 
-    Where whoever started us allows less, that holds.
+    A stricter limit of the parent process stays.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
-    wanted = longest_ms * 1000 if longest_ms else hard
+    wanted = max_run_ms * 1000 if max_run_ms else hard
     if hard == resource.RLIM_INFINITY or wanted <= hard:
         resource.setrlimit(resource.RLIMIT_RTTIME, (wanted, hard))
 
 
 def lock_memory() -> str:
-    """Keeps all memory from being swapped out, now and later; why not, or "".
+    """Lock all memory, now and later, against swapping; return the reason if that is refused, else "".
 
-    Under a limit nothing is locked: what is allocated beyond it would fail.
+    Under a limit nothing is locked: allocations beyond it would fail.
     """
     if not may_lock():
         return f"memory is not locked, it may be swapped out: {LOCK_ADVICE}"
-    if _LIBC.mlockall(_EVERYTHING) != 0:
+    if _LIBC.mlockall(_MCL_ALL) != 0:
         return f"memory is not locked, it may be swapped out: {os.strerror(ctypes.get_errno())}; {LOCK_ADVICE}"
     return ""
 
 
 def may_lock() -> bool:
-    """Whether this process may lock any amount of memory."""
+    """True if this process may lock any amount of memory."""
     return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or has_capability(CAP_IPC_LOCK)
 
 
 def highest_priority() -> int:
-    """The highest real-time priority this process may give its threads; 0: none."""
+    """Return the highest real-time priority that this process may give its threads; 0: none."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return 99 if has_capability(CAP_SYS_NICE) or limit == resource.RLIM_INFINITY else limit
 
 
 def has_capability(number: int) -> bool:
-    """Whether this process has the capability in effect; False where /proc is not there."""
+    """True if this process has the effective capability; False without /proc."""
     with suppress(OSError, ValueError):
         status = Path("/proc/self/status").read_bytes()
         words = next(line.split() for line in status.splitlines() if line.startswith(b"CapEff:"))
@@ -143,6 +145,6 @@ def has_capability(number: int) -> bool:
 
 
 def priority_advice(priority: int) -> str:
-    """How to be allowed a real-time priority."""
+    """Return advice on how to allow a real-time priority."""
     return (f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
             "realtime.motor_priority = 0 and realtime.capture_priority = 0")

@@ -1,4 +1,4 @@
-"""What ends a run from outside: Ctrl-C, SIGTERM, a terminal that is closed."""
+"""Handling of the signals that stop a run: Ctrl-C, SIGTERM, a closed terminal."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
-def ended_by_signals(heed: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Has heed(number, frame) called for each of them meanwhile; what is ignored, as nohup has it, stays ignored."""
-    heeded = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, heed) for number in heeded}
+def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Call handler(number, frame) for each stop signal within the context; signals ignored (nohup) stay ignored."""
+    handled = [number for number in STOP_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handler) for number in handled}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)

@@ -1,4 +1,4 @@
-"""How often, how long and how much lost: counters of every stage, in constant memory."""
+"""Counters of every stage: messages, drops and durations, in constant memory."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _BINS = math.ceil(math.log(_HIGH_S / _LOW_S) * _BINS_PER_E)
 
 
 class Histogram:
-    """Distribution of durations from 1 us to 1000 s within 1 %, in 8 kB whatever the count.
+    """Distribution of durations from 1 us to 1000 s within 1 %, in 8 kB for any count.
 
-    One thread adds; any thread may read meanwhile and sees a state at most one duration old.
+    One thread adds; any thread may read at the same time and gets a state at most one duration old.
     """
 
     __slots__ = ("_bins", "_total_s", "count", "max_s")
 
     def __init__(self) -> None:
-        self._bins = array("Q", bytes(8 * (_BINS + 2)))  # the first and the last hold what is out of range
+        self._bins = array("Q", bytes(8 * (_BINS + 2)))  # the first and the last are for values out of range
         self._total_s = 0.0
         self.count = 0
         self.max_s = math.nan
 
     def add(self, duration_s: float) -> None:
-        """Counts one duration."""
+        """Add one duration."""
         self._bins[_bin(duration_s)] += 1
         self._total_s += duration_s
         self.max_s = duration_s if self.count == 0 else max(self.max_s, duration_s)
@@ -44,11 +44,11 @@ class Histogram:
 
     @property
     def mean_s(self) -> float:
-        """The mean duration; NaN before the first."""
+        """Mean duration, s; NaN before the first."""
         return self._total_s / self.count if self.count else math.nan
 
     def p(self, q: float) -> float:
-        """The duration [s] that the fraction q (0 to 1) of all durations does not exceed; NaN before the first."""
+        """Return the quantile q (0 to 1) of the durations, s; NaN before the first."""
         if not 0.0 <= q <= 1.0:
             raise ValueError(f"a quantile is a fraction from 0 to 1, found {q}: for the 99th percentile ask p(0.99)")
         ranks = list(accumulate(self._bins[:]))
@@ -73,8 +73,8 @@ class StageStats:
     """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
 
     A source's durations are the waits for its next message; a ticker's `dropped` are missed deadlines.
-    `busy_since_ns` (CLOCK_MONOTONIC) tells whoever watches from when on a message waits or is in hand and none has been
-    finished; 0 when there is nothing to do. Only readers that have an inbox, and tickers, tell it.
+    `busy_since_ns` (CLOCK_MONOTONIC): since when a message waits or is processed and none has been finished; 0 when
+    idle. Only stages with an inbox and tickers set it.
     """
 
     name: str
@@ -85,14 +85,14 @@ class StageStats:
     cpu: Histogram = field(default_factory=Histogram)  # of the calling thread only
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
-        """What `call(*args)` gives, counted and timed; a call that raises is not counted."""
+        """Return `call(*args)`, counted and timed; a call that raises is not counted."""
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         result = call(*args)
         self._record(wall_ns, cpu_ns)
         return result
 
     def timed_each(self, messages: Iterable[T]) -> Iterator[T]:
-        """The messages, each counted and timed on its way out."""
+        """Yield the messages, each counted and timed."""
         wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         for message in messages:
             self._record(wall_ns, cpu_ns)
@@ -106,7 +106,7 @@ class StageStats:
 
 
 class SummaryRow(NamedTuple):
-    """One printed line: wall time per message in milliseconds, NaN where nothing was processed."""
+    """One printed line: wall time per message in milliseconds, NaN if no message was processed."""
 
     stage: str
     n: int
@@ -117,15 +117,15 @@ class SummaryRow(NamedTuple):
 
 
 class Telemetry:
-    """The registry of all counters of a run, in the order of the wiring."""
+    """Registry of all counters of a run, in the order of the wiring."""
 
     def __init__(self) -> None:
         self._stages: dict[str, StageStats] = {}
 
     def add(self, stats: StageStats) -> StageStats:
-        """Registers the counters and gives them back; OmnidError if another stage has their name."""
+        """Register the counters and return them; OmnidError if another stage has their name."""
         if stats.name in self._stages:
-            raise OmnidError(f"stage '{stats.name}': the name is taken, name it otherwise")
+            raise OmnidError(f"stage '{stats.name}': the name is in use, choose another one")
         self._stages[stats.name] = stats
         return stats
 
@@ -135,7 +135,7 @@ class Telemetry:
         return tuple(self._stages.values())
 
     def summary(self) -> list[SummaryRow]:
-        """One row per stage, for printing."""
+        """Return one row per stage, for printing."""
         return [_row(stats) for stats in self.stages]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, suppress
@@ -22,7 +23,6 @@ from omnid.diagnostics.rig_monitor import RigMonitor
 from omnid.diagnostics.status import StatusReport, StatusSources, StatusTick
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
-from omnid.engine.logging_setup import WARNING
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
@@ -42,7 +42,7 @@ from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
-Report: TypeAlias = Callable[[int, str], None]  # severity and one line
+Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 StatusPublisher: TypeAlias = Callable[[list[DiagnosticStatus]], None]
 
 
@@ -71,7 +71,7 @@ class LiveRun:
         compile_serialisers()
         offset_ns = time.time_ns() - time.monotonic_ns()
         with ExitStack() as outputs:
-            session = Session(self._config, self._graph, outputs, lambda text: self._report(WARNING, text),
+            session = Session(self._config, self._graph, outputs, lambda text: self._report(logging.WARNING, text),
                               offset_ns=offset_ns)
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from drivers.events import NOTICE, WARNING, EventCallback
+from drivers.events import EventCallback
 from drivers.frame import Camera, FrameSource
 from drivers.logs.log_folder import LogFolder
 from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
-from omnid.engine.signals import ended_by_signals
+from omnid.engine.signals import handle_stop_signals
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
@@ -45,15 +46,15 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
 
     def report_progress() -> None:
         if recorder.state.files:
-            report(NOTICE, progress_line(recorder, graph))
+            report(logging.INFO, progress_line(recorder, graph))
 
     graph.ticker("progress", PERIOD_S, report_progress)
     try:
-        with ended_by_signals(lambda *_: graph.stop()):  # a second signal ends it at once
+        with handle_stop_signals(lambda *_: graph.stop()):  # a second signal ends it at once
             graph.run()
     finally:
         recorder.close()
-    report(NOTICE if recorder.state.messages else WARNING, progress_line(recorder, graph))
+    report(logging.INFO if recorder.state.messages else logging.WARNING, progress_line(recorder, graph))
     return recorder
 
 

@@ -15,7 +15,7 @@ from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph
-from omnid.engine.signals import ended_by_signals
+from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, clouds_of
@@ -90,5 +90,5 @@ class Session:
 
         with ExitStack() as handlers:
             with suppress(ValueError):
-                handlers.enter_context(ended_by_signals(handle))
+                handlers.enter_context(handle_stop_signals(handle))
             yield

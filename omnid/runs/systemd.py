@@ -7,6 +7,7 @@ whose cameras are gone has nothing to do, which is not that.
 from __future__ import annotations
 
 import faulthandler
+import logging
 import os
 import signal
 import socket
@@ -16,7 +17,7 @@ from contextlib import suppress
 from typing import Final
 
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.engine.logging_setup import ERROR, NOTICE, say
+from omnid.engine.logging_setup import log
 from omnid.engine.telemetry import StageStats, Telemetry
 
 STATUS_PERIOD_S: Final = 1.0
@@ -95,9 +96,10 @@ class Service:
 
     def _tell_of(self, stuck: dict[str, float]) -> None:
         for name in stuck.keys() - self._hung:
-            say(ERROR, f"stage '{name}' is hung: {stuck[name]:.1f} s at one message; systemd's watchdog is fed no more")
+            log(logging.ERROR, f"stage '{name}' is hung: {stuck[name]:.1f} s at one message; systemd's watchdog is fed "
+                "no more")
         for name in self._hung - stuck.keys():
-            say(NOTICE, f"stage '{name}' has gone on")
+            log(logging.INFO, f"stage '{name}' has gone on")
         self._hung = frozenset(stuck)
 
 

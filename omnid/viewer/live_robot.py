@@ -10,7 +10,7 @@ from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Diagnostics, Pose, Robot
 from omnid.core.odometry.stereo_frame import Features
-from omnid.engine.signals import ended_by_signals
+from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport.bus_config import BusConfig
@@ -36,7 +36,7 @@ class LiveRobotView:
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
         signals: list[int] = []
-        stopping = ended_by_signals(lambda number, _: signals.append(number))
+        stopping = handle_stop_signals(lambda number, _: signals.append(number))
         with stopping, Robot(settings=bus, timeout_s=CONNECT_TIMEOUT_S) as robot:
             inbox = Inbox()
             robot.on_message(inbox.put)

@@ -18,7 +18,7 @@ from urllib.parse import quote
 
 import rerun as rr
 
-from omnid.engine.signals import ended_by_signals
+from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 
 INSTEAD: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
@@ -144,7 +144,7 @@ class Viewer:
         """A window stays; what a browser looks at is served until Ctrl-C."""
         if not self._web or self._process is None:
             return "the window stays until it is closed"
-        with ended_by_signals(lambda *_: self.abandon()):
+        with handle_stop_signals(lambda *_: self.abandon()):
             print("omnid: that is all; Ctrl-C ends it", file=sys.stderr, flush=True)
             self._process.wait()
         return "no longer served"

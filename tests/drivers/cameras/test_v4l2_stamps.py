@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.v4l2_stamps import StampValidator
-from drivers.events import WARNING
 
 PERIOD_NS = 33_333_000
 START_NS = 5_000 * 10**9
@@ -43,7 +44,7 @@ def test_keeps_the_kernels_stamps(stamps: Stamps) -> None:
 def test_accepts_an_undeclared_clock_with_one_warning(stamps: Stamps, flags: int) -> None:
     expected = [START_NS, START_NS + PERIOD_NS]
     assert [stamps.validate(stamp_ns, stamp_ns + DELAY_NS, flags) for stamp_ns in expected] == expected
-    assert [severity for severity, _ in stamps.events] == [WARNING]
+    assert [level for level, _ in stamps.events] == [logging.WARNING]
     assert stamps.events[0][1].startswith("lower camera: ") and "clock" in stamps.events[0][1]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import subprocess
@@ -17,7 +18,6 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.errors import DriverError
-from drivers.events import NOTICE, WARNING
 from drivers.logs.file_lock import is_locked
 from drivers.logs.log_folder import LogFolder, RotationSettings
 from drivers.logs.mcap_catalog import Catalog
@@ -36,8 +36,8 @@ TICK_NS = 33_333_333
 class Heard(list[tuple[int, str]]):
     """Reports, in order."""
 
-    def __call__(self, severity: int, text: str) -> None:
-        self.append((severity, text))
+    def __call__(self, level: int, text: str) -> None:
+        self.append((level, text))
 
 
 class Bench:
@@ -194,7 +194,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     ballast = fill(small_disk)
     recording.write(300, size=10_000)
     assert recording.state.status == "stopped" and "No space left" in recording.heard[0][1]
-    assert [severity for severity, _ in recording.heard] == [WARNING] and recording.names() == [
+    assert [level for level, _ in recording.heard] == [logging.WARNING] and recording.names() == [
         "robot_20231114T221320Z_001.mcap.part"]  # what was saved until then, and no more than that
     lost = recording.state.lost
     time.sleep(1.1)
@@ -204,7 +204,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     try_again(recording)
     recording.write(50, size=10_000)
     recording.log.close()
-    assert [severity for severity, _ in recording.heard] == [WARNING, NOTICE]
+    assert [level for level, _ in recording.heard] == [logging.WARNING, logging.INFO]
     assert recording.heard[1][1].endswith(f"; {recording.state.lost} messages were lost")
     whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
     saved = len(list(DataSection(LogFile(recording.folder / recording.names()[0]), Catalog()).messages()))
@@ -263,7 +263,7 @@ def test_a_folder_that_vanishes_is_noticed_and_its_return_too(bench: Callable[..
     stick.mkdir()
     try_again(recording)
     recording.log.close()
-    assert [severity for severity, _ in recording.heard] == [WARNING, NOTICE]
+    assert [level for level, _ in recording.heard] == [logging.WARNING, logging.INFO]
     assert counted(next(recording.folder.iterdir())) == recording.state.messages - recording.state.lost > 0
 
 

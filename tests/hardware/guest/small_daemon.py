@@ -6,6 +6,7 @@ It leaves in /var/lib/omnid/report.json what it may do and what its threads are.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import socket
@@ -19,7 +20,7 @@ import numpy as np
 
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
-from omnid.engine.logging_setup import WARNING, say
+from omnid.engine.logging_setup import configure_logging, log
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare, priorities
 from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
 from omnid.transport.bus import Bus, BusConfig
@@ -126,6 +127,7 @@ class Reporter:
 def main() -> None:
     """Runs until SIGTERM."""
     show_stacks_at_the_end()
+    configure_logging()
     config, tally, bus = RealtimeSettings(), RunStatistics(), Bus(BusConfig())
     graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))
     graph.sink("bus", Speaker(bus), graph.stage("image", Image(), graph.source("lower", numbers)))
@@ -135,7 +137,7 @@ def main() -> None:
     graph.ticker("watchdog", service.period_s, service)
     signal.signal(signal.SIGTERM, lambda *_: graph.stop())
     for line in prepare(config):
-        say(WARNING, line)
+        log(logging.WARNING, line)
     graph.run()
     bus.close()
 

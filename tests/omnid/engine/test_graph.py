@@ -1,4 +1,4 @@
-"""The graph: nothing is lost that must not be, everything ends, and threads change no number."""
+"""The graph: drop policies, end of the run, errors, stops, tickers; threads and inline give the same results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
 from omnid.errors import OmnidError
 
-LONG_S = 20.0  # a wait that only a broken graph exhausts
+LONG_S = 20.0  # a timeout that only a defect reaches
 both = pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
 
 
@@ -30,7 +30,7 @@ def no_thread_is_left() -> Iterator[None]:
 
 @dataclass
 class Collect:
-    """A sink that keeps what it gets, and is told the end."""
+    """A sink that keeps its messages and counts calls of finish."""
 
     got: list[int] = field(default_factory=list)
     finished: int = 0
@@ -44,7 +44,7 @@ class Collect:
 
 @dataclass
 class Apply:
-    """A stage without an end."""
+    """A stage without finish."""
 
     function: Callable[[int], int | None]
 
@@ -54,7 +54,7 @@ class Apply:
 
 @dataclass
 class Sums:
-    """A stage with memory: gives the sum of two messages, and in the end what is left over and a marker."""
+    """A stage with state: sums of two messages; at the end the message left over and a marker."""
 
     held: list[int] = field(default_factory=list)
 
@@ -80,7 +80,7 @@ def fail_at(bad: int) -> Callable[[int], int]:
 
 
 def stopped_at(graph: Graph, last: int, act: Callable[[], None]) -> Callable[[int], int]:
-    """Lets messages pass and acts at one of them."""
+    """Return a function that passes messages on and acts at one of them."""
 
     def check(message: int) -> int:
         if message == last:
@@ -102,15 +102,15 @@ def summed(threaded: bool) -> tuple[list[int], list[int], list[int]]:
     return raw.got, sums.got, late.got
 
 
-def test_threads_change_no_number_and_no_order() -> None:
+def test_threads_give_the_results_of_inline() -> None:
     raw, sums, late = summed(threaded=True)
     assert (raw, sums, late) == summed(threaded=False)
     assert raw == list(range(101))
-    assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # what finish gives flows down
+    assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # with the results of finish
     assert late == [sums[k] + sums[k + 1] for k in range(0, 52, 2)] + [-1]
 
 
-def test_a_slow_reader_loses_nothing_and_its_inbox_stays_bounded() -> None:
+def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
     graph, slow = Graph(policy=LOSSLESS, depth=3), Collect()
     produced: list[int] = []
     ahead: list[int] = []
@@ -128,11 +128,11 @@ def test_a_slow_reader_loses_nothing_and_its_inbox_stays_bounded() -> None:
     graph.sink("slow", slow, graph.stage("crawl", Apply(crawl), graph.source("numbers", numbers)))
     graph.run()
     assert slow.got == list(range(300))
-    assert max(ahead) <= 3 + 2  # the inbox, one message in the writer's hand and the one at work
+    assert max(ahead) <= 3 + 2  # the inbox, one message at the writer, one at the reader
     assert [row.drops for row in graph.telemetry.summary()] == [0, 0, 0]
 
 
-def test_newest_forgets_the_oldest_and_counts_it() -> None:
+def test_newest_drops_the_oldest_and_counts_it() -> None:
     graph, slow, fast, all_sent = Graph(policy=NEWEST, depth=2), Collect(), Collect(), threading.Event()
 
     def numbers() -> Iterator[int]:
@@ -147,16 +147,16 @@ def test_newest_forgets_the_oldest_and_counts_it() -> None:
     graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), policy=LOSSLESS)
     graph.sink("fast", fast, stream, policy=LOSSLESS)
     graph.run()
-    assert fast.got == list(range(50))  # a sink may overrule the run
+    assert fast.got == list(range(50))  # the policy of the sink
     assert slow.got[-2:] == [48, 49]
-    assert len(slow.got) in (2, 3)  # and perhaps the one that was at work first
+    assert len(slow.got) in (2, 3)  # and perhaps the first one
     counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
     assert counted["hold"] == (len(slow.got), 50 - len(slow.got))
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
 
 @both
-def test_several_sources_merge_into_one_inbox(threaded: bool) -> None:
+def test_merges_several_sources_into_one_inbox(threaded: bool) -> None:
     graph, sink = Graph(threaded=threaded), Collect()
     streams = [graph.source("even", lambda: range(0, 100, 2)), graph.source("odd", lambda: range(1, 60, 2))]
     graph.sink("sink", sink, *streams)
@@ -165,7 +165,7 @@ def test_several_sources_merge_into_one_inbox(threaded: bool) -> None:
     assert [number for number in sink.got if number % 2] == list(range(1, 60, 2))
     assert sink.finished == 1
     if not threaded:
-        assert sink.got[:60] == list(range(60))  # inline, sources take turns
+        assert sink.got[:60] == list(range(60))  # inline: round robin
 
 
 @both
@@ -187,17 +187,17 @@ def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
         graph.run()
     assert caught.value.__notes__ == ["in 'fragile'"]
     assert after.got == list(range(10))
-    assert [sink.finished for sink in (before, beside, after)] == [1, 1, 1]  # the end flows down all the same
+    assert [sink.finished for sink in (before, beside, after)] == [1, 1, 1]  # all are finished nevertheless
     assert before.got == list(range(len(before.got)))
     assert closed.is_set()
 
 
-def test_a_writer_that_waits_for_a_dead_reader_is_woken() -> None:
+def test_a_failed_reader_releases_its_waiting_writer() -> None:
     graph, third = Graph(depth=1), threading.Event()
 
     def numbers() -> Iterator[int]:
         yield from (0, 1)
-        third.set()  # one message at work, one in the inbox: the next one has to wait
+        third.set()  # one message in process, one in the inbox: the next one has to wait
         yield 2
 
     def fail(message: int) -> int:
@@ -212,7 +212,7 @@ def test_a_writer_that_waits_for_a_dead_reader_is_woken() -> None:
 
 @both
 @pytest.mark.parametrize("place", ["open", "next", "close", "finish", "sink"])
-def test_an_error_anywhere_is_raised_and_named(threaded: bool, place: str) -> None:
+def test_raises_an_error_with_the_name_of_its_stage(threaded: bool, place: str) -> None:
     def broken() -> NoReturn:
         raise OSError(place)
 
@@ -244,7 +244,7 @@ def test_an_error_anywhere_is_raised_and_named(threaded: bool, place: str) -> No
     assert caught.value.__notes__ == ["in 'sink'" if place in ("finish", "sink") else "in 'source'"]
 
 
-def test_later_errors_are_told_with_the_first() -> None:
+def test_later_errors_are_notes_of_the_first() -> None:
     class Second(Collect):
         def finish(self) -> None:
             raise OSError("the disk is full")
@@ -276,7 +276,7 @@ def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
     stopper.start()
     graph.run()
     stopper.join()
-    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all that the source gave has come down
+    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
     assert len(sink.got) >= 6
     assert sink.finished == 1
 
@@ -300,13 +300,13 @@ def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool, handled:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_stop_forgets_what_waits_and_wakes_a_blocked_writer() -> None:
+def test_a_second_stop_drops_the_inboxes_and_releases_a_waiting_writer() -> None:
     graph, sink, third, ended = Graph(depth=1), Collect(), threading.Event(), threading.Event()
 
     def numbers() -> Iterator[int]:
         try:
             yield from (0, 1)
-            third.set()  # one message at work, one in the inbox: the next one has to wait
+            third.set()  # one message in process, one in the inbox: the next one has to wait
             yield from count(2)
         finally:
             ended.set()
@@ -315,7 +315,7 @@ def test_a_second_stop_forgets_what_waits_and_wakes_a_blocked_writer() -> None:
         assert third.wait(LONG_S)
         graph.stop()
         graph.stop()
-        assert ended.wait(LONG_S)  # the writer was woken while its reader is still at work
+        assert ended.wait(LONG_S)  # the writer was released while its reader still works
         return message
 
     graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("numbers", numbers)))
@@ -326,7 +326,7 @@ def test_a_second_stop_forgets_what_waits_and_wakes_a_blocked_writer() -> None:
     assert sink.finished == 0
 
 
-def test_a_second_ctrl_c_breaks_into_an_inline_stage() -> None:
+def test_a_second_ctrl_c_interrupts_an_inline_stage() -> None:
     graph, sink = Graph(threaded=False), Collect()
 
     def stuck() -> None:
@@ -342,7 +342,7 @@ def test_a_second_ctrl_c_breaks_into_an_inline_stage() -> None:
     assert sink.finished == 0
 
 
-def test_an_exception_from_a_foreign_signal_handler_joins_everything() -> None:
+def test_an_exception_from_another_signal_handler_joins_all_threads() -> None:
     graph, sink = Graph(), Collect()
 
     def too_long(*_: object) -> None:
@@ -353,7 +353,7 @@ def test_an_exception_from_a_foreign_signal_handler_joins_everything() -> None:
 
         def act() -> None:
             os.kill(os.getpid(), signal.SIGALRM)
-            threading.Event().wait(0.05)  # at work still when the exception comes up in the main thread
+            threading.Event().wait(0.05)  # still working when the main thread raises
 
         numbers = graph.source("numbers", count)
         graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
@@ -363,7 +363,7 @@ def test_an_exception_from_a_foreign_signal_handler_joins_everything() -> None:
         signal.signal(signal.SIGALRM, old)
 
 
-def test_a_source_that_blocks_is_woken_to_end() -> None:
+def test_wake_ends_a_blocked_source() -> None:
     graph, sink, closed = Graph(), Collect(), threading.Event()
 
     def camera() -> Iterator[int]:
@@ -386,8 +386,8 @@ def test_a_stop_before_the_run_ends_it_at_once(threaded: bool) -> None:
 
 
 @dataclass
-class Beat:
-    """A ticker's action that tells when it has been called often enough, and fails at one call if asked to."""
+class Action:
+    """An action that sets an event at the call `enough` and fails at the call `bad`."""
 
     enough: int
     bad: int = -1
@@ -407,45 +407,45 @@ class Beat:
 
 
 @both
-def test_a_ticker_does_not_wait_for_a_stage(threaded: bool) -> None:
-    graph, sink, beat = Graph(threaded=threaded), Collect(), Beat(enough=20)
+def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
+    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=20)
 
     def hold(message: int) -> int:
-        assert beat.reached.wait(LONG_S)  # the stage ends only after 20 more ticks
+        assert action.reached.wait(LONG_S)  # the stage ends after 20 more ticks only
         return message
 
     graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
-    ticker = graph.ticker("motor", 1e-3, beat)
+    ticker = graph.ticker("motor", 1e-3, action)
     graph.run()
     assert sink.got == [7]
-    assert beat.closed == 1
-    assert ticker.stats.processed == beat.calls >= 20
+    assert action.closed == 1
+    assert ticker.stats.processed == action.calls >= 20
     assert ticker.stats in graph.telemetry.stages
 
 
 @both
 def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
-    graph, sink, beat = Graph(threaded=threaded), Collect(), Beat(enough=99, bad=3)
+    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=99, bad=3)
     graph.sink("sink", sink, graph.source("numbers", lambda: (number % 7 for number in count())), policy=NEWEST)
-    graph.ticker("motor", 1e-3, beat)
+    graph.ticker("motor", 1e-3, action)
     with pytest.raises(OSError, match="no answer") as caught:
         graph.run()
     assert caught.value.__notes__ == ["in 'motor'"]
-    assert (beat.calls, beat.closed, sink.finished) == (3, 1, 1)
+    assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
 
 
-def test_a_stop_ends_the_ticker_before_the_rest_has_drained() -> None:
-    graph, sink, beat = Graph(), Collect(), Beat(enough=1)
-    hourly, both_closed = Beat(enough=1), threading.Barrier(3)
-    beat.close = hourly.close = partial(both_closed.wait, LONG_S)  # type: ignore[method-assign, assignment]
+def test_a_stop_ends_tickers_before_the_inboxes_are_empty() -> None:
+    graph, sink, action = Graph(), Collect(), Action(enough=1)
+    hourly, both_closed = Action(enough=1), threading.Barrier(3)
+    action.close = hourly.close = partial(both_closed.wait, LONG_S)  # type: ignore[method-assign, assignment]
 
     def drain_slowly(message: int) -> int:
         graph.stop()
-        both_closed.wait(LONG_S)  # the wheels stand still while this message is still at work
+        both_closed.wait(LONG_S)  # tickers are closed while this message is in process
         return message
 
     graph.sink("sink", sink, graph.stage("slow", Apply(drain_slowly), graph.source("one", lambda: [1])))
-    graph.ticker("motor", 1e-3, beat)
+    graph.ticker("motor", 1e-3, action)
     graph.ticker("hourly", 3600.0, hourly)
     graph.run()
     assert sink.got == [1]
@@ -454,11 +454,11 @@ def test_a_stop_ends_the_ticker_before_the_rest_has_drained() -> None:
 @pytest.mark.parametrize(
     ("late_ns", "skipped"), [(-50, 0), (0, 0), (99, 0), (100, 1), (199, 1), (1000, 10), (1050, 10)]
 )
-def test_a_stall_skips_deadlines_and_keeps_the_phase(late_ns: int, skipped: int) -> None:
+def test_skips_missed_deadlines_and_keeps_the_phase(late_ns: int, skipped: int) -> None:
     assert skipped_deadlines(5_000, 5_000 + late_ns, 100) == skipped
 
 
-def test_a_stalled_ticker_counts_what_it_missed_and_does_not_burst() -> None:
+def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst() -> None:
     stalled, period_s = threading.Event(), 2e-3
 
     def action() -> None:
@@ -471,24 +471,24 @@ def test_a_stalled_ticker_counts_what_it_missed_and_does_not_burst() -> None:
     ticker, start_s = Ticker("motor", period_s, action), time.monotonic()
     ticker.run(lambda: False)
     assert ticker.stats.processed == 6
-    assert ticker.stats.dropped >= 23  # of those within the stall the newest is served
+    assert ticker.stats.dropped >= 23  # of the deadlines within the stall the newest is served
     assert ticker.stats.processed + ticker.stats.dropped <= (time.monotonic() - start_s) / period_s + 1
 
 
 @both
-def test_two_hundred_runs_leave_no_thread(threaded: bool) -> None:
+def test_runs_leave_no_thread(threaded: bool) -> None:
     before = threading.enumerate()
     for _ in range(200):
         graph, sink = Graph(threaded=threaded), Collect()
         graph.sink("sink", sink, graph.stage("sums", Sums(), graph.source("numbers", lambda: range(5))))
-        graph.ticker("beat", 1e-3, Beat(enough=1))
+        graph.ticker("action", 1e-3, Action(enough=1))
         graph.run()
         assert sink.got == [1, 5, 4, -1]
         assert threading.enumerate() == before
 
 
 @both
-def test_threads_are_named_after_their_boxes(threaded: bool) -> None:
+def test_threads_have_the_names_of_their_stages(threaded: bool) -> None:
     names: list[str] = []
     graph = Graph(threaded=threaded)
     where = Apply(lambda _: names.append(threading.current_thread().name))
@@ -498,7 +498,7 @@ def test_threads_are_named_after_their_boxes(threaded: bool) -> None:
 
 
 @both
-def test_a_slot_keeps_the_newest_as_a_sink(threaded: bool) -> None:
+def test_a_slot_as_a_sink_keeps_the_newest(threaded: bool) -> None:
     slot: Slot[int] = Slot()
     assert slot.get() is None
     graph = Graph(threaded=threaded)
@@ -509,7 +509,7 @@ def test_a_slot_keeps_the_newest_as_a_sink(threaded: bool) -> None:
     assert slot.get() == 3
 
 
-def test_a_run_may_live_outside_the_main_thread() -> None:
+def test_runs_outside_the_main_thread() -> None:
     graph, sink = Graph(), Collect()
     graph.sink("sink", sink, graph.source("numbers", lambda: range(3)))
     thread = threading.Thread(target=graph.run)
@@ -518,10 +518,10 @@ def test_a_run_may_live_outside_the_main_thread() -> None:
     assert sink.got == [0, 1, 2]
 
 
-def test_wrong_wiring_is_refused_in_one_line() -> None:
+def test_refuses_wrong_wiring() -> None:
     graph = Graph()
     numbers = graph.source("numbers", lambda: range(3))
-    with pytest.raises(OmnidError, match="'numbers': the name is taken"):
+    with pytest.raises(OmnidError, match="'numbers': the name is in use"):
         graph.sink("numbers", Collect(), numbers)
     with pytest.raises(OmnidError, match="expected inputs"):
         graph.sink("nothing", Collect())
@@ -529,7 +529,7 @@ def test_wrong_wiring_is_refused_in_one_line() -> None:
         graph.sink("narrow", Collect(), numbers, depth=0)
     for period_s in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(OmnidError, match="period above 0"):
-            graph.ticker("beat", period_s, print)
+            graph.ticker("action", period_s, print)
     graph.run()
     with pytest.raises(OmnidError, match="runs once"):
         graph.run()

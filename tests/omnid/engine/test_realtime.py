@@ -1,11 +1,12 @@
-"""Real-time rights: what is asked for is in force where it is allowed, and said, not raised, where it is not.
+"""Real-time settings take effect where the system allows them, and are reported, not raised, where it does not.
 
-Whatever changes the whole process is done in one of its own.
+Settings of the whole process are tested in a process of their own.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -17,7 +18,6 @@ from types import SimpleNamespace
 import pytest
 
 from omnid.engine.graph import Graph
-from omnid.engine.logging_setup import WARNING
 from omnid.engine.realtime import (
     LOCK_ADVICE,
     RealtimeSettings,
@@ -30,13 +30,14 @@ from omnid.engine.realtime import (
 )
 
 ROOT = Path(__file__).parents[3]
-NOBODY = 65534
+UNPRIVILEGED = 65534
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
 PREAMBLE = """
-from omnid.engine.malloc_settings import share_heap
+from omnid.engine.malloc_settings import use_one_malloc_arena
 import gc, json, os, resource, sys, threading, time
 from pathlib import Path
-from omnid.engine.realtime import RealtimeSettings, ThreadStart, limit_runs, lock_memory, prepare, raise_thread
+from omnid.engine.realtime import RealtimeSettings, ThreadStart, limit_realtime_runs, lock_memory, prepare
+from omnid.engine.realtime import set_realtime_priority
 def locked_kb():
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
@@ -45,46 +46,46 @@ WITHOUT_RIGHTS = f"""
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, 1 << 20))
 if os.getuid() == 0:
-    os.setgid({NOBODY}); os.setuid({NOBODY})
+    os.setgid({UNPRIVILEGED}); os.setuid({UNPRIVILEGED})
 """
 
 
 def process(script: str) -> subprocess.CompletedProcess[str]:
-    """What a process says that runs the script."""
+    """Run the script in a process of its own."""
     return subprocess.run([sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True,
                           timeout=60)
 
 
 def answer(script: str) -> SimpleNamespace:
-    """What it prints as JSON."""
+    """Return the JSON that the script prints."""
     done = process(script)
     assert done.returncode == 0, done.stderr
     return SimpleNamespace(**json.loads(done.stdout))
 
 
 def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
-    """Name and policy, for the kernel, of the threads of a graph: a source of this name and the sink that reads it."""
+    """Return kernel name and policy of the threads of a graph: a source of this name and its sink."""
     seen = {}
 
-    def look(whose: str) -> None:
+    def record(whose: str) -> None:
         task = Path(f"/proc/self/task/{threading.get_native_id()}")
         seen[whose] = (task.joinpath("comm").read_text().strip(), os.sched_getscheduler(0))
 
     def numbers() -> range:
-        look("source")
+        record("source")
         return range(1)
 
     graph = Graph(on_thread=start)
-    graph.sink("sink", SimpleNamespace(process=lambda number: look("sink")), graph.source(name, numbers))
+    graph.sink("sink", SimpleNamespace(process=lambda number: record("sink")), graph.source(name, numbers))
     graph.run()
     return seen
 
 
-def test_the_kernel_knows_the_threads_by_name() -> None:
+def test_threads_have_names_in_the_kernel() -> None:
     assert seen_in("lower", ThreadStart({})) == {"source": ("lower", os.SCHED_OTHER), "sink": ("sink", os.SCHED_OTHER)}
 
 
-def test_a_ticker_has_its_thread_too() -> None:
+def test_the_thread_of_a_ticker_has_its_name() -> None:
     graph, ticked = Graph(on_thread=ThreadStart({})), threading.Event()
     names: list[str] = []
 
@@ -98,7 +99,7 @@ def test_a_ticker_has_its_thread_too() -> None:
     assert set(names) == {"motor"}
 
 
-def test_a_long_name_is_cut() -> None:
+def test_cuts_a_long_name() -> None:
     thread = threading.Thread(target=lambda: (name_thread("a name of many letters"), names.append(comm())))
     names: list[str] = []
 
@@ -111,13 +112,13 @@ def test_a_long_name_is_cut() -> None:
 
 
 @allowed
-def test_only_the_named_thread_has_priority_and_does_not_pass_it_on() -> None:
+def test_only_the_named_thread_has_priority() -> None:
     seen = seen_in("lower", ThreadStart({"lower": 10}))
     assert seen == {"source": ("lower", os.SCHED_FIFO | os.SCHED_RESET_ON_FORK), "sink": ("sink", os.SCHED_OTHER)}
 
 
 @allowed
-def test_priorities_are_those_of_the_configuration() -> None:
+def test_priorities_come_from_the_configuration_and_are_not_inherited() -> None:
     assert priorities(RealtimeSettings(capture_priority=7), "lower", "upper") == {"lower": 7, "upper": 7}
     script = """
 def motor():
@@ -132,44 +133,44 @@ print(json.dumps(found))
     assert vars(answer(script)) == {"main": os.SCHED_OTHER, "own": 18, "child": os.SCHED_OTHER}
 
 
-def test_without_the_right_the_threads_go_on_and_it_is_said_once_with_what_to_do() -> None:
+def test_reports_a_refused_priority_once_with_advice() -> None:
     done = answer(WITHOUT_RIGHTS + """
-said = []
-start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: said.append(words))
+reported = []
+start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: reported.append(words))
 for name in ("motor", "lower", "stereo"):
     start(name)
-print(json.dumps({"said": said, "policy": os.sched_getscheduler(0)}))
+print(json.dumps({"reported": reported, "policy": os.sched_getscheduler(0)}))
 """)
-    ((priority, text),) = done.said
-    assert priority == WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
+    ((priority, text),) = done.reported
+    assert priority == logging.WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
     assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
 
 
-def test_under_a_limit_memory_is_not_locked_and_grows_freely() -> None:
+def test_does_not_lock_memory_under_a_limit() -> None:
     done = answer(WITHOUT_RIGHTS + """
-said = lock_memory()
+reported = lock_memory()
 grown = len(bytearray(50 << 20))
-print(json.dumps({"said": said, "locked": locked_kb()}))
+print(json.dumps({"reported": reported, "locked": locked_kb()}))
 """)
-    assert done.said.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # it is not even tried
+    assert done.reported.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # not even tried
 
 
 @pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
-def test_all_memory_is_locked_without_being_filled() -> None:
+def test_locks_memory_without_allocating_it() -> None:
     done = answer("""
 import cv2
 before = locked_kb()
-said = lock_memory()
+reported = lock_memory()
 room = bytearray(8 << 20)
 lines = Path("/proc/self/status").read_text().splitlines()
 resident = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
-print(json.dumps({"said": said, "before": before, "locked": locked_kb(), "resident": resident}))
+print(json.dumps({"reported": reported, "before": before, "locked": locked_kb(), "resident": resident}))
 """)
-    assert done.said == "" and done.before == 0
+    assert done.reported == "" and done.before == 0
     assert done.locked > 100_000 and done.resident < done.locked / 2  # stacks of OpenCV's threads, never touched
 
 
-def test_python_is_prepared() -> None:
+def test_prepare_applies_the_settings() -> None:
     done = answer("""
 refused = prepare(RealtimeSettings(lock_memory=False, switch_interval_ms=2.0, longest_run_ms=300))
 print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinterval(), "refused": refused,
@@ -179,7 +180,7 @@ print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinte
     assert (done.switch_s, done.run) == (pytest.approx(2e-3), 300_000)
 
 
-def test_what_is_not_wanted_stays_as_it_is() -> None:
+def test_prepare_leaves_disabled_settings_unchanged() -> None:
     done = answer("""
 before = sys.getswitchinterval()
 refused = prepare(RealtimeSettings(False, False, 0.0, 0, 0, 0))
@@ -190,20 +191,20 @@ print(json.dumps({"frozen": gc.get_freeze_count(), "same": before == sys.getswit
     assert done.run[0] == done.run[1]
 
 
-def test_a_stricter_limit_of_whoever_started_us_holds() -> None:
+def test_keeps_a_stricter_limit_of_the_parent_process() -> None:
     done = answer("""
 resource.setrlimit(resource.RLIMIT_RTTIME, (1000, 2000))
-limit_runs(500)
+limit_realtime_runs(500)
 print(json.dumps({"run": resource.getrlimit(resource.RLIMIT_RTTIME)}))
 """)
     assert done.run == [1000, 2000]
 
 
 @allowed
-def test_a_real_time_thread_that_runs_on_ends_the_daemon() -> None:
+def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
     done = process("""
-limit_runs(50)
-assert raise_thread(10)
+limit_realtime_runs(50)
+assert set_realtime_priority(10)
 until_s = time.monotonic() + 20
 while time.monotonic() < until_s:
     pass
@@ -211,13 +212,13 @@ while time.monotonic() < until_s:
     assert done.returncode == -signal.SIGXCPU
 
 
-def test_capabilities_are_read() -> None:
+def test_reads_capabilities() -> None:
     mask = next(int(line.split()[1], 16) for line in Path("/proc/self/status").read_text().splitlines()
                 if line.startswith("CapEff"))
     assert [has_capability(number) for number in range(41)] == [bool(mask >> number & 1) for number in range(41)]
 
 
-GLUTTON = """
+ALLOCATING_THREAD = """
 def resident_mb():
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
@@ -232,6 +233,6 @@ print(json.dumps({"kept_mb": resident_mb() - before}))
 
 
 @pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
-def test_what_a_thread_has_given_back_goes_back_to_the_kernel_though_memory_is_locked() -> None:
-    """42 MB; a heap of the thread's own keeps them."""
-    assert answer("share_heap()" + GLUTTON).kept_mb < 10
+def test_freed_memory_of_a_thread_returns_to_the_kernel_though_locked() -> None:
+    """The thread frees 42 MB, which a malloc arena of its own would keep."""
+    assert answer("use_one_malloc_arena()" + ALLOCATING_THREAD).kept_mb < 10

@@ -1,4 +1,4 @@
-"""Telemetry: quantiles within two per cent in constant memory, and honest counters."""
+"""Telemetry: quantiles within 2 % in constant memory, counters of stages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnid.errors import OmnidError
 
 
 @pytest.mark.parametrize("duration_s", np.geomspace(1.001e-6, 999.0, 200).tolist())
-def test_a_quantile_is_within_two_per_cent_over_nine_decades(duration_s: float) -> None:
+def test_quantiles_are_within_two_per_cent_over_nine_decades(duration_s: float) -> None:
     histogram = Histogram()
     for value_s in (duration_s, duration_s, 1e4):
         histogram.add(value_s)
@@ -34,7 +34,7 @@ def test_quantiles_agree_with_sorting() -> None:
     assert histogram.count == 5000
 
 
-def test_what_is_out_of_range_is_counted_too() -> None:
+def test_counts_durations_out_of_range() -> None:
     histogram = Histogram()
     for duration_s in (0.0, 1e-9, 1e9, math.inf):
         histogram.add(duration_s)
@@ -44,18 +44,18 @@ def test_what_is_out_of_range_is_counted_too() -> None:
     assert histogram.p(1.0) == math.inf
 
 
-def test_an_empty_histogram_knows_nothing() -> None:
+def test_an_empty_histogram_returns_nan() -> None:
     histogram = Histogram()
     assert all(math.isnan(value) for value in (histogram.p(0.5), histogram.mean_s, histogram.max_s))
 
 
 @pytest.mark.parametrize("q", [-0.1, 1.1, 99, math.nan])
-def test_a_quantile_is_a_fraction(q: float) -> None:
+def test_refuses_a_quantile_that_is_no_fraction(q: float) -> None:
     with pytest.raises(ValueError, match="fraction"):
         Histogram().p(q)
 
 
-def test_the_memory_does_not_grow() -> None:
+def test_memory_is_constant() -> None:
     histogram = Histogram()
     before = sys.getsizeof(histogram._bins)
     for k in range(10_000):
@@ -63,27 +63,27 @@ def test_the_memory_does_not_grow() -> None:
     assert sys.getsizeof(histogram._bins) == before < 10_000
 
 
-def test_work_is_counted_in_wall_and_thread_time() -> None:
+def test_measures_wall_and_thread_time() -> None:
     stats = StageStats("sleep")
     assert stats.timed(lambda seconds: threading.Event().wait(seconds), 0.02) is False
     assert stats.processed == stats.wall.count == stats.cpu.count == 1
     assert stats.wall.max_s > stats.cpu.max_s  # a wait costs time but no work
 
 
-def test_a_call_that_raises_is_not_counted() -> None:
+def test_does_not_count_a_call_that_raises() -> None:
     stats = StageStats("broken")
     with pytest.raises(ZeroDivisionError):
         stats.timed(lambda: 1 / 0)
     assert stats.processed == stats.wall.count == 0
 
 
-def test_every_message_of_a_source_is_counted_and_its_end_is_not() -> None:
+def test_counts_the_messages_of_a_source_without_its_end() -> None:
     stats = StageStats("source")
     assert list(stats.timed_each("abc")) == ["a", "b", "c"]
     assert stats.processed == stats.wall.count == 3
 
 
-def test_the_summary_has_a_row_per_stage_in_milliseconds() -> None:
+def test_summary_has_a_row_per_stage_in_milliseconds() -> None:
     telemetry = Telemetry()
     stats = telemetry.add(StageStats("stereo", processed=2, dropped=1))
     telemetry.add(StageStats("idle"))
@@ -96,7 +96,7 @@ def test_the_summary_has_a_row_per_stage_in_milliseconds() -> None:
     assert all(map(math.isnan, idle[3:]))
 
 
-def test_a_name_is_given_once() -> None:
+def test_refuses_a_name_in_use() -> None:
     telemetry = Telemetry()
     telemetry.add(StageStats("stereo"))
     with pytest.raises(OmnidError, match="stereo"):
