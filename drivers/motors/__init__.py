@@ -1,1 +1,1 @@
-"""Motor controllers behind a serial port."""
+"""Motor controllers on serial ports, real and simulated."""

@@ -1,4 +1,4 @@
-"""The wheels of a base with two driven sides: forward speed and yaw rate <-> wheel speeds <-> controllers' units."""
+"""Kinematics and wiring of a base with two driven sides: forward velocity and yaw rate <-> channel speeds."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ _SIZES = ("track_m", "wheel_radius_m", "max_wheel_mps", "gear", "ticks_per_turn"
 class DifferentialDrive:
     """Geometry and wiring. A controller's channels are its motors in its own order and sense of rotation.
 
-    The track of a base that skids (four wheels, tracks) is the one that makes its measured turns right.
+    For a base that skids (four wheels, tracks) the effective track is needed: the one that fits measured turns.
     """
 
-    track_m: float = 0.3  # between the left and the right wheels
+    track_m: float = 0.3  # distance between the left and the right wheels
     wheel_radius_m: float = 0.05
-    max_wheel_mps: float = 1.0  # no wheel is told to roll faster
-    gear: float = 1.0  # turns of the motor for one of the wheel
-    ticks_per_turn: float = 1000.0  # of the encoder, for one turn of the motor
+    max_wheel_mps: float = 1.0  # limit of every wheel speed command
+    gear: float = 1.0  # turns of the motor per turn of the wheel
+    ticks_per_turn: float = 1000.0  # of the encoder, per turn of the motor
     pole_pairs: int = 7  # of the motor
     reverse_left: bool = False
     reverse_right: bool = False
     swapped: bool = False  # channel 1 is the right wheel
-    can_id: int = 1  # of the controller of channel 2 where each motor has its own
+    can_id: int = 1  # of the controller of channel 2, where each motor has its own
 
     def __post_init__(self) -> None:
-        """DriverError for a size that is not finite and above 0."""
+        """Raise DriverError for a size that is not finite and above 0."""
         for name in _SIZES:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -38,13 +38,14 @@ class DifferentialDrive:
 
     @property
     def turns_per_m(self) -> float:
-        """Turns of a motor for a metre of its wheel."""
+        """Turns of a motor per metre of its wheel."""
         return self.gear / (math.tau * self.wheel_radius_m)
 
     def limited(self, command: VelocityCommand, max_wheel_mps: float = math.inf) -> tuple[float, float]:
-        """The command's speed [m/s] and yaw rate [rad/s], both scaled alike where a wheel would be too fast.
+        """Return velocity [m/s] and yaw rate [rad/s], scaled by one factor where a wheel would be too fast.
 
-        DriverError for numbers that are not finite.
+        max_wheel_mps: limit of the protocol, besides the one of this drive. Raises DriverError for numbers that are
+        not finite.
         """
         _require_finite(command)
         fastest_mps = abs(command.velocity_mps) + abs(command.yaw_rate_radps) * self.track_m / 2
@@ -52,23 +53,23 @@ class DifferentialDrive:
         return command.velocity_mps * scale, command.yaw_rate_radps * scale
 
     def channels(self, command: VelocityCommand, max_wheel_mps: float = math.inf) -> tuple[float, float]:
-        """The command as the speeds of the channels [m/s], limited with the curvature kept."""
+        """Return the speeds of the two channels [m/s], limited as by `limited`, which keeps the curvature."""
         velocity_mps, yaw_rate_radps = self.limited(command, max_wheel_mps)
         half_mps = yaw_rate_radps * self.track_m / 2
-        return self._wired(velocity_mps - half_mps, velocity_mps + half_mps)
+        return self.to_channels(velocity_mps - half_mps, velocity_mps + half_mps)
 
     def motion(self, first_mps: float, second_mps: float) -> tuple[float, float]:
-        """Speed [m/s] and yaw rate [rad/s] of the base from the measured speeds of the channels."""
-        left_mps, right_mps = self.sides(first_mps, second_mps)
+        """Return velocity [m/s] and yaw rate [rad/s] of the base from the measured speeds of the channels."""
+        left_mps, right_mps = self.to_sides(first_mps, second_mps)
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.track_m
 
-    def sides(self, first: float, second: float) -> tuple[float, float]:
-        """What belongs to the left and to the right wheel, forward positive, of what the channels say."""
+    def to_sides(self, first: float, second: float) -> tuple[float, float]:
+        """Return the values of the left and the right wheel, forward positive, from those of the channels."""
         left, right = (second, first) if self.swapped else (first, second)
         return -left if self.reverse_left else left, -right if self.reverse_right else right
 
-    def _wired(self, left: float, right: float) -> tuple[float, float]:
-        """The inverse of `sides`."""
+    def to_channels(self, left: float, right: float) -> tuple[float, float]:
+        """Return the values of the channels from those of the wheels: the inverse of `to_sides`."""
         left, right = -left if self.reverse_left else left, -right if self.reverse_right else right
         return (right, left) if self.swapped else (left, right)
 

@@ -1,8 +1,8 @@
-"""What a controller's protocol is to the driver of the port: frames, and scripts of what to write and what comes back.
+"""Interface between the driver of a serial port and the protocol of a controller: frames and transactions.
 
-A protocol does no I/O. It is written as scripts, generators that yield the bytes to write (none: only listen), are
-sent the next whole frame each time, and return what they were after. The driver runs a script within a deadline, so a
-script simply goes on until it has heard what it wants and never counts its waits:
+A protocol does no I/O. It consists of transactions: generators that yield the bytes to write (none: only wait), are
+sent the next complete frame each time, and return the result. The driver runs a transaction up to a deadline;
+the transaction itself waits without a limit:
 
     def connect(self, watchdog_ms):
         frame = yield b"^RWD %d\\r" % watchdog_ms
@@ -23,83 +23,90 @@ Transaction: TypeAlias = Generator[bytes, bytes, T]
 
 
 class Framer(Protocol):
-    """Whole frames out of a byte stream in any pieces, in bounded memory."""
+    """Splits a byte stream, received in pieces of any size, into frames; needs bounded memory."""
 
-    garbage: int  # bytes that belonged to no whole frame
+    garbage: int  # bytes that belonged to no complete frame
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The frames that end in data."""
+        """Return the frames that end in data."""
 
     def reset(self) -> None:
-        """Forgets the piece of a frame that is in hand."""
+        """Discard the incomplete frame."""
 
 
 class MotorProtocol(Protocol):
-    """Commands <-> bytes of one kind of controller; one object for one connection."""
+    """Commands <-> bytes of one kind of controller; one object serves one connection."""
 
-    baud: int  # the controller's own default
-    bad_frames: int  # frames that made no sense
+    baud: int  # default of the controller
+    bad_frames: int  # complete frames that could not be decoded
 
     def framer(self) -> Framer:
-        """A new one for its answers."""
+        """Return a new framer for the controller's replies."""
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
-        """Prepares the controller, has it stop by itself after watchdog_ms, and gives the time in force [ms].
+        """Set up the controller and its watchdog, and return the watchdog's time in force [ms].
 
-        DriverError where it does not.
+        Raises DriverError where the controller does not take the settings.
         """
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """Hands a command over; now_s is any steady clock. DriverError for a command that it refuses."""
+        """Send a command and return the status; raise DriverError for a command that the controller rejects.
+
+        now_s: time of any monotonic clock.
+        """
 
 
 def request(data: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
-    """Writes data and gives the first frame that parse knows."""
+    """Write data and return the first frame that parse accepts (does not return None for)."""
     frame = yield data
     while (found := parse(frame)) is None:
         frame = yield b""
     return found
 
 
-def require_watchdog(asked_ms: int, in_force_ms: float) -> None:
-    """DriverError unless the controller took the time that it was asked for."""
-    if round(in_force_ms) != asked_ms:
-        raise DriverError(f"watchdog of {asked_ms} ms asked, {in_force_ms:g} ms in force; ask for another")
+def require_watchdog(requested_ms: int, in_force_ms: float) -> None:
+    """Raise DriverError unless the requested watchdog time is in force."""
+    if round(in_force_ms) != requested_ms:
+        raise DriverError(f"watchdog of {requested_ms} ms requested, {in_force_ms:g} ms in force; "
+                          "set another motor.watchdog_ms")
 
 
 class TextFramer:
-    """Lines that end in CR or LF, without their end and without empty ones; one longer than `longest` is garbage."""
+    """Splits text into lines that end in CR or LF; returns them without the end, and drops empty ones.
 
-    def __init__(self, longest: int = 256) -> None:
+    max_line: a longer line is garbage [bytes].
+    """
+
+    def __init__(self, max_line: int = 256) -> None:
         self.garbage = 0
-        self._longest, self._line, self._lost = longest, bytearray(), False
+        self._max_line, self._line, self._overflow = max_line, bytearray(), False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that end in data."""
+        """Return the lines that end in data."""
         lines = []
         for byte in data:
             if byte in b"\r\n":
-                lines += self._ended()
-            elif self._lost or len(self._line) >= self._longest:
-                self._lose()
+                lines += self._end_line()
+            elif self._overflow or len(self._line) >= self._max_line:
+                self._skip_byte()
             else:
                 self._line.append(byte)
         return lines
 
     def reset(self) -> None:
-        """Forgets the line in hand."""
+        """Discard the incomplete line."""
         self.garbage += len(self._line)
         self._line.clear()
-        self._lost = False
+        self._overflow = False
 
-    def _ended(self) -> list[bytes]:
+    def _end_line(self) -> list[bytes]:
         line = [bytes(self._line)] if self._line else []
         self._line.clear()
-        self._lost = False
+        self._overflow = False
         return line
 
-    def _lose(self) -> None:
-        """The rest of a line that is too long is no line either."""
+    def _skip_byte(self) -> None:
+        """Count a byte of a line that is too long, and what was kept of that line, as garbage."""
         self.garbage += len(self._line) + 1
         self._line.clear()
-        self._lost = True
+        self._overflow = True

@@ -1,4 +1,4 @@
-"""A motor controller behind a serial port, whatever its protocol."""
+"""Driver of a motor controller on a serial port, for any protocol."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import termios
 import time
 from dataclasses import replace
+from typing import Final
 
 import serial  # type: ignore[import-untyped]
 
@@ -18,13 +19,13 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import MotorProtocol, T, Transaction
 from drivers.motors.protocols.line_protocol import LineProtocol
 
-CONNECT_TRY_S = 0.2
-STOPS_AT_CLOSE = 3
-READ_LIMIT_BYTES = 4096
-LOOK_S = 0.001  # between two looks at whether an answer has come
-STALE_SHARE = 0.5  # of the watchdog's time: later than that the controller may have stopped before a command arrives
-FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 5.0
+CONNECT_TRY_S: Final = 0.2
+STOPS_AT_CLOSE: Final = 3  # tries
+READ_LIMIT_BYTES: Final = 4096
+POLL_PERIOD_S: Final = 0.001  # between two checks for received bytes
+FRESH_SHARE: Final = 0.5  # of the watchdog's time; after a longer pause it may expire before a command arrives
+FIRST_WAIT_S: Final = 0.2  # between two tries to open the port; doubles with each try
+LONGEST_WAIT_S: Final = 5.0
 _REASONS = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
@@ -34,22 +35,23 @@ _REASONS = {
 
 
 class NoReplyError(DriverError):
-    """No answer within the time; the port is still there."""
+    """No reply before the timeout, from a port that is still there."""
 
 
 class LateReplyError(NoReplyError):
-    """No answer within the time, but the last one is so young that the controller's watchdog cannot have expired."""
+    """No reply before the timeout, but the last one is so recent that the controller's watchdog cannot have expired."""
 
 
 class SerialMotor:
-    """The base on `port`, for this program alone.
+    """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, and for the opening of the port where that was gone; `close` for STOPS_AT_CLOSE
-    times that. A command is told once: who sends at a rate sends the next one anyway. An answer that is Late does no
-    harm. After any other error, a silence in which the controller's watchdog may have expired, or a new connection, the
-    first thing told is an explicit stop, whatever was asked: the status then says watchdog_expired, and the next
-    command drives. A port that is gone is opened again by a later `send`, with growing waits in between, in which
-    `send` fails at once.
+    `send` blocks for at most timeout_s, plus the time to open the port where it was gone; `close` for STOPS_AT_CLOSE
+    times timeout_s. A command is sent once and never repeated: the caller sends the next one at its own rate.
+
+    After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
+    watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
+    status with watchdog_expired; the command after it drives. A port that is gone is opened again by a later `send`,
+    with growing waits, during which `send` fails at once.
     """
 
     def __init__(
@@ -62,15 +64,15 @@ class SerialMotor:
         watchdog_ms: int = 500,
         connect_s: float = 3.0,
     ) -> None:
-        """Opens the port and has the controller stop by itself after watchdog_ms; DriverError where it does not.
+        """Open the port and set the controller's watchdog; raise DriverError where either fails.
 
-        protocol: the line protocol where none is given. baud: 0 is the protocol's own.
-        connect_s: some boards restart when their port is opened and stay silent for seconds.
+        protocol: default is the line protocol. baud: 0 is the protocol's default. connect_s: time for the first
+        reply; some boards restart when their port is opened and do not reply for seconds.
         """
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
         self.errors = 0  # calls of `send` that failed
-        self.replaced_by_stop = 0  # commands in place of which a stop was told
+        self.replaced_by_stop = 0  # commands in place of which a stop was sent
         self.connections = 0
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
@@ -79,38 +81,42 @@ class SerialMotor:
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
         self._stop_first = True
-        self._heard_s = -math.inf  # when the last command that was answered had been begun
-        self._patience_s = 0.0  # silence in which the watchdog cannot have expired
+        self._last_sent_s = -math.inf  # start of the last command that got a reply
+        self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
         self._connect(connect_s)
 
     @property
     def garbage(self) -> int:
-        """Bytes received that belonged to no whole frame."""
+        """Received bytes that belonged to no complete frame."""
         return self._framer.garbage
 
     @property
     def bad_frames(self) -> int:
-        """Frames received that made no sense."""
+        """Received frames that could not be decoded."""
         return self._protocol.bad_frames
 
     def send(self, command: VelocityCommand) -> MotorStatus:
-        """Hands the command over and gives the controller's answer; DriverError when it stays silent or is gone."""
+        """Send a command and return the controller's status.
+
+        Raises LateReplyError or NoReplyError at the timeout, DriverError where the port is gone or the command is
+        rejected.
+        """
         try:
-            return self._sent(command, time.monotonic() + self._timeout_s)
+            return self._send(command, time.monotonic() + self._timeout_s)
         except DriverError as error:
             self.errors += 1
-            if isinstance(error, NoReplyError) and self._surely_drives():
+            if isinstance(error, NoReplyError) and self._watchdog_alive():
                 raise LateReplyError(str(error)) from None
             self._stop_first = True
             raise
 
-    def _surely_drives(self) -> bool:
-        """Whether the controller cannot have stopped by itself by now."""
-        return self._armed and not self._stop_first and time.monotonic() - self._heard_s <= self._patience_s
+    def _watchdog_alive(self) -> bool:
+        """True if the controller's watchdog cannot have expired by now."""
+        return self._armed and not self._stop_first and time.monotonic() - self._last_sent_s <= self._fresh_s
 
     def close(self) -> None:
-        """Stops the wheels as well as it can and releases the port; a second call does nothing."""
+        """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
         self._closed = True
         with contextlib.suppress(DriverError):
             for _ in range(STOPS_AT_CLOSE):
@@ -118,16 +124,16 @@ class SerialMotor:
                     break
         self._release()
 
-    def _sent(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
+    def _send(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
         if self._port is None:
             self._open()
         if not self._armed:
             self._arm(deadline_s)
         now_s = time.monotonic()
-        stopping = self._stop_first or now_s - self._heard_s > self._patience_s
-        told = stop_command(command.stamp_ns) if stopping else command
-        status = self._run(self._protocol.drive(told, now_s), deadline_s)
-        self._heard_s = now_s
+        stopping = self._stop_first or now_s - self._last_sent_s > self._fresh_s
+        sent = stop_command(command.stamp_ns) if stopping else command
+        status = self._run(self._protocol.drive(sent, now_s), deadline_s)
+        self._last_sent_s = now_s
         self._stop_first = status.watchdog_expired
         if is_stop(command) or not stopping:
             return status
@@ -135,7 +141,7 @@ class SerialMotor:
         return replace(status, watchdog_expired=True)
 
     def _connect(self, connect_s: float) -> None:
-        """The first connection may take its time: nothing moves yet."""
+        """Open the port and send stops until one gets a reply; raise DriverError after connect_s."""
         deadline_s = time.monotonic() + connect_s
         self._open()
         try:
@@ -146,9 +152,9 @@ class SerialMotor:
             raise
 
     def _try_to_stop(self, deadline_s: float) -> None:
-        """Silence is borne until the deadline; the last try may go on past it."""
+        """Send one stop; ignore a missing reply before the deadline. The last try may end after it."""
         try:
-            self._sent(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            self._send(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
         except NoReplyError:
             if time.monotonic() >= deadline_s:
                 raise
@@ -159,7 +165,7 @@ class SerialMotor:
     def _arm(self, deadline_s: float) -> None:
         self._stop_first = True
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
-        self._patience_s = STALE_SHARE * in_force_ms / 1000
+        self._fresh_s = FRESH_SHARE * in_force_ms / 1000
         self._armed, self._wait_s = True, FIRST_WAIT_S
         self.connections += 1
 
@@ -170,7 +176,7 @@ class SerialMotor:
         return False
 
     def _open(self) -> None:
-        """DriverError where it is not yet time to try again, or the port cannot be had."""
+        """Open the port; raise DriverError before the time of the next try, and where it cannot be opened."""
         if self._closed:
             raise DriverError(f"motor on {self._name} is closed; make a new one")
         wait_s = self._next_open_s - time.monotonic()
@@ -187,10 +193,14 @@ class SerialMotor:
                 port.close()
 
     def _run(self, transaction: Transaction[T], deadline_s: float) -> T:
-        """What a script returns; Silence at the deadline, after a last look at what a late thread finds waiting."""
-        request = self._framer.garbage + self._protocol.bad_frames
+        """Run a transaction and return its result.
+
+        Raises NoReplyError after the deadline. The input is read once more after it, since a thread that was delayed
+        may find a reply waiting that came in time.
+        """
+        invalid_before = self._framer.garbage + self._protocol.bad_frames
         try:
-            self._forget_input()
+            self._discard_input()
             self._write(next(transaction))
             overdue = False
             while not overdue:
@@ -202,21 +212,23 @@ class SerialMotor:
             result: T = done.value
             return result
         except NoReplyError:
-            raise self._silence(self._framer.garbage + self._protocol.bad_frames - request) from None
+            invalid = self._framer.garbage + self._protocol.bad_frames - invalid_before
+            raise self._no_reply(invalid) from None
         except DriverError as error:
             raise DriverError(f"motor on {self._name}: {error}") from None
         except (OSError, termios.error) as error:
             self._release()
-            raise DriverError(f"motor on {self._name} is gone ({_line(error)}); plug it in again") from None
+            raise DriverError(f"motor on {self._name} is gone ({_one_line(error)}); plug it in again") from None
 
-    def _forget_input(self) -> None:
-        """Answers to earlier commands are nobody's."""
+    def _discard_input(self) -> None:
+        """Discard replies to earlier commands."""
         self._framer.reset()
         if self._port is not None:
             self._port.reset_input_buffer()
 
     def _write(self, data: bytes) -> None:
-        """All of it at once, or none of it counts: a port that takes no more has nobody who reads."""
+        """Write all data at once; raise NoReplyError where the output buffer is full, as the other end does not read.
+        """
         if data and self._port is not None:
             try:
                 if os.write(self._port.fileno(), data) < len(data):
@@ -225,10 +237,10 @@ class SerialMotor:
                 raise NoReplyError from None
 
     def _read(self, deadline_s: float) -> bytes:
-        """What has arrived, or arrives until the deadline.
+        """Return the bytes received up to now, or the first ones before the deadline, b"" without any.
 
-        It is looked for again and again: whoever waits for a terminal, by select or a read, waits for a thread of the
-        kernel that has no priority, on a busy machine far beyond any timeout.
+        Polls, since select and a blocking read on a terminal wait for a kernel thread without priority: on a busy
+        machine that takes far longer than any timeout.
         """
         if self._port is None:
             raise NoReplyError
@@ -236,11 +248,12 @@ class SerialMotor:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 return b""
-            time.sleep(min(left_s, LOOK_S))
+            time.sleep(min(left_s, POLL_PERIOD_S))
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
-    def _silence(self, nonsense: int) -> NoReplyError:
-        if nonsense:
+    def _no_reply(self, invalid: int) -> NoReplyError:
+        """Return the error for a missing reply; invalid: received bytes and frames that could not be decoded."""
+        if invalid:
             return NoReplyError(
                 f"motor on {self._name} answers, but not in its protocol; check motor.protocol, the baud rate "
                 f"({self._baud}) and the cable"
@@ -251,15 +264,16 @@ class SerialMotor:
 
 
 def _opened(port: str, baud: int) -> serial.Serial:
-    """The port, for this program alone; reads and writes do not wait."""
+    """Open the port for exclusive, non-blocking use; raise DriverError where it cannot be opened."""
     try:
         return serial.Serial(port, baud, timeout=0, exclusive=True)
     except (OSError, ValueError, termios.error) as error:
         reason = _REASONS.get(getattr(error, "errno", None) or 0)
         raise DriverError(
-            f"motor port {port!r} at {baud} baud cannot be opened: {reason or _line(error) + '; is it a serial port?'}"
+            f"motor port {port!r} at {baud} baud cannot be opened: "
+            f"{reason or _one_line(error) + '; is it a serial port?'}"
         ) from None
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())

@@ -1,4 +1,4 @@
-"""A controller's protocol and its twin, over a real pty or without one."""
+"""A controller's protocol and its simulation, connected by a real pty or directly."""
 
 from __future__ import annotations
 
@@ -17,51 +17,52 @@ from drivers.motors.simulated.simulated_motor import SimulatedController, Simula
 from drivers.motors.simulated.simulated_vesc import SimulatedVesc
 
 NAMES = sorted(PROTOCOLS)
-PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing is measured against it
-ANSWER_S = 2.0
+PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
+REPLY_S = 2.0
 LONG_MS = 10_000
 BASE = DifferentialDrive(track_m=0.4, wheel_radius_m=0.08, max_wheel_mps=1.0, gear=12.0, ticks_per_turn=300.0)
 INSTANT = MotionLimits(acceleration_mps2=1e4, yaw_acceleration_radps2=1e5)
 
 
 def controller_of(name: str, drive: DifferentialDrive = BASE, watchdog_ms: int = LONG_MS) -> SimulatedController:
-    """The twin; it follows the yaw rate even where it could steer to a heading."""
+    """Return the simulated controller; it follows the yaw rate even where it could steer to a heading."""
     if name == "vesc":
         return SimulatedVesc(drive, watchdog_ms)
     return SimulatedLine(drive, heading_input=False) if name == "line" else SIMULATED_CONTROLLERS[name](drive)
 
 
 def shortest_watchdog_ms(name: str) -> int:
-    """What can be asked of the controller and is soon over."""
+    """Return a short watchdog time that the controller accepts."""
     return 2000 if name == "ros_arduino_bridge" else 100
 
 
-def answer(script: Transaction[T], controller: SimulatedController, framer: Framer) -> T:
-    """What a script returns that talks to a twin directly."""
+def run(transaction: Transaction[T], controller: SimulatedController, framer: Framer) -> T:
+    """Run a transaction with a simulated controller and return its result."""
     try:
-        data = next(script)
+        data = next(transaction)
         while True:
             frames = framer.feed(controller.feed(data))
-            assert frames, "the twin has nothing to say to it"
-            data = b"".join([script.send(frame) for frame in frames])
+            assert frames, "the simulated controller does not reply"
+            data = b"".join([transaction.send(frame) for frame in frames])
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
 
 
 @contextlib.contextmanager
 def connected_motor(
-    name: str, drive: DifferentialDrive = BASE, *, watchdog_ms: int = LONG_MS, timeout_s: float = ANSWER_S
+    name: str, drive: DifferentialDrive = BASE, *, watchdog_ms: int = LONG_MS, timeout_s: float = REPLY_S
 ) -> Iterator[tuple[SerialMotor, SimulatedMotor]]:
-    """Both ends of a pty, connected."""
-    with contextlib.closing(SimulatedMotor(controller_of(name, drive, watchdog_ms))) as twin:
+    """Yield a driver and the simulated motor that it is connected to."""
+    with contextlib.closing(SimulatedMotor(controller_of(name, drive, watchdog_ms))) as simulated:
         protocol = PROTOCOLS[name](drive)
-        motor = SerialMotor(twin.port, protocol, timeout_s=timeout_s, watchdog_ms=watchdog_ms, connect_s=PATIENCE_S)
+        motor = SerialMotor(simulated.port, protocol, timeout_s=timeout_s, watchdog_ms=watchdog_ms,
+                            connect_s=PATIENCE_S)  # fmt: skip
         with contextlib.closing(motor):
-            yield motor, twin
+            yield motor, simulated
 
 
 def until(condition: Callable[[], bool]) -> bool:
-    """Waits for a condition and gives whether it came."""
+    """Wait for a condition; False if it is not met in time."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         if condition():

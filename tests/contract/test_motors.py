@@ -1,4 +1,4 @@
-"""What every motor owes its user, over real ptys: it drives, it stops, and no fault of the line moves the wheels."""
+"""Requirements on every motor driver, tested over real ptys: it drives, it stops, and no fault moves the wheels."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from tests.contract.simulated_motors import (
-    ANSWER_S,
     BASE,
     INSTANT,
     LONG_MS,
     NAMES,
     PATIENCE_S,
+    REPLY_S,
     connected_motor,
     controller_of,
     shortest_watchdog_ms,
@@ -34,135 +34,136 @@ SHORT_S = 0.05
 
 @pytest.mark.parametrize("name", NAMES)
 def test_drives_turns_and_stops(name: str) -> None:
-    with connected_motor(name) as (motor, twin):
-        twin.base.limits = INSTANT
-        assert until(lambda: motor.send(ARC).watchdog_expired or twin.pose[2] > 0.5)
-        x_m, y_m, heading_rad = twin.pose
+    with connected_motor(name) as (motor, simulated):
+        simulated.base.limits = INSTANT
+        assert until(lambda: motor.send(ARC).watchdog_expired or simulated.pose[2] > 0.5)
+        x_m, y_m, heading_rad = simulated.pose
         assert ((x_m**2 + (y_m - 0.8) ** 2) ** 0.5) == pytest.approx(0.8, rel=0.02)  # a circle of v / w = 0.8 m
-        assert twin.base.velocity_mps == pytest.approx(0.72, rel=0.02)
-        assert until(lambda: paced(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
-        assert twin.pose[2] >= heading_rad
+        assert simulated.base.velocity_mps == pytest.approx(0.72, rel=0.02)
+        assert until(lambda: delayed(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
+        assert simulated.pose[2] >= heading_rad
         motor.send(stop_command(0))
-        assert until(lambda: twin.base.velocity_mps == twin.base.yaw_rate_radps == 0.0)
-        assert twin.errors == 0 and motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
+        assert until(lambda: simulated.base.velocity_mps == simulated.base.yaw_rate_radps == 0.0)
+        assert simulated.errors == motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_close_stops_the_wheels(name: str) -> None:
-    with connected_motor(name) as (motor, twin):
+    with connected_motor(name) as (motor, simulated):
         motor.send(FORWARD)
-        assert twin.base.commanded_mps != [0.0, 0.0]
+        assert simulated.base.commanded_mps != [0.0, 0.0]
         motor.close()
         motor.close()
-        assert twin.base.commanded_mps == [0.0, 0.0] and not twin.watchdog_expired and twin.errors == 0
+        assert simulated.base.commanded_mps == [0.0, 0.0] and not simulated.watchdog_expired and simulated.errors == 0
         with pytest.raises(DriverError, match="is closed"):
             motor.send(FORWARD)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_silent_host_is_stopped_and_a_zero_comes_before_motion(name: str) -> None:
+def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) -> None:
     watchdog_ms = shortest_watchdog_ms(name)
-    with connected_motor(name, watchdog_ms=watchdog_ms) as (motor, twin):
+    with connected_motor(name, watchdog_ms=watchdog_ms) as (motor, simulated):
         motor.send(stop_command(0))
         motor.send(FORWARD)
-        assert until(lambda: twin.watchdog_expired and twin.base.velocity_mps == 0.0)
-        assert motor.send(FORWARD).watchdog_expired, "told a zero in its place, and says so"
-        assert twin.base.commanded_mps == [0.0, 0.0] and motor.replaced_by_stop >= 1
-        assert until(lambda: motor.send(FORWARD) is not None and twin.base.commanded_mps != [0.0, 0.0])
-        assert twin.base.unsafe_resumes == 0 and twin.errors == 0
+        assert until(lambda: simulated.watchdog_expired and simulated.base.velocity_mps == 0.0)
+        assert motor.send(FORWARD).watchdog_expired, "sends a stop instead, and reports it"
+        assert simulated.base.commanded_mps == [0.0, 0.0] and motor.replaced_by_stop >= 1
+        assert until(lambda: motor.send(FORWARD) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        assert simulated.base.unsafe_resumes == 0 and simulated.errors == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_silent_controller_is_an_error_and_then_a_zero_comes_first(name: str) -> None:
-    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, twin):
-        heard(motor)
-        twin.drop_replies = True
-        assert until(lambda: type(silence(motor)) is NoReplyError), "late at first, then silent"
-        found = silence(motor)
-        assert "gave no answer" in str(found) and twin.port in str(found) and "\n" not in str(found)
-        twin.drop_replies = False
-        assert heard(motor).watchdog_expired and twin.base.commanded_mps == [0.0, 0.0]
-        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
+def test_a_missing_reply_is_an_error_and_a_stop_comes_before_motion(name: str) -> None:
+    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, simulated):
+        first_status(motor)
+        simulated.drop_replies = True
+        assert until(lambda: type(send_error(motor)) is NoReplyError), "LateReplyError at first"
+        found = send_error(motor)
+        assert "gave no answer" in str(found) and simulated.port in str(found) and "\n" not in str(found)
+        simulated.drop_replies = False
+        assert first_status(motor).watchdog_expired and simulated.base.commanded_mps == [0.0, 0.0]
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_answer_that_is_late_stops_nothing(name: str) -> None:
-    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
-        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
-        twin.drop_replies = True
-        found, replaced_by_stop = silence(motor), motor.replaced_by_stop
+def test_a_late_reply_stops_nothing(name: str) -> None:
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.drop_replies = True
+        found, replaced_by_stop = send_error(motor), motor.replaced_by_stop
         assert isinstance(found, LateReplyError) and motor.errors >= 1
-        twin.drop_replies = False
-        assert not heard(motor).watchdog_expired and twin.base.commanded_mps != [0.0, 0.0]
+        simulated.drop_replies = False
+        assert not first_status(motor).watchdog_expired and simulated.base.commanded_mps != [0.0, 0.0]
         assert motor.replaced_by_stop == replaced_by_stop
 
 
-def silence(motor: SerialMotor) -> DriverError:
-    """What is raised for a command that is not answered."""
+def send_error(motor: SerialMotor) -> DriverError:
+    """Return the exception raised for a command without a reply."""
     with pytest.raises(DriverError) as caught:
         motor.send(FORWARD)
     return caught.value
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_garbage_is_survived(name: str) -> None:
+def test_recovers_from_garbage(name: str) -> None:
     rng = random.Random(21)
-    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, simulated):
         for _ in range(20):
-            twin.garbage = rng.randbytes(rng.randint(1, 40)) + b"\r\n"
+            simulated.garbage = rng.randbytes(rng.randint(1, 40)) + b"\r\n"
             with contextlib.suppress(DriverError):
                 motor.send(FORWARD)
         assert motor.garbage + motor.bad_frames + motor.errors > 0
-        twin.garbage = b""
-        assert until(lambda: heard(motor) is not None and twin.base.commanded_mps != [0.0, 0.0])
-        assert twin.errors == 0, "nothing that came back damaged was sent on"
+        simulated.garbage = b""
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        assert simulated.errors == 0, "received garbage was not sent back"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_stream_without_end_is_an_error(name: str) -> None:
-    """A controller that talks without a break and never answers: the deadline holds all the same."""
-    with connected_motor(name, timeout_s=SHORT_S) as (motor, twin):
-        twin.garbage = b"\xff\xfe{[" * 900
+def test_an_endless_stream_is_an_error(name: str) -> None:
+    """The deadline holds for a controller that sends without a break and never replies."""
+    with connected_motor(name, timeout_s=SHORT_S) as (motor, simulated):
+        simulated.garbage = b"\xff\xfe{[" * 900
         for _ in range(3):
             with contextlib.suppress(DriverError):
                 motor.send(FORWARD)
-        twin.garbage = b""
-        assert heard(motor) is not None
+        simulated.garbage = b""
+        assert first_status(motor) is not None
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "ros_arduino_bridge"])  # it tells no voltage
-def test_a_late_answer_is_nobodys(name: str) -> None:
-    with connected_motor(name) as (motor, twin):
-        twin.base.battery_v = 9.5
-        late = twin.controller.feed(next(PROTOCOLS[name](BASE).drive(stop_command(0), 0.0)))
-        twin.base.battery_v = 12.0
-        twin.send(late)
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "ros_arduino_bridge"])  # it reports no voltage
+def test_a_late_reply_is_discarded(name: str) -> None:
+    with connected_motor(name) as (motor, simulated):
+        simulated.base.battery_v = 9.5
+        late = simulated.controller.feed(next(PROTOCOLS[name](BASE).drive(stop_command(0), 0.0)))
+        simulated.base.battery_v = 12.0
+        simulated.send(late)
         assert motor._port is not None and until(lambda: motor._port.in_waiting >= len(late))
         assert motor.send(stop_command(0)).battery_v == 12.0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_silence_at_connect(name: str) -> None:
-    with contextlib.closing(SimulatedMotor(controller_of(name))) as twin:
-        twin.drop_input = True
+def test_a_missing_reply_at_the_connection_is_an_error(name: str) -> None:
+    with contextlib.closing(SimulatedMotor(controller_of(name))) as simulated:
+        simulated.drop_input = True
         with pytest.raises(DriverError, match="gave no answer"):
-            SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
-        twin.drop_input = False
-        SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
+            SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
+        simulated.drop_input = False
+        SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
 
 
 @pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "ros_arduino_bridge")])
-def test_another_protocol_is_noticed(name: str, other: str) -> None:
-    with contextlib.closing(SimulatedMotor(controller_of(name))) as twin, pytest.raises(DriverError, match="protocol"):
-        SerialMotor(twin.port, PROTOCOLS[other](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
+def test_detects_another_protocol(name: str, other: str) -> None:
+    controller = controller_of(name)
+    with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="protocol"):
+        SerialMotor(simulated.port, PROTOCOLS[other](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_unplugged_controller_is_an_error_and_comes_back(name: str, tmp_path: Path) -> None:
+def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path: Path) -> None:
     port = tmp_path / "motor"
     first = SimulatedMotor(controller_of(name))
     port.symlink_to(first.port)
-    motor = SerialMotor(str(port), PROTOCOLS[name](BASE), timeout_s=ANSWER_S, watchdog_ms=LONG_MS)
+    motor = SerialMotor(str(port), PROTOCOLS[name](BASE), timeout_s=REPLY_S, watchdog_ms=LONG_MS)
     with contextlib.closing(motor):
         motor.send(FORWARD)
         port.unlink()
@@ -172,26 +173,26 @@ def test_an_unplugged_controller_is_an_error_and_comes_back(name: str, tmp_path:
         with pytest.raises(DriverError, match=r"no such port|tried again"):
             motor.send(FORWARD)
         with contextlib.closing(SimulatedMotor(controller_of(name))) as second:
-            second.expire()  # from now on it complains unless a stop is the first thing told
+            second.expire()   # from now on a first command other than a stop is an error
             port.symlink_to(second.port)
-            assert until(lambda: heard(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
+            assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
             assert motor.connections == 2 and second.errors == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_port_is_for_one_program(name: str) -> None:
-    with connected_motor(name) as (_, twin), pytest.raises(DriverError, match="in use by another program"):
-        SerialMotor(twin.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS)
+def test_locks_the_port(name: str) -> None:
+    with connected_motor(name) as (_, simulated), pytest.raises(DriverError, match="in use by another program"):
+        SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS)
 
 
-def paced(motor: SerialMotor) -> MotorStatus:
-    """The status after a while: a speed that is a difference of counts needs one."""
+def delayed(motor: SerialMotor) -> MotorStatus:
+    """Return the status after a pause, which speeds from differences of counts need."""
     time.sleep(0.05)
     return motor.send(FORWARD)
 
 
-def heard(motor: SerialMotor, tries: int = 200) -> object:
-    """The first status that comes, None where none does; a machine under load may be late with one."""
+def first_status(motor: SerialMotor, tries: int = 200) -> MotorStatus | None:
+    """Return the first status received, None without one; a machine under load may be late with it."""
     for _ in range(tries):
         with contextlib.suppress(DriverError):
             return motor.send(FORWARD)

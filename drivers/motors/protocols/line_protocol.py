@@ -7,8 +7,8 @@ Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus 
     body    = velocity | status | watchdog | armed
 
     host to controller
-    velocity = "V," seq "," velocity "," heading "," yaw_rate          drive; answered by a status
-    watchdog = "W," time                                               set the watchdog; answered by armed
+    velocity = "V," seq "," velocity "," heading "," yaw_rate          drive; the reply is a status
+    watchdog = "W," time                                               set the watchdog; the reply is armed
 
     controller to host
     status   = "S," seq "," velocity "," heading "," yaw_rate "," battery "," fault "," expired
@@ -22,12 +22,12 @@ Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus 
 | yaw_rate | mrad/s   | -20000 .. 20000 | counter-clockwise                                                        |
 | battery  | mV       | -1 .. 100000    | -1 is unknown                                                            |
 | fault    | 1        | 0 .. 65535      | 0 is none                                                                |
-| expired  | 1        | 0, 1            | 1: the watchdog had stopped the wheels before this command came          |
+| expired  | 1        | 0, 1            | 1: the watchdog had stopped the wheels before this command               |
 | time     | ms       | 20 .. 10000     |                                                                          |
 
-A controller with a heading input steers to the heading; one without follows the yaw rate. Velocity 0 with yaw rate 0 is
-the stop for both. The controller stops the wheels by itself when no valid velocity line came for the watchdog time; the
-next one drives again. It ignores lines that are not exactly as above; the host asks again.
+A controller with a heading input steers to the heading; one without follows the yaw rate. Velocity 0 with yaw rate 0
+stops both. The controller's watchdog stops the wheels when no valid velocity line arrives for the watchdog time; the
+next one drives again. The controller ignores lines that do not match the grammar; the host sends the next one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
-MAX_LINE = 64
+MAX_LINE = 64  # bytes
+_CRC_START = 0xFFFF
 
 _LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,7})\*([0-9A-Fa-f]{4})\r?\n?")
 _SEQ = (0, SEQ_COUNT - 1)
@@ -72,12 +73,12 @@ _TIME_NAME = (("watchdog time", "ms"),)
 
 
 class ProtocolError(DriverError):
-    """A line that is not of the protocol, or a number that has no place in it."""
+    """A line that does not match the grammar, or a number that is out of its range."""
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityMessage:
-    """Host to controller: a command. Its stamp does not travel; a decoded one has stamp 0."""
+    """Host to controller: a command. Its stamp is not sent; a decoded one has stamp 0."""
 
     seq: int
     command: VelocityCommand
@@ -85,7 +86,7 @@ class VelocityMessage:
 
 @dataclass(frozen=True, slots=True)
 class StatusMessage:
-    """Controller to host: the answer to the command with this seq."""
+    """Controller to host: the reply to the command with this seq."""
 
     seq: int
     status: MotorStatus
@@ -93,7 +94,7 @@ class StatusMessage:
 
 @dataclass(frozen=True, slots=True)
 class WatchdogRequest:
-    """Host to controller: stop by yourself after this time without a command."""
+    """Host to controller: set the time without a command after which the watchdog stops the wheels."""
 
     watchdog_ms: int
 
@@ -109,7 +110,7 @@ LineMessage = VelocityMessage | StatusMessage | WatchdogRequest | WatchdogReply
 
 
 def encode(message: LineMessage) -> bytes:
-    """The line of a message; ProtocolError for a number that is not finite or out of its range."""
+    """Return the line of a message; raise ProtocolError for a number that is not finite or out of its range."""
     kind, numbers = _fields(message)
     _check(kind, numbers)
     body = ",".join([kind, *map(str, numbers)]).encode()
@@ -117,7 +118,7 @@ def encode(message: LineMessage) -> bytes:
 
 
 def decode(line: bytes) -> LineMessage:
-    """The message of a line, with or without its end; any bytes may come: ProtocolError unless it is exactly one."""
+    """Return the message of a line, with or without its end; raise ProtocolError for any other bytes."""
     match = _LINE.fullmatch(line)
     if match is None:
         raise ProtocolError(f"{line[:MAX_LINE]!r} is not a line of the motor protocol; check port and baud rate")
@@ -131,8 +132,8 @@ def decode(line: bytes) -> LineMessage:
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE of data; of b"123456789" it is 0x29B1."""
-    return binascii.crc_hqx(data, 0xFFFF)
+    """Return the CRC-16/CCITT-FALSE of data; that of b"123456789" is 0x29B1."""
+    return binascii.crc_hqx(data, _CRC_START)
 
 
 def _fields(message: LineMessage) -> tuple[str, list[int]]:
@@ -178,24 +179,26 @@ def _message(kind: str, numbers: list[int]) -> LineMessage:
         return WatchdogRequest(numbers[0])
     if kind == "A":
         return WatchdogReply(numbers[0])
-    seq, velocity_mps, heading_rad, yaw_rate_radps = numbers[0], *(n / 1000 for n in numbers[1:4])
+    seq = numbers[0]
+    velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
     if kind == "V":
         return VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-    battery_v = math.nan if numbers[4] < 0 else numbers[4] / 1000
+    battery_mv, fault, expired = numbers[4:]
+    battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
     return StatusMessage(
-        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(numbers[6]), numbers[5], battery_v)
+        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v)
     )
 
 
 class LineFramer:
-    """Lines out of a byte stream in any pieces; starts anew at every '$', holds at most MAX_LINE bytes."""
+    """Splits a byte stream into lines; each '$' starts a new one. Holds at most MAX_LINE bytes."""
 
     def __init__(self) -> None:
-        self.garbage = 0  # bytes that belonged to no whole line
+        self.garbage = 0  # bytes that belonged to no complete line
         self._line = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The whole lines that end in data, each from its '$' to its line feed."""
+        """Return the lines that end in data, each from its '$' to its line feed."""
         lines = []
         for byte in data:
             if byte == ord("$") or len(self._line) >= MAX_LINE:
@@ -214,15 +217,15 @@ class LineFramer:
         self._line.clear()
 
     def reset(self) -> None:
-        """Forgets the piece of a line in hand."""
+        """Discard the incomplete line."""
         self._discard()
 
 
 class LineProtocol:
     """The host's side of one connection.
 
-    A controller counts its heading from where its watchdog was set. That happens again after a cable was out, so the
-    heading it had last is added from then on; turns in between go unnoticed.
+    A controller measures its heading from where its watchdog was set. After a reconnection this happens again, so the
+    last heading before it is added from then on; a rotation in between is lost.
     """
 
     baud = 115_200
@@ -231,28 +234,29 @@ class LineProtocol:
         self.bad_frames = 0
         self._drive = drive
         self._seq = 0
-        self._zero_rad = self._heading_rad = 0.0  # what the controller calls 0, and what it said last
+        self._zero_rad = 0.0  # heading at which the controller's heading is 0
+        self._heading_rad = 0.0  # last reported
 
     def framer(self) -> LineFramer:
-        """Lines from '$' to line feed."""
+        """Return a framer of lines."""
         return LineFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
-        """Sets the watchdog and hears what is in force."""
-        answer = yield from request(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
-        require_watchdog(watchdog_ms, answer.watchdog_ms)
+        """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
+        reply = yield from request(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
+        require_watchdog(watchdog_ms, reply.watchdog_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """One velocity line; the status is the one with its seq."""
+        """Send one velocity line and return the status with the same seq."""
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
         heading_rad = _wrapped(command.heading_rad - self._zero_rad)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
         line = encode(VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
-        answer = yield from request(line, lambda frame: self._status(frame, seq))
-        self._heading_rad = _wrapped(answer.status.heading_rad + self._zero_rad)
-        return replace(answer.status, heading_rad=self._heading_rad)
+        reply = yield from request(line, lambda frame: self._status(frame, seq))
+        self._heading_rad = _wrapped(reply.status.heading_rad + self._zero_rad)
+        return replace(reply.status, heading_rad=self._heading_rad)
 
     def _watchdog(self, frame: bytes) -> WatchdogReply | None:
         message = self._message(frame)

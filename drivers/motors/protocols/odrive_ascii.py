@@ -3,15 +3,15 @@
 Source: ODrive documentation, "ASCII Protocol"; firmware 0.5.x, communication/ascii_protocol.cpp and MotorControl/axis.
 
     "v axis turns_per_s"     velocity; feeds the axis' watchdog, as "u axis" does
-    "f axis"                 answered by "position velocity", turns and turns/s
-    "w property value"       no answer
-    "r property"             answered by the value
+    "f axis"                 reply "position velocity", turns and turns/s
+    "w property value"       no reply
+    "r property"             reply: the value
 
-Each line ends in LF. With "*n" at its end, n the exclusive or of all bytes before, a damaged line is dropped, and the
-answer carries one as well: here every line does. An axis whose watchdog has expired is disarmed: the error flag 0x800
-stays, and nothing moves until it is cleared and closed-loop control is requested, which is done with the zero that
-comes first. Other errors are never cleared here: they are the fault that is reported.
-Answers do not name their question, so they are taken in order and only where all came and fit.
+Each line ends in LF. A line may carry a checksum: "*n" at its end, n the exclusive or of all bytes before. ODrive drops
+a damaged line that has one, and its reply carries one as well; this driver always sends it. An axis whose watchdog has
+expired is disarmed: the error flag 0x800 stays, and nothing moves until it is cleared and closed-loop control is
+requested, which is done together with the stop that the driver sends first. Other errors are never cleared: they are
+reported as the fault. Replies do not name their request, so they are assigned in order, and only if all arrive and fit.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer, Transaction, require_watchdog
 
 AXES = (0, 1)
-WATCHDOG_EXPIRED = 0x800
-CLOSED_LOOP = 8
-VELOCITY_CONTROL = 2
+WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
+CLOSED_LOOP = 8  # AXIS_STATE_CLOSED_LOOP_CONTROL
+VELOCITY_CONTROL = 2  # CONTROL_MODE_VELOCITY_CONTROL
 
-_SEALED = re.compile(rb"([^*]*)\*([0-9]{1,3})")
-_WORDS = {b"true": 1.0, b"false": 0.0}
+_CHECKED_LINE = re.compile(rb"([^*]*)\*([0-9]{1,3})")
+_BOOLEANS = {b"true": 1.0, b"false": 0.0}
+_MAX_NUMBERS = 3  # parsed of a reply; more than any reply has
 
 
-def sealed(line: str) -> bytes:
-    """The line with its checksum and end."""
+def with_checksum(line: str) -> bytes:
+    """Return the line with its checksum and end."""
     return b"%b*%d\n" % (line.encode(), _xor(line.encode()))
 
 
@@ -52,72 +53,77 @@ class ODriveAscii:
         self._disarmed = True
 
     def framer(self) -> TextFramer:
-        """Lines of text."""
+        """Return a framer of lines."""
         return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
-        """Sets both watchdogs and reads them back; DriverError where an axis has an error that is not its watchdog's.
+        """Set both watchdogs and read them back; return the time in force [ms]. The first stop arms the axes.
 
-        The axes are armed by the first stop.
+        Raises DriverError where another time is in force, or an axis has an error other than its watchdog's.
         """
         self._disarmed = True
         lines = [line for axis in AXES for line in _setup(axis, watchdog_ms / 1000)]
-        asked = ("config.enable_watchdog", "config.watchdog_timeout", "error")
-        answers = yield from self._asked(lines, [f"r axis{axis}.{name}" for axis in AXES for name in asked])
-        for enabled, timeout, error in zip(*[iter(answers)] * len(asked), strict=True):
+        properties = ("config.enable_watchdog", "config.watchdog_timeout", "error")
+        replies = yield from self._query(lines, [f"r axis{axis}.{name}" for axis in AXES for name in properties])
+        for enabled, timeout, error in zip(*[iter(replies)] * len(properties), strict=True):
             if int(error[0]) & ~WATCHDOG_EXPIRED:
                 raise DriverError(f"an axis has error 0x{int(error[0]):x}; see `odrivetool`, dump_errors(odrv0, True)")
             require_watchdog(watchdog_ms, 1000 * timeout[0] if enabled[0] else 0.0)
         return float(watchdog_ms)
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """Both velocities and the questions at once; a stop arms axes that are not."""
+        """Send both velocities and the requests for the status at once; a stop arms disarmed axes."""
         arming = self._disarmed and is_stop(command)
         speeds = self._drive.channels(command)
         lines = [f"v {axis} {mps * self._drive.turns_per_m:.5f}" for axis, mps in zip(AXES, speeds, strict=True)]
         if arming:
             lines += [line for axis in AXES for line in _arming(axis)]
-        asked = ["f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
-        first, second, *errors, battery = yield from self._asked(lines, asked)
-        flags = int(errors[0][0]) | int(errors[1][0])
+        requests = ["f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
+        first, second, first_error, second_error, battery = yield from self._query(lines, requests)
+        flags = int(first_error[0]) | int(second_error[0])
         self._disarmed = bool(flags & WATCHDOG_EXPIRED) or (self._disarmed and not arming)
-        motion = self._drive.motion(first[-1] / self._drive.turns_per_m, second[-1] / self._drive.turns_per_m)
-        return MotorStatus(motion[0], math.nan, motion[1], self._disarmed, flags & ~WATCHDOG_EXPIRED, battery[0])
+        (_, first_turns_per_s), (_, second_turns_per_s) = first, second  # position, velocity
+        velocity_mps, yaw_rate_radps = self._drive.motion(first_turns_per_s / self._drive.turns_per_m,
+                                                          second_turns_per_s / self._drive.turns_per_m)
+        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, self._disarmed, flags & ~WATCHDOG_EXPIRED,
+                           battery[0])  # fmt: skip
 
-    def _asked(self, lines: Sequence[str], questions: Sequence[str]) -> Transaction[list[list[float]]]:
-        """Writes lines and questions and gives the numbers of each answer; "f" has two, "r" one."""
-        answers: list[list[float]] = []
-        frame = yield b"".join(map(sealed, [*lines, *questions]))
+    def _query(self, lines: Sequence[str], requests: Sequence[str]) -> Transaction[list[list[float]]]:
+        """Write lines and requests, and return the numbers of each reply: two for "f", one for "r"."""
+        replies: list[list[float]] = []
+        frame = yield b"".join(map(with_checksum, [*lines, *requests]))
         while True:
             numbers = self._numbers(frame)
-            if numbers and len(numbers) == (2 if questions[len(answers)][0] == "f" else 1):
-                answers.append(numbers)
+            if numbers and len(numbers) == (2 if requests[len(replies)][0] == "f" else 1):
+                replies.append(numbers)
             else:
                 self.bad_frames += 1
-                answers.clear()  # one is missing, so nobody knows which is which: silence is asked again
-            if len(answers) == len(questions):
-                return answers
+                replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
+            if len(replies) == len(requests):
+                return replies
             frame = yield b""
 
     def _numbers(self, frame: bytes) -> list[float] | None:
-        match = _SEALED.fullmatch(frame)
+        """Return the numbers of a reply, None if it is damaged; raise DriverError where it is an error message."""
+        match = _CHECKED_LINE.fullmatch(frame)
         if match is None or int(match[2]) != _xor(match[1]):
             return None
         if match[1].startswith((b"invalid", b"unknown", b"not")):
-            said = match[1].decode("ascii", "replace")
-            raise DriverError(f"it answered {said!r}; a board with two axes and firmware 0.5 is needed")
-        numbers = [_number(word) for word in match[1].split()[:3]]
+            reply = match[1].decode("ascii", "replace")
+            raise DriverError(f"it answered {reply!r}; a board with two axes and firmware 0.5 is needed")
+        numbers = [_number(word) for word in match[1].split()[:_MAX_NUMBERS]]
         return numbers if all(map(math.isfinite, numbers)) else None
 
 
 def _setup(axis: int, timeout_s: float) -> list[str]:
-    """The timeout is set and fed before it counts."""
+    """Return the lines that set the watchdog's timeout and feed it before it is enabled."""
     config = f"w axis{axis}.config"
     return [f"{config}.enable_watchdog 0", f"{config}.watchdog_timeout {timeout_s:g}", f"u {axis}",
             f"{config}.enable_watchdog 1"]  # fmt: skip
 
 
 def _arming(axis: int) -> list[str]:
+    """Return the lines that clear the axis' errors and start closed-loop velocity control."""
     return [f"w axis{axis}.controller.config.control_mode {VELOCITY_CONTROL}", f"w axis{axis}.error 0", f"u {axis}",
             f"w axis{axis}.requested_state {CLOSED_LOOP}"]  # fmt: skip
 
@@ -126,7 +132,7 @@ def _number(word: bytes) -> float:
     try:
         return float(word)
     except ValueError:
-        return _WORDS.get(word.lower(), math.nan)
+        return _BOOLEANS.get(word.lower(), math.nan)
 
 
 def _xor(data: bytes) -> int:

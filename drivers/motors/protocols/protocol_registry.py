@@ -1,4 +1,4 @@
-"""The controllers' protocols by the names that the configuration knows them by."""
+"""Protocols of motor controllers by their names in the configuration (motor.protocol)."""
 
 from __future__ import annotations
 

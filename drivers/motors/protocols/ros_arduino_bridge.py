@@ -2,12 +2,12 @@
 
 Source: github.com/hbrobotics/ros_arduino_bridge, ROSArduinoBridge.ino, commands.h, diff_controller.h.
 
-    "m left right"   encoder ticks for each turn of its speed loop (33 ms); answered by "OK"
-    "e"              answered by "left right", the encoders' counts, signed 32 bits
-    "r"              sets them to 0; answered by "OK"
+    "m left right"   encoder ticks per period of its speed loop (33 ms); reply "OK"
+    "e"              reply "left right", the encoders' counts, signed 32 bits
+    "r"              sets them to 0; reply "OK"
 
-Lines end in CR, answers in CR LF. The wheels stop 2000 ms after the last "m" (AUTO_STOP_INTERVAL), which is compiled
-in: it can neither be set nor read. Speeds are whole ticks, so small ones are coarse.
+Lines end in CR, replies in CR LF. The wheels stop 2000 ms after the last "m" (AUTO_STOP_INTERVAL), which is compiled
+in: it can neither be set nor read. Speeds are whole ticks, so low speeds are coarse.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer, Transaction
 
-AUTO_STOP_MS = 2000
-FRAME_S = 0.033
-MAX_TICKS = 32767  # an int of the board
+AUTO_STOP_MS = 2000  # ROSArduinoBridge.ino: AUTO_STOP_INTERVAL
+LOOP_S = 0.033  # ROSArduinoBridge.ino: PID_RATE 30 Hz, PID_INTERVAL = 1000 / 30 ms in whole ms
+MAX_TICKS = 32767  # int of the board: 16 bits
 
 _COUNTS = re.compile(rb"(-?[0-9]{1,10}) (-?[0-9]{1,10})")
 
 
 class RosArduinoBridge:
-    """One board: its left is channel 1."""
+    """One board: its left motor is channel 1."""
 
     baud = 57_600
 
@@ -36,42 +36,47 @@ class RosArduinoBridge:
         self.bad_frames = 0
         self._drive = drive
         self._ticks_per_m = drive.turns_per_m * drive.ticks_per_turn
-        self._last: tuple[float, tuple[int, int]] | None = None
+        self._last: tuple[float, tuple[int, int]] | None = None  # time [s], counts of both encoders
 
     def framer(self) -> TextFramer:
-        """Lines of text."""
+        """Return a framer of lines."""
         return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
-        """Hears whether this is such a board; DriverError where a shorter watchdog is asked for than it has."""
+        """Verify that the board replies, and return its watchdog time [ms].
+
+        Raises DriverError where a shorter time is requested.
+        """
         if watchdog_ms < AUTO_STOP_MS:
             raise DriverError(
-                f"watchdog of {watchdog_ms} ms asked, {AUTO_STOP_MS} ms is compiled into ROSArduinoBridge; "
+                f"watchdog of {watchdog_ms} ms requested, {AUTO_STOP_MS} ms is compiled into ROSArduinoBridge; "
                 f"set motor.watchdog_ms = {AUTO_STOP_MS}"
             )
         self._last = None
-        yield from self._told(b"r\re\r")
+        yield from self._counts_after(b"r\re\r")
         return float(AUTO_STOP_MS)
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """Both speeds and the question at once; the speed in the status is the mean since the last command."""
-        per_mps = self._ticks_per_m * FRAME_S
-        first, second = self._drive.channels(command, MAX_TICKS / per_mps)
-        counts = yield from self._told(b"m %d %d\re\r" % (round(first * per_mps), round(second * per_mps)))
+        """Send both speeds and request the counts; the velocity in the status is the mean since the last command."""
+        ticks_per_mps = self._ticks_per_m * LOOP_S
+        first_mps, second_mps = self._drive.channels(command, MAX_TICKS / ticks_per_mps)
+        ticks = round(first_mps * ticks_per_mps), round(second_mps * ticks_per_mps)
+        counts = yield from self._counts_after(b"m %d %d\re\r" % ticks)
         velocity_mps, yaw_rate_radps = self._motion(counts, now_s)
         return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, False, 0, math.nan)
 
     def _motion(self, counts: tuple[int, int], now_s: float) -> tuple[float, float]:
-        """NaN where there was no count before."""
+        """Return velocity and yaw rate since the last counts, NaN without these."""
         last, self._last = self._last, (now_s, counts)
         if last is None or now_s <= last[0]:
             return math.nan, math.nan
-        per_tick = 1 / (self._ticks_per_m * (now_s - last[0]))
-        first, second = (_wrapped(new - old) * per_tick for new, old in zip(counts, last[1], strict=True))
+        last_s, last_counts = last
+        tick_mps = 1 / (self._ticks_per_m * (now_s - last_s))
+        first, second = (_wrapped(new - old) * tick_mps for new, old in zip(counts, last_counts, strict=True))
         return self._drive.motion(first, second)
 
-    def _told(self, lines: bytes) -> Transaction[tuple[int, int]]:
-        """Writes an order and the question, and gives the counts once the order is confirmed."""
+    def _counts_after(self, lines: bytes) -> Transaction[tuple[int, int]]:
+        """Write a command and the request for the counts; return them once the command is confirmed."""
         confirmed = False
         frame = yield lines
         while True:
@@ -84,5 +89,5 @@ class RosArduinoBridge:
 
 
 def _wrapped(ticks: int) -> int:
-    """A difference of two counts of 32 bits."""
+    """Return the difference of two signed 32-bit counts, of which one may have overflowed."""
     return (ticks + (1 << 31)) % (1 << 32) - (1 << 31)

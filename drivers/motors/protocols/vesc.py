@@ -7,10 +7,10 @@ Source: VESC firmware (github.com/vedderb/bldc): comm/packet.c, comm/commands.c,
     payload = COMM_SET_RPM (8), int32 electrical rpm | COMM_GET_VALUES_SELECTIVE (50), uint32 mask
             | COMM_GET_APPCONF (17) | COMM_FORWARD_CAN (34), uint8 id, payload for that one
 
-The motor stops by itself after the "timeout" of the App Settings, which feeds on every command. It lies in the
-application's configuration, of which only the first fields stay the same from firmware to firmware (signature, id,
-timeout): it is read at connect and compared, and set by VESC Tool alone. Bit 21 of the values says that it has expired.
-Which of two answers is whose says the id in it.
+The motor stops after the "timeout" of the App Settings without a command. The timeout is a part of the application's
+configuration, of which only the first fields (signature, id, timeout) are the same in all firmware versions: it is read
+and compared at the connection, and can be set only by VESC Tool. Bit 21 of the values marks that it has expired.
+Each reply carries the id of its controller.
 """
 
 from __future__ import annotations
@@ -26,45 +26,51 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import T, Transaction
 
-SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50
+SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_PACKET_ID in datatypes.h
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
-LONGEST_PAYLOAD = 512
-MAX_ERPM = 0x7FFFFFFF
+MAX_PAYLOAD = 512  # bytes; PACKET_MAX_PL_LEN in packet.h
+MAX_ERPM = 0x7FFFFFFF  # int32
+S_PER_MIN = 60
+SHORT, LONG, END = 2, 3, 3  # first byte of a packet, also the size of its head: 1 or 2 bytes of length; last byte
+_TAIL_BYTES = 3  # CRC and END
+_MIN_LONG_PAYLOAD = 255
+_EXPIRED = 1  # bit of the status
 
 _CONFIG = struct.Struct(">xIBI")  # signature, id, timeout [ms]
 _VALUES = struct.Struct(">BIihBB")  # command, mask, erpm, 0.1 V, fault, id; then the status where the firmware has it
 
 
 def packet(payload: bytes) -> bytes:
-    """The frame around a payload of 1 to 512 bytes."""
-    head = b"\x02%c" % len(payload) if len(payload) < 256 else b"\x03" + len(payload).to_bytes(2, "big")
-    return head + payload + binascii.crc_hqx(payload, 0).to_bytes(2, "big") + b"\x03"
+    """Return the packet of a payload of 1 to 512 bytes."""
+    size = len(payload)
+    head = bytes((SHORT, size)) if size < 256 else bytes((LONG,)) + size.to_bytes(2, "big")
+    return head + payload + binascii.crc_hqx(payload, 0).to_bytes(2, "big") + bytes((END,))
 
 
 def forwarded(can_id: int, payload: bytes) -> bytes:
-    """The payload that carries another one to the controller with an id on the CAN bus."""
+    """Return the payload that forwards another one to the controller with this id on the CAN bus."""
     return bytes((FORWARD_CAN, can_id)) + payload
 
 
 @dataclass(frozen=True, slots=True)
-class Values:
-    """What one controller says of itself."""
+class VescValues:
+    """State of one controller."""
 
-    erpm: int
+    erpm: int  # electrical revolutions per minute
     battery_v: float
-    fault: int
-    expired: bool
+    fault: int  # mc_fault_code in datatypes.h; 0 is none
+    expired: bool  # its timeout has stopped the motor
 
 
 class PacketFramer:
-    """Payloads out of a byte stream in any pieces; a byte that starts no packet is garbage, the next one is tried."""
+    """Splits a byte stream into payloads; a byte that does not start a packet is skipped as garbage."""
 
     def __init__(self) -> None:
         self.garbage = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The payloads of the packets that end in data."""
+        """Return the payloads of the packets that end in data."""
         self._buffer += data
         payloads = []
         start = 0
@@ -78,29 +84,31 @@ class PacketFramer:
         return payloads
 
     def reset(self) -> None:
-        """Forgets the piece of a packet in hand."""
+        """Discard the incomplete packet."""
         self.garbage += len(self._buffer)
         self._buffer.clear()
 
 
 def _size(buffer: bytearray, start: int) -> int | None:
-    """The size of the packet that starts there; 0 where none can, None where more has to come."""
-    head = buffer[start : start + 3]
-    if not head or (head[0] in (2, 3) and len(head) < head[0]):
+    """Return the size of the packet at start, 0 if there is none, None if it is incomplete."""
+    head = buffer[start : start + LONG]
+    if not head or (head[0] in (SHORT, LONG) and len(head) < head[0]):
         return None
-    if head[0] not in (2, 3):
+    if head[0] not in (SHORT, LONG):
         return 0
-    length = head[1] if head[0] == 2 else head[1] << 8 | head[2]
-    if not (1 if head[0] == 2 else 255) <= length <= LONGEST_PAYLOAD:
+    length = head[1] if head[0] == SHORT else head[1] << 8 | head[2]
+    if not (1 if head[0] == SHORT else _MIN_LONG_PAYLOAD) <= length <= MAX_PAYLOAD:
         return 0
-    size = head[0] + length + 3
+    size = head[0] + length + _TAIL_BYTES
     return size if len(buffer) - start >= size else None
 
 
 def _payload(buffer: bytearray, start: int, size: int) -> bytes | None:
-    payload = bytes(buffer[start + buffer[start] : start + size - 3])
-    crc = int.from_bytes(buffer[start + size - 3 : start + size - 1], "big")
-    return payload if buffer[start + size - 1] == 3 and binascii.crc_hqx(payload, 0) == crc else None
+    """Return the payload of a packet, None if its CRC or its end is wrong."""
+    end = start + size
+    payload = bytes(buffer[start + buffer[start] : end - _TAIL_BYTES])
+    crc = int.from_bytes(buffer[end - _TAIL_BYTES : end - 1], "big")
+    return payload if buffer[end - 1] == END and binascii.crc_hqx(payload, 0) == crc else None
 
 
 class Vesc:
@@ -113,58 +121,68 @@ class Vesc:
         self._drive = drive
 
     def framer(self) -> PacketFramer:
-        """Packets."""
+        """Return a framer of packets."""
         return PacketFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
-        """Reads both timeouts; DriverError where one is off or longer than asked. Gives the shorter one [ms]."""
-        first, second = yield from self._both((bytes((GET_APPCONF,)),) * 2, _config)
+        """Read the timeouts of both controllers and return the shorter one [ms].
+
+        Raises DriverError where one is off or longer than requested.
+        """
+        query = bytes((GET_APPCONF,))
+        first, second = yield from self._query_both(query, _config)
         for can_id, timeout_ms in (first, second):
             if not 0 < timeout_ms <= watchdog_ms:
                 raise DriverError(
-                    f"watchdog of {watchdog_ms} ms asked, {timeout_ms} ms in force in the VESC with id {can_id}; set "
-                    "Timeout in VESC Tool (App Settings, General), or motor.watchdog_ms to at least what it has"
+                    f"watchdog of {watchdog_ms} ms requested, {timeout_ms} ms in force in the VESC with id {can_id}; "
+                    "set Timeout in VESC Tool (App Settings, General), or raise motor.watchdog_ms to at least its time"
                 )
         return float(min(first[1], second[1]))
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """The questions and both speeds at once; the questions first, for an order hides that the timeout had come."""
-        erpm_per_mps = 60 * self._drive.turns_per_m * self._drive.pole_pairs
+        """Send the queries, then both speeds, at once; a speed sent before would clear an expired timeout."""
+        erpm_per_mps = S_PER_MIN * self._drive.turns_per_m * self._drive.pole_pairs
         speeds = self._drive.channels(command, MAX_ERPM / erpm_per_mps)
-        orders = [struct.pack(">Bi", SET_RPM, round(mps * erpm_per_mps)) for mps in speeds]
-        ordered = packet(orders[0]) + packet(forwarded(self._drive.can_id, orders[1]))
-        question = struct.pack(">BI", GET_VALUES_SELECTIVE, MASK)
-        first, second = yield from self._both((question, question), _values, ordered)
-        motion = self._drive.motion(first[1].erpm / erpm_per_mps, second[1].erpm / erpm_per_mps)
-        return MotorStatus(motion[0], math.nan, motion[1], first[1].expired or second[1].expired,
-                           first[1].fault or second[1].fault, min(first[1].battery_v, second[1].battery_v))  # fmt: skip
+        commands = [struct.pack(">Bi", SET_RPM, round(mps * erpm_per_mps)) for mps in speeds]
+        packets = packet(commands[0]) + packet(forwarded(self._drive.can_id, commands[1]))
+        query = struct.pack(">BI", GET_VALUES_SELECTIVE, MASK)
+        (_, first), (_, second) = yield from self._query_both(query, _values, packets)
+        velocity_mps, yaw_rate_radps = self._drive.motion(first.erpm / erpm_per_mps, second.erpm / erpm_per_mps)
+        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, first.expired or second.expired,
+                           first.fault or second.fault, min(first.battery_v, second.battery_v))  # fmt: skip
 
-    def _both(
-        self, questions: tuple[bytes, bytes], parse: Callable[[bytes], tuple[int, T] | None], orders: bytes = b""
+    def _query_both(
+        self, query: bytes, parse: Callable[[bytes], tuple[int, T] | None], commands: bytes = b""
     ) -> Transaction[tuple[tuple[int, T], tuple[int, T]]]:
-        """What each of the two answers, as id and value."""
-        answers: dict[bool, tuple[int, T]] = {}
-        frame = yield packet(questions[0]) + packet(forwarded(self._drive.can_id, questions[1])) + orders
+        """Send a query to both controllers, then the commands; return (id, parsed reply) of each."""
+        replies: dict[bool, tuple[int, T]] = {}  # the key is True for the controller on CAN
+        frame = yield packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
         while True:
-            answer = parse(frame)
-            if answer is not None:
-                answers[answer[0] == self._drive.can_id] = answer
-            self.bad_frames += answer is None
-            if len(answers) == 2:
-                return answers[False], answers[True]
+            reply = parse(frame)
+            if reply is None:
+                self.bad_frames += 1
+            else:
+                can_id, _ = reply
+                replies[can_id == self._drive.can_id] = reply
+            if len(replies) == 2:
+                return replies[False], replies[True]
             frame = yield b""
 
 
 def _config(payload: bytes) -> tuple[int, int] | None:
+    """Return id and timeout [ms], None of another payload."""
     if payload[0] != GET_APPCONF or len(payload) < _CONFIG.size:
         return None
     _, can_id, timeout_ms = _CONFIG.unpack_from(payload)
     return can_id, timeout_ms
 
 
-def _values(payload: bytes) -> tuple[int, Values] | None:
+def _values(payload: bytes) -> tuple[int, VescValues] | None:
+    """Return id and state, None of another payload."""
     if payload[0] != GET_VALUES_SELECTIVE or not _VALUES.size <= len(payload) <= _VALUES.size + 1:
         return None
     _, mask, erpm, decivolt, fault, can_id = _VALUES.unpack_from(payload)
-    expired = bool(payload[_VALUES.size :] and payload[-1] & 1)
-    return (can_id, Values(erpm, decivolt / 10, fault, expired)) if mask == MASK else None
+    if mask != MASK:
+        return None
+    expired = len(payload) > _VALUES.size and bool(payload[-1] & _EXPIRED)
+    return can_id, VescValues(erpm, decivolt / 10, fault, expired)

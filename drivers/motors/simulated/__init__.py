@@ -1,1 +1,1 @@
-"""Simulated motor controllers, byte for byte, for demonstrations and tests."""
+"""Simulated motor controllers that use the protocols' real bytes: digital twins for demonstrations and tests."""

@@ -1,4 +1,4 @@
-"""The twins of the controllers by the names of their protocols."""
+"""Simulated controllers by the names of their protocols."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated Arduino with ROSArduinoBridge; for the source see drivers/motors/protocols/ros_arduino_bridge.py."""
+"""Simulated Arduino with ROSArduinoBridge; sources as in drivers/motors/protocols/ros_arduino_bridge.py."""
 
 from __future__ import annotations
 
@@ -10,47 +10,48 @@ from drivers.motors.motor_protocol import TextFramer
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
 _AUTO_STOP_MS, _LOOP_S = 2000, 0.033
+_MAX_LINE = 40  # bytes
+_MAX_TICKS = 32767  # int of the board: 16 bits
+_FIRST_COUNT = 2**31 - 100
 
 
 class SimulatedArduino:
-    """Its counts start near the end of their 32 bits, so that they run over."""
+    """One board; its counts start near the end of their 32 bits, so that they overflow."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
         self.base = SimulatedBase(drive)
         self.base.watchdog_ms = _AUTO_STOP_MS
-        self._framer = TextFramer(40)
-        self._zero = [-(2**31 - 100), -(2**31 - 100)]
+        self._framer = TextFramer(_MAX_LINE)
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to all lines that end in data."""
+        """Return the replies to all lines that end in data."""
         return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
-        return self._answer(line) + b"\r\n"
+        return self._reply(line) + b"\r\n"
 
-    def _answer(self, line: bytes) -> bytes:
-        if order := re.fullmatch(rb"m (-?[0-9]{1,5}) (-?[0-9]{1,5})", line):
-            return self._drive(int(order[1]), int(order[2]))
+    def _reply(self, line: bytes) -> bytes:
+        if command := re.fullmatch(rb"m (-?[0-9]{1,5}) (-?[0-9]{1,5})", line):
+            return self._drive(int(command[1]), int(command[2]))
         if line == b"e":
             return b"%d %d" % self._counts()
         if line == b"r":
-            return b"OK"  # the counts stay where they are: a host that counts differences does not mind
+            return b"OK"  # the counts are not reset: the host uses only their differences
         self.base.errors += 1
         return b"Invalid Command"
 
     def _drive(self, first: int, second: int) -> bytes:
-        self.base.errors += max(abs(first), abs(second)) > 32767
+        self.base.errors += max(abs(first), abs(second)) > _MAX_TICKS
         self.base.commands += 1
-        per_tick = 1 / (self._ticks_per_m() * _LOOP_S)
-        self.base.command_channels(first * per_tick, second * per_tick)
+        tick_mps = 1 / (self._ticks_per_m() * _LOOP_S)
+        self.base.command_channels(first * tick_mps, second * tick_mps)
         return b"OK"
 
     def _counts(self) -> tuple[int, int]:
-        first, second = (
-            _signed(round(way_m * self._ticks_per_m()) - zero)
-            for way_m, zero in zip(self.base.channels_m(), self._zero, strict=True)
-        )
-        return first, second
+        first_m, second_m = self.base.channels_m()
+        ticks_per_m = self._ticks_per_m()
+        return (_signed(round(first_m * ticks_per_m) + _FIRST_COUNT),
+                _signed(round(second_m * ticks_per_m) + _FIRST_COUNT))  # fmt: skip
 
     def _ticks_per_m(self) -> float:
         drive = self.base.drive
@@ -58,4 +59,5 @@ class SimulatedArduino:
 
 
 def _signed(count: int) -> int:
+    """Return the count as a signed number of 32 bits."""
     return (count + 2**31) % 2**32 - 2**31

@@ -1,4 +1,4 @@
-"""A base with two driven wheels as pure state: what it is told, its watchdogs, its way; time passes by `advance`."""
+"""Simulated base with two driven wheels: commands, watchdogs, motion; its time is advanced by the caller."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import Framer
 
-STEP_S = 0.005
+STEP_S = 0.005  # of the integration
 LONGEST_ADVANCE_S = 60.0
 LEFT, RIGHT = SIDES = (0, 1)
 Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
@@ -19,67 +19,67 @@ Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """What the wheels can do."""
+    """Limits of the motion, and the gain of the heading controller."""
 
     acceleration_mps2: float = 2.0
     yaw_rate_radps: float = 2.0
     yaw_acceleration_radps2: float = 8.0
-    heading_gain_hz: float = 3.0
+    heading_gain_hz: float = 3.0  # yaw rate per heading error
 
 
 class SimulatedBase:
-    """Wheels behind a controller. Each has its own watchdog; one that was stopped by it owes a zero before it moves.
+    """Wheels of a simulated controller, each with its own watchdog; after it has expired, a stop must come first.
 
-    A controller counts its valid commands in `commands` and everything that a real one would complain of in `errors`.
+    The controller counts valid commands in `commands`, and in `errors` all that a real one would reject.
     """
 
     def __init__(self, drive: DifferentialDrive | None = None, limits: MotionLimits | None = None) -> None:
         self.drive = drive or DifferentialDrive()
         self.commands = self.errors = 0
-        self.expiries = 0  # times the watchdog has stopped the wheels
-        self.unsafe_resumes = 0  # motion told to a side that owed a zero
+        self.expiries = 0  # times that the watchdog has stopped the wheels
+        self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
         self.watchdog_ms = 500.0  # 0 is off
         self.fault = 0
         self.battery_v = 12.0
         self.pose: Pose = (0.0, 0.0, 0.0)
         self.velocity_mps = self.yaw_rate_radps = 0.0
-        self.travel_m = [0.0, 0.0]  # of the wheels
-        self.goal_heading_rad: float | None = None  # in the world: steered to while it moves, for what can
-        self.commanded_mps = [0.0, 0.0]
-        self.expired = [False, False]
+        self.travel_m = [0.0, 0.0]  # of the left and the right wheel
+        self.goal_heading_rad: float | None = None  # in the world; steered to during motion, if set
+        self.commanded_mps = [0.0, 0.0]  # left, right
+        self.expired = [False, False]  # watchdogs: left, right
         self._needs_stop = [False, False]
         self._since_command_s = [0.0, 0.0]
         self.limits = limits or MotionLimits()
 
     @property
     def watchdog_expired(self) -> bool:
-        """Whether a watchdog holds a wheel."""
+        """True if a watchdog has stopped a wheel."""
         return any(self.expired)
 
     @property
     def last_command(self) -> VelocityCommand:
-        """The motion that was told last, with stamp and heading 0."""
+        """The last commanded motion, with stamp and heading 0."""
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         return VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps)
 
     def command(self, velocity_mps: float, yaw_rate_radps: float) -> None:
-        """A motion for both wheels."""
+        """Command a motion of the base."""
         half_mps = yaw_rate_radps * self.drive.track_m / 2
         self.command_wheel(LEFT, velocity_mps - half_mps)
         self.command_wheel(RIGHT, velocity_mps + half_mps)
 
     def command_channels(self, first_mps: float, second_mps: float) -> None:
-        """Speeds for both motors, as they are wired."""
-        for side, speed_mps in zip(SIDES, self.drive.sides(first_mps, second_mps), strict=True):
+        """Command the speeds of both channels."""
+        for side, speed_mps in zip(SIDES, self.drive.to_sides(first_mps, second_mps), strict=True):
             self.command_wheel(side, speed_mps)
 
     def command_channel(self, channel: int, speed_mps: float) -> None:
-        """A speed for one motor, 0 or 1, as it is wired."""
-        side = RIGHT if bool(channel) != self.drive.swapped else LEFT
-        self.command_wheel(side, self.drive.sides(speed_mps, speed_mps)[side])
+        """Command the speed of one channel, 0 or 1."""
+        side = self.side_of(channel)
+        self.command_wheel(side, self.drive.to_sides(speed_mps, speed_mps)[side])
 
     def command_wheel(self, side: int, speed_mps: float) -> None:
-        """A speed for one wheel, forward positive; feeds its watchdog."""
+        """Command the speed of one wheel, forward positive, and feed its watchdog."""
         if self._needs_stop[side] and speed_mps != 0.0:
             self.unsafe_resumes += 1
             self.errors += 1
@@ -88,28 +88,33 @@ class SimulatedBase:
         self.feed(side)
 
     def feed(self, side: int) -> None:
-        """Feeds the watchdog of one wheel."""
+        """Feed the watchdog of one wheel."""
         self._since_command_s[side] = 0.0
 
+    def side_of(self, channel: int) -> int:
+        """Return the wheel, LEFT or RIGHT, of a channel, 0 or 1."""
+        return RIGHT if bool(channel) != self.drive.swapped else LEFT
+
     def channels_mps(self) -> tuple[float, float]:
-        """The motors' speeds as they are wired."""
+        """Return the speeds of the channels."""
         half_mps = self.yaw_rate_radps * self.drive.track_m / 2
-        return self._wired(self.velocity_mps - half_mps, self.velocity_mps + half_mps)
+        return self.drive.to_channels(self.velocity_mps - half_mps, self.velocity_mps + half_mps)
 
     def channels_m(self) -> tuple[float, float]:
-        """The motors' ways as they are wired."""
-        return self._wired(*self.travel_m)
+        """Return the distances travelled by the channels."""
+        left_m, right_m = self.travel_m
+        return self.drive.to_channels(left_m, right_m)
 
     def expire(self) -> None:
-        """Both watchdogs stop the wheels now."""
+        """Let both watchdogs stop the wheels now."""
         self.expiries += not self.watchdog_expired
         for side in SIDES:
             self._stop(side)
 
     def advance(self, dt_s: float) -> None:
-        """Lets the time dt_s pass in small steps: watchdogs, wheels, pose."""
+        """Advance watchdogs, wheels and pose by dt_s; raise DriverError for a time below 0 or above 60 s."""
         if not 0.0 <= dt_s <= LONGEST_ADVANCE_S:
-            raise DriverError(f"the twin cannot advance by {dt_s} s; give 0 to {LONGEST_ADVANCE_S:g} s")
+            raise DriverError(f"the simulated base cannot advance by {dt_s} s; give 0 to {LONGEST_ADVANCE_S:g} s")
         steps = math.ceil(dt_s / STEP_S)
         for _ in range(steps):
             self._step(dt_s / steps)
@@ -119,14 +124,14 @@ class SimulatedBase:
         self.commanded_mps[side] = 0.0
 
     def _step(self, dt_s: float) -> None:
-        self._watch(dt_s)
+        self._update_watchdogs(dt_s)
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         self.velocity_mps += _clamp(velocity_mps - self.velocity_mps, self.limits.acceleration_mps2 * dt_s)
-        wanted_radps = _clamp(self._steered(yaw_rate_radps), self.limits.yaw_rate_radps)
+        wanted_radps = _clamp(self._yaw_rate_to_goal(yaw_rate_radps), self.limits.yaw_rate_radps)
         self.yaw_rate_radps += _clamp(wanted_radps - self.yaw_rate_radps, self.limits.yaw_acceleration_radps2 * dt_s)
-        self._roll(dt_s)
+        self._move(dt_s)
 
-    def _watch(self, dt_s: float) -> None:
+    def _update_watchdogs(self, dt_s: float) -> None:
         before = self.watchdog_expired
         for side in SIDES:
             self._since_command_s[side] += dt_s
@@ -134,36 +139,32 @@ class SimulatedBase:
                 self._stop(side)
         self.expiries += self.watchdog_expired and not before
 
-    def _steered(self, yaw_rate_radps: float) -> float:
-        """The yaw rate towards the heading that is wanted, where there is one and the base is to move."""
+    def _yaw_rate_to_goal(self, yaw_rate_radps: float) -> float:
+        """Return the yaw rate towards the goal heading; the commanded one without a goal, or where the base stops."""
         if self.goal_heading_rad is None or self.commanded_mps == [0.0, 0.0]:
             return yaw_rate_radps
         return self.limits.heading_gain_hz * _wrap(self.goal_heading_rad - self.pose[2])
 
-    def _roll(self, dt_s: float) -> None:
-        """Moves the pose along the chord of the arc."""
+    def _move(self, dt_s: float) -> None:
+        """Move the pose along the chord of the arc."""
         x_m, y_m, heading_rad = self.pose
-        turn_rad, way_m = self.yaw_rate_radps * dt_s, self.velocity_mps * dt_s
-        chord_rad = heading_rad + turn_rad / 2
-        self.travel_m[LEFT] += way_m - turn_rad * self.drive.track_m / 2
-        self.travel_m[RIGHT] += way_m + turn_rad * self.drive.track_m / 2
-        x_m, y_m = x_m + way_m * math.cos(chord_rad), y_m + way_m * math.sin(chord_rad)
-        self.pose = (x_m, y_m, _wrap(heading_rad + turn_rad))
+        rotation_rad, distance_m = self.yaw_rate_radps * dt_s, self.velocity_mps * dt_s
+        chord_rad = heading_rad + rotation_rad / 2
+        self.travel_m[LEFT] += distance_m - rotation_rad * self.drive.track_m / 2
+        self.travel_m[RIGHT] += distance_m + rotation_rad * self.drive.track_m / 2
+        x_m, y_m = x_m + distance_m * math.cos(chord_rad), y_m + distance_m * math.sin(chord_rad)
+        self.pose = (x_m, y_m, _wrap(heading_rad + rotation_rad))
 
     def _twist(self, left_mps: float, right_mps: float) -> tuple[float, float]:
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.drive.track_m
 
-    def _wired(self, left: float, right: float) -> tuple[float, float]:
-        left, right = -left if self.drive.reverse_left else left, -right if self.drive.reverse_right else right
-        return (right, left) if self.drive.swapped else (left, right)
-
 
 def reply_to(base: SimulatedBase, framer: Framer, handle: Callable[[bytes], bytes], data: bytes) -> bytes:
-    """What a controller answers to all frames that end in data; bytes that are of none are errors."""
+    """Return a controller's replies to all frames that end in data; count other bytes as errors."""
     before = framer.garbage
-    answer = b"".join(handle(frame) for frame in framer.feed(data))
+    replies = b"".join(handle(frame) for frame in framer.feed(data))
     base.errors += framer.garbage - before
-    return answer
+    return replies
 
 
 def _clamp(value: float, magnitude: float) -> float:

@@ -1,4 +1,4 @@
-"""The twin of a base that speaks the line protocol."""
+"""Simulated controller with the line protocol."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase,
 
 
 class SimulatedLine:
-    """heading_input: steers to the commanded heading; else follows the commanded yaw rate."""
+    """One controller; heading_input: steer to the commanded heading, else follow the commanded yaw rate."""
 
     def __init__(
         self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: MotionLimits | None = None
@@ -29,39 +29,39 @@ class SimulatedLine:
         self.base = SimulatedBase(drive, limits)
         self._heading_input = heading_input
         self._assembler = LineFramer()
-        self._zero_rad = 0.0  # world heading the controller calls 0
+        self._zero_rad = 0.0  # heading in the world at which the controller's heading is 0
         self._next_seq: int | None = None
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to all lines that end in data."""
+        """Return the replies to all lines that end in data."""
         return reply_to(self.base, self._assembler, lambda line: self.handle(line) or b"", data)
 
     def handle(self, line: bytes) -> bytes | None:
-        """The answer to a line, None where it gets none."""
+        """Return the reply to a line, None without one."""
         try:
             message = decode(line)
         except ProtocolError:
             message = None
         match message:
             case VelocityMessage(seq, command):
-                return self._obey(seq, command)
+                return self._drive(seq, command)
             case WatchdogRequest(watchdog_ms):
-                return self._arm(watchdog_ms)
+                return self._connect(watchdog_ms)
         self.base.errors += 1
         return None
 
-    def _obey(self, seq: int, command: VelocityCommand) -> bytes:
+    def _drive(self, seq: int, command: VelocityCommand) -> bytes:
         self.base.errors += self._next_seq not in (None, seq)
         self._next_seq = (seq + 1) % SEQ_COUNT
         self.base.commands += 1
-        answer = encode(StatusMessage(seq, self._status()))
+        reply = encode(StatusMessage(seq, self._status()))
         steers = self._heading_input and not is_stop(command)
         self.base.goal_heading_rad = command.heading_rad + self._zero_rad if steers else None
         self.base.command(command.velocity_mps, command.yaw_rate_radps)
-        return answer
+        return reply
 
-    def _arm(self, watchdog_ms: int) -> bytes:
-        """Connects a host: stands still, takes the present heading as zero, and any seq as the first."""
+    def _connect(self, watchdog_ms: int) -> bytes:
+        """Start a connection: stop, set the present heading to 0, accept any seq as the first one."""
         self.base.watchdog_ms = watchdog_ms
         self._next_seq = None
         self._zero_rad = self.base.pose[2]

@@ -1,4 +1,4 @@
-"""A simulated controller at the other end of a real pty: the twin of a base, for demonstrations and tests."""
+"""A simulated controller on a pseudo-terminal, for demonstrations and tests."""
 
 from __future__ import annotations
 
@@ -15,34 +15,32 @@ from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
 
 READ_LIMIT_BYTES = 4096
-LONGEST_ABSENCE_S = 0.05  # a twin that got no processor for longer stands still with its clocks: nobody was silent
+LONGEST_ABSENCE_S = 0.05  # a thread that was not scheduled for longer does not advance: the host was not late
 
 
 class SimulatedController(Protocol):
-    """The firmware of a twin: bytes in, bytes out, wheels turned. It checks every byte and counts what is wrong."""
+    """Simulated firmware: receives and sends bytes, and turns the wheels. Invalid bytes are counted as errors."""
 
     @property
     def base(self) -> SimulatedBase:
-        """Its wheels."""
+        """The simulated base."""
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to what has arrived."""
+        """Return the replies to received bytes."""
 
 
 class SimulatedMotor:
-    """A controller on a pty, in real time; its thread is the foreign device's own processor.
-
-    silent: it hears and obeys, but answers nothing. deaf: it does neither. garbage: what comes before each answer.
-    """
+    """A controller on a pty in real time; a thread stands for the processor of the real device."""
 
     def __init__(self, controller: SimulatedController | None = None) -> None:
-        """Opens the pty; `port` is what a driver opens."""
+        """Open the pty; `port` is the path for the driver."""
         self.controller = controller or SimulatedLine()
-        self.unsent = 0  # answers dropped because nobody read
-        self.drop_replies = self.drop_input = False
-        self.garbage = b""
+        self.unsent = 0  # replies dropped because the host did not read
+        self.drop_replies = False  # fault: commands are carried out without a reply
+        self.drop_input = False  # fault: received bytes are ignored
+        self.garbage = b""  # fault: sent before each reply
         self._device, self._host = os.openpty()
-        tty.setraw(self._host)  # and kept open: without an open host side the device side reads errors
+        tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
         os.set_blocking(self._device, False)
         self.port = os.ttyname(self._host)
         self._expiring = threading.Event()
@@ -52,49 +50,49 @@ class SimulatedMotor:
 
     @property
     def base(self) -> SimulatedBase:
-        """The base."""
+        """The simulated base."""
         return self.controller.base
 
     @property
     def commands(self) -> int:
-        """Valid commands so far."""
+        """Number of valid commands received."""
         return self.base.commands
 
     @property
     def errors(self) -> int:
-        """What was wrong so far: bytes, numbers, order."""
+        """Number of errors in the received bytes, numbers and sequence."""
         return self.base.errors
 
     @property
     def pose(self) -> Pose:
-        """x [m], y [m], heading [rad] of the base now."""
+        """Present x [m], y [m], heading [rad] of the base."""
         return self.base.pose
 
     @property
     def watchdog_expired(self) -> bool:
-        """Whether the wheels stand because no command came."""
+        """True if the watchdog has stopped the wheels."""
         return self.base.watchdog_expired
 
     @property
     def last_command(self) -> VelocityCommand:
-        """The motion that was told last, with stamp 0."""
+        """The last commanded motion, with stamp and heading 0."""
         return self.base.last_command
 
     def expire(self) -> None:
-        """Has the watchdog stop the wheels at once."""
+        """Let the watchdog stop the wheels at once."""
         self._expiring.set()
         while self._expiring.is_set() and self._thread.is_alive():
             time.sleep(STEP_S)
 
     def send(self, data: bytes) -> None:
-        """Sends bytes, asked or not; drops them where nobody reads."""
+        """Send bytes; drop them where the host does not read."""
         with contextlib.suppress(BlockingIOError):
             if os.write(self._device, data) == len(data):
                 return
         self.unsent += 1
 
     def close(self) -> None:
-        """Ends the thread and the pty; a second call does nothing."""
+        """End the thread and close the pty; a second call does nothing."""
         if not self._thread.is_alive():
             return
         os.write(self._wake_write, b"x")
@@ -120,6 +118,6 @@ class SimulatedMotor:
     def _receive(self, data: bytes) -> None:
         if self.drop_input:
             return
-        answer = self.controller.feed(data)
-        if answer and not self.drop_replies:
-            self.send(self.garbage + answer)
+        replies = self.controller.feed(data)
+        if replies and not self.drop_replies:
+            self.send(self.garbage + replies)

@@ -1,4 +1,4 @@
-"""The twin of an ODrive v3 with two axes; the source is named in drivers/motors/protocols/odrive_ascii.py."""
+"""Simulated ODrive v3 with two axes; sources as in drivers/motors/protocols/odrive_ascii.py."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import re
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
-from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, reply_to
+from drivers.motors.simulated.simulated_base import SIDES, SimulatedBase, reply_to
 
 _FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"
 _WATCHDOG_EXPIRED, _CLOSED_LOOP, _IDLE = 0x800, 8, 1
 
 
 class SimulatedODrive:
-    """Asks for a checksum on every line, which a real one leaves to the host: a damaged line must never be obeyed."""
+    """One board. It requires a checksum on every line, which is optional for a real one, to detect damaged lines."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
         self.base = SimulatedBase(drive)
         self.base.watchdog_ms = 0
         self._framer = TextFramer()
         self._state = [_IDLE, _IDLE]
-        self._input_vel = [0.0, 0.0]  # turns/s; stays while an axis is disarmed, and counts once it is armed
+        self._input_vel = [0.0, 0.0]  # turns/s; set while an axis is disarmed too, in force once it is armed
         self._settings = {
             f"axis{axis}.{name}": 0.0
             for axis in SIDES
@@ -29,27 +29,24 @@ class SimulatedODrive:
         }
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to all lines that end in data."""
+        """Return the replies to all lines that end in data."""
         return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         body, star, checksum = line.partition(b"*")
-        found = 0
-        for byte in body:
-            found ^= byte
-        if not star or not re.fullmatch(rb"[0-9]{1,3}", checksum) or int(checksum) != found:
+        if not star or not re.fullmatch(rb"[0-9]{1,3}", checksum) or int(checksum) != _xor(body):
             self.base.errors += 1
             return b""
-        answer = self._answer(body.decode("latin-1"))
-        return _sealed(answer) if answer else b""
+        reply = self._reply(body.decode("latin-1"))
+        return b"%b*%d\r\n" % (reply.encode(), _xor(reply.encode())) if reply else b""
 
-    def _answer(self, line: str) -> str:
+    def _reply(self, line: str) -> str:
         self._disarm_expired()
         if match := re.fullmatch(rf"v ([01]) {_FLOAT}", line):
             self.base.commands += 1
             return self._drive(int(match[1]), float(match[2]))
         if match := re.fullmatch(r"u ([01])", line):
-            return self._fed(int(match[1]))
+            return self._feed_axis(int(match[1]))
         if match := re.fullmatch(r"f ([01])", line):
             turns = self._turns_per_m()
             axis = int(match[1])
@@ -58,65 +55,63 @@ class SimulatedODrive:
             return self._read(match[1])
         if match := re.fullmatch(rf"w (\S+) {_FLOAT}", line):
             return self._write(match[1], float(match[2]))
-        return self._wrong("unknown command")
+        return self._reject("unknown command")
 
     def _drive(self, axis: int, turns_per_s: float) -> str:
-        """A disarmed axis is fed and takes the velocity down, but does not turn."""
+        """Set the velocity and feed the watchdog; a disarmed axis does not turn."""
         self._input_vel[axis] = turns_per_s
-        self._fed(axis)
+        self._feed_axis(axis)
         if self._state[axis] == _CLOSED_LOOP:
             self.base.command_channel(axis, turns_per_s / self._turns_per_m())
         return ""
 
-    def _fed(self, axis: int) -> str:
-        self.base.feed(self._side(axis))
+    def _feed_axis(self, axis: int) -> str:
+        self.base.feed(self.base.side_of(axis))
         return ""
 
     def _read(self, name: str) -> str:
         if name == "vbus_voltage":
             return f"{self.base.battery_v:f}"
         if match := re.fullmatch(r"axis([01])\.error", name):
-            expired = self.base.expired[self._side(int(match[1]))]
+            expired = self.base.expired[self.base.side_of(int(match[1]))]
             return str(self.base.fault | _WATCHDOG_EXPIRED * expired)
-        return f"{self._settings[name]:g}" if name in self._settings else self._wrong("invalid property")
+        return f"{self._settings[name]:g}" if name in self._settings else self._reject("invalid property")
 
     def _write(self, name: str, value: float) -> str:
         if match := re.fullmatch(r"axis([01])\.(error|requested_state)", name):
             return self._arm(int(match[1]), match[2], value)
         if name not in self._settings:
-            return self._wrong("invalid property")
+            return self._reject("invalid property")
         self._settings[name] = value
         times_s = [self._settings[f"axis{axis}.config.watchdog_timeout"] for axis in SIDES]
         enabled = all(self._settings[f"axis{axis}.config.enable_watchdog"] for axis in SIDES)
         self.base.watchdog_ms = 1000 * max(times_s) if enabled else 0.0
         return ""
 
-    def _arm(self, axis: int, what: str, value: float) -> str:
-        if what == "error":
-            self.base.expired[self._side(axis)] = bool(int(value) & _WATCHDOG_EXPIRED)
-        elif value == _CLOSED_LOOP and not self.base.expired[self._side(axis)] and not self.base.fault:
+    def _arm(self, axis: int, name: str, value: float) -> str:
+        side = self.base.side_of(axis)
+        if name == "error":
+            self.base.expired[side] = bool(int(value) & _WATCHDOG_EXPIRED)
+        elif value == _CLOSED_LOOP and not self.base.expired[side] and not self.base.fault:
             self._state[axis] = _CLOSED_LOOP
             self.base.command_channel(axis, self._input_vel[axis] / self._turns_per_m())
         return ""
 
     def _disarm_expired(self) -> None:
         for axis in SIDES:
-            if self.base.expired[self._side(axis)]:
+            if self.base.expired[self.base.side_of(axis)]:
                 self._state[axis] = _IDLE
 
-    def _side(self, axis: int) -> int:
-        return RIGHT if bool(axis) != self.base.drive.swapped else LEFT
-
-    def _wrong(self, answer: str) -> str:
+    def _reject(self, reply: str) -> str:
         self.base.errors += 1
-        return answer
+        return reply
 
     def _turns_per_m(self) -> float:
         return self.base.drive.gear / (math.tau * self.base.drive.wheel_radius_m)
 
 
-def _sealed(answer: str) -> bytes:
+def _xor(data: bytes) -> int:
     checksum = 0
-    for byte in answer.encode():
+    for byte in data:
         checksum ^= byte
-    return f"{answer}*{checksum}\r\n".encode()
+    return checksum

@@ -1,4 +1,4 @@
-"""The twin of a Roboteq dual-channel controller; the manual is named in drivers/motors/protocols/roboteq.py."""
+"""Simulated Roboteq dual-channel controller; sources as in drivers/motors/protocols/roboteq.py."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import re
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
-from drivers.motors.protocols.roboteq import MIXED, RPM
+from drivers.motors.protocols.roboteq import FULL, MIXED, RPM, S_PER_MIN
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
-_ORDER = re.compile(rb"!([SG]) ([12]) (-?[0-9]{1,5})")
-_TOP = {b"S": 65535, b"G": 1000}
+_COMMAND = re.compile(rb"!([SG]) ([12]) (-?[0-9]{1,5})")
+_MAX_VALUE = {b"S": 65535, b"G": 1000}  # rpm; full power
 
 
 class SimulatedRoboteq:
-    """Echoes until it is told not to, as one out of the box."""
+    """One controller; by default it echoes, as a real one does."""
 
     def __init__(self, drive: DifferentialDrive | None = None, mode: str = RPM) -> None:
         self.base = SimulatedBase(drive)
@@ -26,26 +26,26 @@ class SimulatedRoboteq:
         self._mixed = [0.0, 0.0]  # throttle and steering
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to all lines that end in data."""
+        """Return the replies to all lines that end in data."""
         return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
         echo = line + b"\r" if self._echo else b""
-        return echo + (self._answer(line) or self._refusal()) + b"\r"
+        return echo + (self._reply(line) or self._rejection()) + b"\r"
 
-    def _answer(self, line: bytes) -> bytes | None:
-        if order := _ORDER.fullmatch(line):
-            return self._obey(order[1], int(order[2]) - 1, int(order[3]))
+    def _reply(self, line: bytes) -> bytes | None:
+        if command := _COMMAND.fullmatch(line):
+            return self._drive(command[1], int(command[2]) - 1, int(command[3]))
         if setting := re.fullmatch(rb"\^(ECHOF|RWD) ([0-9]{1,5})", line):
             return self._set(setting[1], int(setting[2]))
-        return self._question(line)
+        return self._query(line)
 
-    def _refusal(self) -> bytes:
+    def _rejection(self) -> bytes:
         self.base.errors += 1
         return b"-"
 
-    def _obey(self, kind: bytes, channel: int, value: int) -> bytes | None:
-        if abs(value) > _TOP[kind] or (kind == b"S") != (self._mode == RPM):
+    def _drive(self, kind: bytes, channel: int, value: int) -> bytes | None:
+        if abs(value) > _MAX_VALUE[kind] or (kind == b"S") != (self._mode == RPM):
             return None
         self.base.commands += 1
         if self._mode == MIXED:
@@ -54,7 +54,7 @@ class SimulatedRoboteq:
         return b"+"
 
     def _mix(self, channel: int, value: int) -> bytes:
-        """Both motors follow either input, and either feeds the one watchdog."""
+        """Set throttle or steering; both motors follow the steering, which comes last."""
         self._mixed[channel] = value
         throttle, steering = self._mixed
         if channel == 1:
@@ -69,7 +69,7 @@ class SimulatedRoboteq:
             self.base.watchdog_ms = value
         return b"+"
 
-    def _question(self, line: bytes) -> bytes | None:
+    def _query(self, line: bytes) -> bytes | None:
         speeds = b":".join(b"%d" % round(mps / self._unit_mps()) for mps in self.base.channels_mps())
         return {
             b"?S": b"S=" + speeds,
@@ -81,7 +81,7 @@ class SimulatedRoboteq:
         }.get(line)
 
     def _unit_mps(self) -> float:
-        """Wheel speed of one rpm of the motor, or of a thousandth of full power."""
+        """Return the wheel speed of one rpm of the motor, or of a thousandth of full power."""
         if self._mode == RPM:
-            return math.tau * self.base.drive.wheel_radius_m / (60 * self.base.drive.gear)
-        return self.base.drive.max_wheel_mps / 1000
+            return math.tau * self.base.drive.wheel_radius_m / (S_PER_MIN * self.base.drive.gear)
+        return self.base.drive.max_wheel_mps / FULL

@@ -1,4 +1,4 @@
-"""The twin of a Waveshare UGV board; the source is named in drivers/motors/protocols/waveshare_json.py."""
+"""Simulated Waveshare UGV board; sources as in drivers/motors/protocols/waveshare_json.py."""
 
 from __future__ import annotations
 
@@ -8,43 +8,54 @@ from typing import Any
 
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.waveshare_json import (
+    BASE_INFO,
+    ECHO,
+    FEEDBACK,
+    HEARTBEAT,
+    INTERVAL,
+    MAX_LINE,
+    MAX_WHEEL_MPS,
+    SPEED,
+    STREAM,
+)
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
-_TOP_MPS = 2.0
-_SETTINGS = (131, 136, 142, 143)
+_SETTINGS = (STREAM, HEARTBEAT, INTERVAL, ECHO)
+_HEARTBEAT_MS = 3000  # default of the firmware
 
 
 class SimulatedWaveshare:
-    """Streams its feedback with every answer until it is told not to."""
+    """One board; by default it sends its feedback with every reply, and echoes."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
         self.base = SimulatedBase(drive)
-        self.base.watchdog_ms = 3000
-        self._framer = TextFramer(1024)
-        self._settings = {131: 1, 142: 0, 143: 1}
+        self.base.watchdog_ms = _HEARTBEAT_MS
+        self._framer = TextFramer(MAX_LINE)
+        self._settings = {STREAM: 1, INTERVAL: 0, ECHO: 1}
 
     def feed(self, data: bytes) -> bytes:
-        """The answers to all lines that end in data."""
+        """Return the replies to all lines that end in data."""
         return reply_to(self.base, self._framer, self._handle, data)
 
     def _handle(self, line: bytes) -> bytes:
-        answer = line + b"\r\n" if self._settings[143] else b""
+        echo = line + b"\r\n" if self._settings[ECHO] else b""
         try:
             command = json.loads(line)
             kind = command["T"]
         except (ValueError, TypeError, KeyError, RecursionError):
             kind, command = None, {}
-        if kind == 1:
+        if kind == SPEED:
             self._drive(command)
         elif kind in _SETTINGS:
             self._set(kind, command.get("cmd"))
-        elif kind != 130:
+        elif kind != FEEDBACK:
             self.base.errors += 1
-        return answer + self._feedback() if kind == 130 or self._settings[131] else answer
+        return echo + self._feedback() if kind == FEEDBACK or self._settings[STREAM] else echo
 
     def _drive(self, command: dict[str, Any]) -> None:
         speeds: list[Any] = [command.get("L"), command.get("R")]
-        if len(command) != 3 or not all(isinstance(mps, float) and abs(mps) <= _TOP_MPS for mps in speeds):
+        if len(command) != 3 or not all(isinstance(mps, float) and abs(mps) <= MAX_WHEEL_MPS for mps in speeds):
             self.base.errors += 1
             return
         self.base.commands += 1
@@ -53,13 +64,13 @@ class SimulatedWaveshare:
     def _set(self, kind: int, value: object) -> None:
         if not isinstance(value, int) or value < 0:
             self.base.errors += 1
-        elif kind == 136:
+        elif kind == HEARTBEAT:
             self.base.watchdog_ms = value
         else:
             self._settings[kind] = value
 
     def _feedback(self) -> bytes:
         first, second = self.base.channels_mps()
-        said = {"T": 1001, "L": first, "R": second, "r": 0.0, "p": 0.0, "y": math.degrees(self.base.pose[2]),
-                "temp": 31.5, "v": self.base.battery_v}  # fmt: skip
-        return json.dumps(said).encode() + b"\r\n"
+        message = {"T": BASE_INFO, "L": first, "R": second, "r": 0.0, "p": 0.0, "y": math.degrees(self.base.pose[2]),
+                   "temp": 31.5, "v": self.base.battery_v}  # fmt: skip
+        return json.dumps(message).encode() + b"\r\n"

@@ -1,4 +1,4 @@
-"""The two-wheeled base: units, signs, wiring, and the curvature that limits keep."""
+"""The differential drive: units, signs, wiring, and limits that keep the curvature."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def test_a_left_turn_has_a_faster_right_wheel() -> None:
     assert drive.channels(command(0.5, 1.0)) == pytest.approx((0.3, 0.7))
 
 
-def test_a_metre_is_so_many_turns_of_the_motor() -> None:
+def test_turns_of_the_motor_per_metre() -> None:
     assert DifferentialDrive(wheel_radius_m=0.5 / math.pi, gear=20.0).turns_per_m == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize("wiring", list(itertools.product([False, True], repeat=3)))
-def test_motion_undoes_the_wiring(wiring: tuple[bool, bool, bool]) -> None:
+def test_motion_inverts_the_wiring(wiring: tuple[bool, bool, bool]) -> None:
     reverse_left, reverse_right, swapped = wiring
     drive = DifferentialDrive(reverse_left=reverse_left, reverse_right=reverse_right, swapped=swapped)
     assert drive.motion(*drive.channels(command(0.3, -0.7))) == pytest.approx((0.3, -0.7))
@@ -41,7 +41,7 @@ def test_wiring_by_name() -> None:
     assert DifferentialDrive(reverse_right=True, swapped=True).channels(command(0.5, 0.0)) == (-0.5, 0.5)
 
 
-def test_no_wheel_is_ever_too_fast_and_the_curvature_stays() -> None:
+def test_limits_wheel_speeds_and_keeps_the_curvature() -> None:
     rng, drive = random.Random(2), DifferentialDrive(track_m=0.35, max_wheel_mps=0.8)
     for _ in range(2000):
         wanted = command(rng.gauss(0, 3), rng.gauss(0, 8))
@@ -53,13 +53,13 @@ def test_no_wheel_is_ever_too_fast_and_the_curvature_stays() -> None:
         assert velocity_mps * wanted.velocity_mps >= 0.0
 
 
-def test_what_fits_is_not_touched() -> None:
+def test_does_not_change_commands_within_the_limits() -> None:
     assert DifferentialDrive().limited(command(0.3, 0.2)) == (0.3, 0.2)
     assert DifferentialDrive().limited(command(0.0, 0.0)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("name", ["track_m", "wheel_radius_m", "max_wheel_mps", "gear", "ticks_per_turn", "pole_pairs"])
 @pytest.mark.parametrize("bad", [0, -1, math.nan, math.inf])
-def test_sizes_must_make_sense(name: str, bad: float) -> None:
+def test_refuses_invalid_sizes(name: str, bad: float) -> None:
     with pytest.raises(DriverError, match=name):
         DifferentialDrive(**{name: bad})  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The motor of the line protocol and its twin: as pure state, and over a real pty."""
+"""The serial motor with the line protocol, and its simulated controller: directly, and over a real pty."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
-PATIENCE_S = 20.0  # bounds a wait on a loaded machine; nothing here is measured against it
-ANSWER_S = 2.0
+PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
+REPLY_S = 2.0
 
 
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
-    """Commands at 20 Hz for a while."""
+    """Send a command at 20 Hz."""
     for _ in range(round(seconds * 20)):
         assert state.handle(encode(VelocityMessage(state.base.commands, command))) is not None
         state.base.advance(0.05)
@@ -49,15 +49,15 @@ def until(condition: Callable[[], bool]) -> bool:
 
 
 @pytest.fixture
-def twin() -> Iterator[SimulatedMotor]:
-    with contextlib.closing(SimulatedMotor()) as twin:
-        yield twin
+def simulated() -> Iterator[SimulatedMotor]:
+    with contextlib.closing(SimulatedMotor()) as simulated:
+        yield simulated
 
 
-# The twin as pure state
+# The simulated controller
 
 
-def test_twin_drives_straight() -> None:
+def test_drives_straight() -> None:
     state = SimulatedLine()
     drive(state, 2.0, VelocityCommand(0, 0.5, 0.0, 0.0))
     x_m, y_m, heading_rad = state.base.pose
@@ -66,13 +66,13 @@ def test_twin_drives_straight() -> None:
 
 
 @pytest.mark.parametrize("heading_rad", [1.0, -2.0, 3.1, -3.1])
-def test_twin_steers_to_the_heading(heading_rad: float) -> None:
+def test_steers_to_the_heading(heading_rad: float) -> None:
     state = SimulatedLine()
     drive(state, 6.0, VelocityCommand(0, 0.2, heading_rad, 0.0))
     assert state.base.pose[2] == pytest.approx(heading_rad, abs=0.01)
 
 
-def test_twin_crosses_half_a_turn_the_short_way() -> None:
+def test_turns_the_short_way_across_half_a_turn() -> None:
     state = SimulatedLine()
     drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
     before, turned = state.base.pose[2], 0.0
@@ -83,7 +83,7 @@ def test_twin_crosses_half_a_turn_the_short_way() -> None:
     assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
 
 
-def test_twin_without_heading_input_follows_the_yaw_rate() -> None:
+def test_follows_the_yaw_rate_without_heading_input() -> None:
     state = SimulatedLine(heading_input=False)
     drive(state, 2.0, VelocityCommand(0, 0.5, 2.0, 0.5))
     x_m, y_m, heading_rad = state.base.pose
@@ -99,7 +99,7 @@ def test_stop_does_not_turn_towards_its_heading() -> None:
     assert state.base.velocity_mps == 0.0 and is_stop(stop_command(7))
 
 
-def test_watchdog_stops_the_wheels_and_says_so() -> None:
+def test_watchdog_stops_the_wheels_and_reports_it() -> None:
     state = SimulatedLine()
     assert state.handle(encode(WatchdogRequest(200))) == encode(WatchdogReply(200))
     drive(state, 1.0, VelocityCommand(0, 0.5, 0.0, 0.0))
@@ -120,11 +120,11 @@ def test_noise_does_not_feed_the_watchdog() -> None:
     assert state.base.watchdog_expired and state.base.errors == 20 and state.base.commands == 0
 
 
-def test_gap_in_seq_is_an_error_but_obeyed() -> None:
+def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
     state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
-    for seq, told in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
-        assert state.handle(encode(VelocityMessage(seq, told))) is not None
+    for seq, sent in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
+        assert state.handle(encode(VelocityMessage(seq, sent))) is not None
     assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
@@ -137,7 +137,7 @@ def test_heading_counts_from_where_the_host_connected() -> None:
     assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
 
 
-def test_twin_survives_any_line() -> None:
+def test_accepts_any_line() -> None:
     rng, state = random.Random(5), SimulatedLine()
     for _ in range(1000):
         assert state.handle(rng.randbytes(rng.randint(0, 40))) is None
@@ -145,198 +145,199 @@ def test_twin_survives_any_line() -> None:
 
 
 @pytest.mark.parametrize("dt_s", [-0.1, math.nan, math.inf, 61.0])
-def test_twin_refuses_odd_times(dt_s: float) -> None:
+def test_refuses_invalid_times(dt_s: float) -> None:
     with pytest.raises(DriverError, match="cannot advance"):
         SimulatedLine().base.advance(dt_s)
 
 
-# The serial motor and the twin over a pty
+# The serial motor and the simulated controller over a pty
 
 
-def test_commands_arrive_and_are_answered(twin: SimulatedMotor) -> None:
-    motor: MotorDriver = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
+def test_commands_get_replies(simulated: SimulatedMotor) -> None:
+    motor: MotorDriver = SerialMotor(simulated.port, timeout_s=REPLY_S, watchdog_ms=10_000)
     command = VelocityCommand(123, 0.5, 0.0, 0.0)
     assert until(lambda: motor.send(command).velocity_mps == 0.5)
-    assert twin.pose[0] > 0.0
-    assert twin.last_command == VelocityCommand(0, 0.5, 0.0, 0.0)
+    assert simulated.pose[0] > 0.0
+    assert simulated.last_command == VelocityCommand(0, 0.5, 0.0, 0.0)
     assert motor.send(command) == MotorStatus(0.5, 0.0, 0.0, False, 0, 12.0)
     motor.close()
-    assert twin.errors == 0 and twin.base.watchdog_ms == 10_000
+    assert simulated.errors == 0 and simulated.base.watchdog_ms == 10_000
 
 
-def test_many_commands_over_the_end_of_seq(twin: SimulatedMotor) -> None:
+def test_seq_wraps_around(simulated: SimulatedMotor) -> None:
     protocol = LineProtocol(DifferentialDrive())
     protocol._seq = 65500
-    motor = SerialMotor(twin.port, protocol, timeout_s=ANSWER_S, watchdog_ms=10_000)
+    motor = SerialMotor(simulated.port, protocol, timeout_s=REPLY_S, watchdog_ms=10_000)
     with contextlib.closing(motor):
         for i in range(100):
             motor.send(VelocityCommand(i, 0.001 * i, 0.1 * i, -0.02 * i))
-        assert twin.commands == 101 and twin.errors == 0 and motor.garbage == motor.bad_frames == 0
+        assert simulated.commands == 101 and simulated.errors == 0 and motor.garbage == motor.bad_frames == 0
 
 
-def test_unsendable_command_sends_nothing(twin: SimulatedMotor) -> None:
-    with contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor:
-        before = twin.commands
+def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
+    with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
+        before = simulated.commands
         with pytest.raises(DriverError, match="velocity is nan"):
             motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
-        assert twin.commands == before
+        assert simulated.commands == before
         motor.send(stop_command(0))
-        assert twin.commands == before + 1 and twin.errors == 0
+        assert simulated.commands == before + 1 and simulated.errors == 0
 
 
 @pytest.mark.parametrize(
     ("port", "what"),
     [("/dev/no-such-motor", "no such port"), ("/dev/null", "serial port"), ("/", "serial port"), ("", "port")],
 )
-def test_open_failure_says_what_to_do(port: str, what: str) -> None:
+def test_open_failure_gives_advice(port: str, what: str) -> None:
     with pytest.raises(DriverError, match=what) as caught:
         SerialMotor(port)
     assert f"motor port {port!r} " in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("watchdog_ms", "timeout_s"), [(0, 0.05), (20_000, 0.05), (500, 0.0), (500, math.nan)])
-def test_settings_must_make_sense(twin: SimulatedMotor, watchdog_ms: int, timeout_s: float) -> None:
+def test_refuses_invalid_settings(simulated: SimulatedMotor, watchdog_ms: int, timeout_s: float) -> None:
     with pytest.raises(DriverError, match=r"watchdog|timeout"):
-        SerialMotor(twin.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
+        SerialMotor(simulated.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
 
 
-class Stubborn(SimulatedLine):
+class FixedWatchdog(SimulatedLine):
     """A controller that keeps its own watchdog time."""
 
     def handle(self, line: bytes) -> bytes | None:
-        """The answer of the twin, but with 1000 ms in force."""
-        answer = super().handle(line)
-        return encode(WatchdogReply(1000)) if answer and answer.startswith(b"$A") else answer
+        """Return the usual reply, but with 1000 ms in force."""
+        reply = super().handle(line)
+        return encode(WatchdogReply(1000)) if reply and reply.startswith(b"$A") else reply
 
 
-def test_watchdog_in_force_is_verified() -> None:
+def test_verifies_the_watchdog_in_force() -> None:
     with (
-        contextlib.closing(SimulatedMotor(Stubborn())) as twin,
-        pytest.raises(DriverError, match="500 ms asked, 1000 ms in force"),
+        contextlib.closing(SimulatedMotor(FixedWatchdog())) as simulated,
+        pytest.raises(DriverError, match="500 ms requested, 1000 ms in force"),
     ):
-        SerialMotor(twin.port, timeout_s=ANSWER_S)
+        SerialMotor(simulated.port, timeout_s=REPLY_S)
 
 
-class Stuck(SimulatedLine):
-    """A controller whose watchdog never lets go."""
+class ExpiredForever(SimulatedLine):
+    """A controller whose watchdog stays expired."""
 
     def _status(self) -> MotorStatus:
         return replace(super()._status(), watchdog_expired=True)
 
 
-def test_a_watchdog_that_never_lets_go_is_an_error() -> None:
-    with contextlib.closing(SimulatedMotor(Stuck())) as twin, pytest.raises(DriverError, match="stays stopped"):
-        SerialMotor(twin.port, connect_s=0.1)
+def test_a_watchdog_that_stays_expired_is_an_error() -> None:
+    controller = ExpiredForever()
+    with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="stays stopped"):
+        SerialMotor(simulated.port, connect_s=0.1)
 
 
 class Echo(SimulatedLine):
-    """Two crossed wires: what is sent comes back."""
+    """A port that returns all that is sent."""
 
     def handle(self, line: bytes) -> bytes | None:
-        """The line itself."""
+        """Return the line itself."""
         return line
 
 
-def test_echo_is_not_taken_for_an_answer() -> None:
-    with contextlib.closing(SimulatedMotor(Echo())) as twin, pytest.raises(DriverError, match="no answer"):
-        SerialMotor(twin.port, connect_s=0.1)
+def test_an_echo_is_no_reply() -> None:
+    with contextlib.closing(SimulatedMotor(Echo())) as simulated, pytest.raises(DriverError, match="no answer"):
+        SerialMotor(simulated.port, connect_s=0.1)
 
 
 class Noisy(SimulatedLine):
-    """A controller behind a bad cable: noise and stale answers before each good one."""
+    """A controller with a bad cable: noise and old replies before each valid one."""
 
     def handle(self, line: bytes) -> bytes | None:
-        """The twin's answer behind noise, a broken line and an old status."""
-        answer = super().handle(line) or b""
+        """Return the usual reply after noise, a broken line and an old status."""
+        reply = super().handle(line) or b""
         old_status = encode(StatusMessage(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0)))
-        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + old_status + answer
+        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + old_status + reply
 
 
-def test_noise_before_the_answer_is_skipped_and_counted() -> None:
+def test_skips_and_counts_noise_before_the_reply() -> None:
     with (
-        contextlib.closing(SimulatedMotor(Noisy())) as twin,
-        contextlib.closing(SerialMotor(twin.port, timeout_s=ANSWER_S)) as motor,
+        contextlib.closing(SimulatedMotor(Noisy())) as simulated,
+        contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor,
     ):
         assert motor.send(stop_command(0)).fault == 0
         assert motor.bad_frames == 3 and motor.garbage == 3 * 6  # connected, stopped, sent
 
 
-def test_twin_counts_what_is_not_of_the_protocol(twin: SimulatedMotor) -> None:
-    descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
+def test_simulated_motor_counts_invalid_bytes(simulated: SimulatedMotor) -> None:
+    descriptor = os.open(simulated.port, os.O_RDWR | os.O_NOCTTY)
     os.write(descriptor, b"hello\n$V,1,2,3,4*0000\n" + encode(VelocityMessage(5, stop_command(0))))
-    assert until(lambda: twin.commands == 1)
-    assert twin.errors == 5 + 1
+    assert until(lambda: simulated.commands == 1)
+    assert simulated.errors == 5 + 1
     os.close(descriptor)
 
 
-def test_twin_outlives_a_host_that_never_reads(twin: SimulatedMotor) -> None:
-    descriptor = os.open(twin.port, os.O_RDWR | os.O_NOCTTY)
+def test_simulated_motor_survives_a_host_that_never_reads(simulated: SimulatedMotor) -> None:
+    descriptor = os.open(simulated.port, os.O_RDWR | os.O_NOCTTY)
     for seq in range(2000):
         os.write(descriptor, encode(VelocityMessage(seq, stop_command(0))))
-    assert until(lambda: twin.commands == 2000) and twin.unsent > 0
+    assert until(lambda: simulated.commands == 2000) and simulated.unsent > 0
     os.close(descriptor)
 
 
 # The protocol's host, without a port
 
 
-def test_heading_goes_on_where_it_was_after_a_new_connection() -> None:
-    """A controller counts from 0 again once its watchdog is set; the robot's heading in odom does not."""
-    protocol, twin = LineProtocol(DifferentialDrive()), SimulatedLine()
-    told(protocol.connect(500), twin)
-    turn(protocol, twin, 1.0)
-    assert twin.base.pose[2] == pytest.approx(1.0, abs=0.01)
-    told(protocol.connect(500), twin)
-    status = turn(protocol, twin, 1.5)
-    assert twin.base.pose[2] == pytest.approx(1.5, abs=0.01)
+def test_heading_continues_after_a_reconnection() -> None:
+    """A controller measures from 0 again once its watchdog is set; the heading reported by the protocol continues."""
+    protocol, simulated = LineProtocol(DifferentialDrive()), SimulatedLine()
+    run(protocol.connect(500), simulated)
+    turn(protocol, simulated, 1.0)
+    assert simulated.base.pose[2] == pytest.approx(1.0, abs=0.01)
+    run(protocol.connect(500), simulated)
+    status = turn(protocol, simulated, 1.5)
+    assert simulated.base.pose[2] == pytest.approx(1.5, abs=0.01)
     assert status.heading_rad == pytest.approx(1.5, abs=0.01)
 
 
-def turn(protocol: LineProtocol, twin: SimulatedLine, heading_rad: float) -> MotorStatus:
+def turn(protocol: LineProtocol, simulated: SimulatedLine, heading_rad: float) -> MotorStatus:
     for _ in range(100):
-        status = told(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), twin)
-        twin.base.advance(0.05)
+        status = run(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), simulated)
+        simulated.base.advance(0.05)
     return status
 
 
-def told(script: Transaction[T], twin: SimulatedLine) -> T:
-    """What a script returns that needs one answer."""
+def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:
+    """Run a transaction that needs one reply, and return its result."""
     try:
-        script.send(twin.handle(next(script)) or b"")
+        transaction.send(simulated.handle(next(transaction)) or b"")
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
-    raise AssertionError("it wants more")
+    raise AssertionError("the transaction waits for more")
 
 
 class Stalling(SimulatedLine):
-    """A controller that stops reading once it is told to."""
+    """A controller that stops reading while `reading` is not set."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.going_on = threading.Event()
-        self.going_on.set()
+        self.reading = threading.Event()
+        self.reading.set()
 
     def feed(self, data: bytes) -> bytes:
-        """The twin's answers, while it goes on."""
-        self.going_on.wait(PATIENCE_S)
+        """Return the replies, once it reads."""
+        self.reading.wait(PATIENCE_S)
         return super().feed(data)
 
 
-def test_a_line_that_takes_no_more_is_an_error_and_close_returns() -> None:
+def test_a_full_output_buffer_is_an_error_and_close_returns() -> None:
     controller = Stalling()
-    with contextlib.closing(SimulatedMotor(controller)) as twin:
-        motor = SerialMotor(twin.port, timeout_s=ANSWER_S, watchdog_ms=10_000)
-        controller.going_on.clear()
-        fill(twin.port)
+    with contextlib.closing(SimulatedMotor(controller)) as simulated:
+        motor = SerialMotor(simulated.port, timeout_s=REPLY_S, watchdog_ms=10_000)
+        controller.reading.clear()
+        fill(simulated.port)
         with pytest.raises(DriverError, match="gave no answer"):
             motor.send(VelocityCommand(0, 0.5, 0.0, 0.0))
         motor.close()
-        controller.going_on.set()
-    assert twin.last_command == stop_command(0)
+        controller.reading.set()
+    assert simulated.last_command == stop_command(0)
 
 
 def fill(port: str) -> None:
-    """Writes until the kernel takes no more."""
+    """Write until the kernel's buffer is full."""
     descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     with contextlib.suppress(BlockingIOError):
         while True:

@@ -1,25 +1,25 @@
-"""Scripts of motor protocols, talked to by hand."""
+"""Transactions of motor protocols, run with given frames."""
 
 from __future__ import annotations
 
 from drivers.motors.motor_protocol import T, Transaction
 
 
-class Unfinished(Exception):  # noqa: N818 - it is what was found
-    """The script wants to hear more."""
+class UnfinishedError(Exception):
+    """The transaction waits for more frames."""
 
 
-def result(script: Transaction[T], *frames: bytes) -> T:
-    """What a script returns once it has heard the frames; Unfinished where it goes on waiting."""
-    next(script)
+def result(transaction: Transaction[T], *frames: bytes) -> T:
+    """Return the result of a transaction that receives the frames; raise UnfinishedError if it waits for more."""
+    next(transaction)
     try:
         for frame in frames:
-            script.send(frame)
+            transaction.send(frame)
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
-    raise Unfinished
+    raise UnfinishedError
 
 
-def told(script: Transaction[T]) -> bytes:
-    """The first bytes that a script writes."""
-    return next(script)
+def written(transaction: Transaction[T]) -> bytes:
+    """Return the first bytes that a transaction writes."""
+    return next(transaction)

@@ -1,4 +1,4 @@
-"""The motor's line protocol: known lines, every range's edge, any bytes."""
+"""The line protocol: known lines, limits of all ranges, invalid bytes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MESSAGES: list[LineMessage] = [
 ]
 
 
-def sealed(body: bytes) -> bytes:
+def with_checksum(body: bytes) -> bytes:
     return b"$%b*%04X\n" % (body, crc16(body))
 
 
@@ -46,12 +46,12 @@ def test_checksum_is_ccitt_false() -> None:
 def test_known_lines() -> None:
     command = VelocityCommand(99, 0.3, -1.571, 0.0504)
     assert encode(VelocityMessage(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
-    assert encode(StatusMessage(17, STATUS)) == sealed(b"S,17,250,-1500,125,12600,7,1")
-    assert encode(WatchdogRequest(500)) == sealed(b"W,500")
+    assert encode(StatusMessage(17, STATUS)) == with_checksum(b"S,17,250,-1500,125,12600,7,1")
+    assert encode(WatchdogRequest(500)) == with_checksum(b"W,500")
 
 
 @pytest.mark.parametrize("message", MESSAGES)
-def test_comes_back(message: LineMessage) -> None:
+def test_decodes_what_it_encodes(message: LineMessage) -> None:
     line = encode(message)
     assert decode(line) == message
     assert decode(line.rstrip() + b"\r\n") == decode(line.rstrip()) == message
@@ -67,7 +67,7 @@ def test_unknown_battery_is_nan() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308, 10.001, -10.001, 20.001, -20.001])
 @pytest.mark.parametrize("field", ["velocity_mps", "heading_rad", "yaw_rate_radps"])
-def test_numbers_without_a_place_never_encode(field: str, bad: float) -> None:
+def test_refuses_to_encode_numbers_out_of_range(field: str, bad: float) -> None:
     if field == "yaw_rate_radps" and abs(bad) < 20:
         bad *= 3
     numbers = {"velocity_mps": 0.1, "heading_rad": 0.1, "yaw_rate_radps": 0.1, field: bad}
@@ -77,7 +77,7 @@ def test_numbers_without_a_place_never_encode(field: str, bad: float) -> None:
 
 @pytest.mark.parametrize("message", [VelocityMessage(-1, stop_command(0)), VelocityMessage(65536, stop_command(0)),
                                      WatchdogRequest(0), WatchdogRequest(19), WatchdogRequest(10_001)])  # fmt: skip
-def test_counts_and_times_stay_inside(message: LineMessage) -> None:
+def test_refuses_to_encode_counts_and_times_out_of_range(message: LineMessage) -> None:
     with pytest.raises(ProtocolError, match="keep it inside"):
         encode(message)
 
@@ -88,12 +88,12 @@ def test_counts_and_times_stay_inside(message: LineMessage) -> None:
      b"V,1,10001,0,0", b"V,1,0,3143,0", b"V,1,0,0,20001", b"V,65536,0,0,0", b"V,-1,0,0,0", b"V,1,0.5,0,0", b"W,0",
      b"W,1,2,3,4", b"V,0000001,0,0,0", "V,\u0661,0,0,0".encode(), b"S,1,0,0,0,0,0,2", b"A,10001"],
 )  # fmt: skip
-def test_well_sealed_nonsense_is_refused(body: bytes) -> None:
+def test_refuses_invalid_lines_with_a_valid_checksum(body: bytes) -> None:
     with pytest.raises(ProtocolError):
-        decode(sealed(body))
+        decode(with_checksum(body))
 
 
-def test_every_changed_byte_is_noticed() -> None:
+def test_detects_every_changed_byte() -> None:
     line = encode(VelocityMessage(17, VelocityCommand(0, 0.3, -1.571, 0.05)))
     for i in range(len(line) - 1):
         for value in set(range(256)) - {line[i], line[i] ^ 0x20}:  # hexadecimal digits may be small letters
@@ -107,26 +107,26 @@ def test_errors_are_driver_errors_in_one_line() -> None:
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
-def test_any_bytes() -> None:
+def test_refuses_random_bytes() -> None:
     rng = random.Random(3)
-    assembler = LineFramer()
+    framer = LineFramer()
     for _ in range(3000):
         noise = bytes(rng.choice(b"$V,S*W0123456789-AF\r\n\xff\x00") for _ in range(rng.randint(0, 90)))
-        for line in [noise, *assembler.feed(noise)]:
+        for line in [noise, *framer.feed(noise)]:
             with pytest.raises(ProtocolError):
                 decode(line)
 
 
-def test_assembler_takes_any_pieces() -> None:
+def test_framer_accepts_pieces_of_any_size() -> None:
     rng = random.Random(4)
     stream = b"".join(encode(message) for message in MESSAGES * 20)
-    assembler, lines = LineFramer(), []
+    framer, lines = LineFramer(), []
     while stream:
         size = rng.randint(1, 40)
-        lines += assembler.feed(stream[:size])
+        lines += framer.feed(stream[:size])
         stream = stream[size:]
     assert [decode(line) for line in lines] == MESSAGES * 20
-    assert assembler.garbage == 0
+    assert framer.garbage == 0
 
 
 @pytest.mark.parametrize(
@@ -134,15 +134,15 @@ def test_assembler_takes_any_pieces() -> None:
     [(b"boot v1\r\n", 7), (b"$V,1,2", 6), (b"\xff\x00\xfe", 3), (b"$" * 10, 10), (b"$" + b"x" * 10_000, 10_001),
      (b"\r\n\r\n", 0)],
 )  # fmt: skip
-def test_assembler_finds_the_next_line(noise: bytes, garbage: int) -> None:
-    assembler = LineFramer()
-    (line,) = assembler.feed(noise + encode(WatchdogRequest(500)))
+def test_framer_finds_the_next_line(noise: bytes, garbage: int) -> None:
+    framer = LineFramer()
+    (line,) = framer.feed(noise + encode(WatchdogRequest(500)))
     assert decode(line) == WatchdogRequest(500)
-    assert assembler.garbage == garbage
+    assert framer.garbage == garbage
 
 
-def test_assembler_stays_small() -> None:
-    assembler = LineFramer()
+def test_framer_needs_bounded_memory() -> None:
+    framer = LineFramer()
     for _ in range(100):
-        assert assembler.feed(b"$" + b"1" * 5000) == []
-    assert len(assembler._line) <= MAX_LINE
+        assert framer.feed(b"$" + b"1" * 5000) == []
+    assert len(framer._line) <= MAX_LINE

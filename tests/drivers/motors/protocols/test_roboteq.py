@@ -1,4 +1,4 @@
-"""Roboteq: the bytes of the manual, and what is not taken for an answer."""
+"""Roboteq: the bytes of the manual, and input that is not accepted as a reply."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.roboteq import MIXED, POWER, Roboteq
-from tests.drivers.motors.transactions import Unfinished, result, told
+from tests.drivers.motors.transactions import UnfinishedError, result, written
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, gear=10.0, max_wheel_mps=2.0)  # 600 rpm at 1 m/s
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)
@@ -18,10 +18,10 @@ ANSWERS = (b"+", b"+", b"S=150:450", b"V=246", b"FF=0")
 
 
 def test_bytes_of_each_mode() -> None:
-    assert told(Roboteq(DRIVE).drive(TURN, 0.0)) == b"!S 1 150\r!S 2 450\r?S\r?V 2\r?FF\r"
-    assert told(Roboteq(DRIVE, POWER).drive(TURN, 0.0)) == b"!G 1 125\r!G 2 375\r?M\r?V 2\r?FF\r"
-    assert told(Roboteq(DRIVE, MIXED).drive(TURN, 0.0)) == b"!G 1 250\r!G 2 -125\r?M\r?V 2\r?FF\r"
-    assert told(Roboteq(DRIVE).connect(500)) == b"^ECHOF 1\r^RWD 500\r~RWD\r~MXMD\r"
+    assert written(Roboteq(DRIVE).drive(TURN, 0.0)) == b"!S 1 150\r!S 2 450\r?S\r?V 2\r?FF\r"
+    assert written(Roboteq(DRIVE, POWER).drive(TURN, 0.0)) == b"!G 1 125\r!G 2 375\r?M\r?V 2\r?FF\r"
+    assert written(Roboteq(DRIVE, MIXED).drive(TURN, 0.0)) == b"!G 1 250\r!G 2 -125\r?M\r?V 2\r?FF\r"
+    assert written(Roboteq(DRIVE).connect(500)) == b"^ECHOF 1\r^RWD 500\r~RWD\r~MXMD\r"
 
 
 def test_status_in_the_units_of_the_base() -> None:
@@ -32,7 +32,7 @@ def test_status_in_the_units_of_the_base() -> None:
     assert (power.velocity_mps, power.yaw_rate_radps) == pytest.approx((0.5, 1.0))
 
 
-def test_echoes_are_skipped_and_nonsense_is_counted() -> None:
+def test_skips_echoes_and_counts_invalid_lines() -> None:
     protocol = Roboteq(DRIVE)
     echoed = (b"!S 1 150", b"+", b"!S 2 450", b"+", b"?S", b"S=150:450", b"?V 2", b"V=246", b"?FF")
     assert result(protocol.drive(TURN, 0.0), *echoed, b"\xff\x00", b"V=24x", b"FF=0").battery_v == 24.6
@@ -40,33 +40,33 @@ def test_echoes_are_skipped_and_nonsense_is_counted() -> None:
 
 
 @pytest.mark.parametrize("missing", range(len(ANSWERS)))
-def test_every_order_is_confirmed_and_every_question_answered(missing: int) -> None:
-    with pytest.raises(Unfinished):
+def test_waits_for_every_confirmation_and_every_reply(missing: int) -> None:
+    with pytest.raises(UnfinishedError):
         result(Roboteq(DRIVE).drive(TURN, 0.0), *ANSWERS[:missing], *ANSWERS[missing + 1 :])
 
 
-def test_a_refusal_is_an_error_that_names_the_lines() -> None:
-    with pytest.raises(DriverError, match=r"refused one of !S 1 150"):
+def test_a_rejection_is_an_error_that_names_the_lines() -> None:
+    with pytest.raises(DriverError, match=r"rejected one of !S 1 150"):
         result(Roboteq(DRIVE).drive(TURN, 0.0), b"+", b"-")
 
 
-def test_the_watchdog_is_read_back() -> None:
+def test_reads_back_the_watchdog() -> None:
     assert result(Roboteq(DRIVE).connect(500), b"+", b"+", b"RWD=500", b"MXMD=0") == 500
-    with pytest.raises(DriverError, match="500 ms asked, 0 ms in force"):
+    with pytest.raises(DriverError, match="500 ms requested, 0 ms in force"):
         result(Roboteq(DRIVE).connect(500), b"+", b"+", b"RWD=0", b"MXMD=0")
 
 
 @pytest.mark.parametrize(("mode", "mixing"), [("rpm", b"MXMD=1"), (POWER, b"MXMD=2"), (MIXED, b"MXMD=0")])
-def test_mixing_must_be_as_the_protocol_wants_it(mode: str, mixing: bytes) -> None:
+def test_requires_the_mixing_mode_of_the_protocol(mode: str, mixing: bytes) -> None:
     with pytest.raises(DriverError, match="mixing"):
         result(Roboteq(DRIVE, mode).connect(500), b"+", b"+", b"RWD=500", mixing)
 
 
-def test_a_controller_with_one_channel_is_refused() -> None:
+def test_refuses_a_controller_with_one_channel() -> None:
     with pytest.raises(DriverError, match="two"):
         result(Roboteq(DRIVE).drive(TURN, 0.0), b"+", b"+", b"S=150", b"V=246", b"FF=0")
 
 
-def test_speeds_stay_within_the_manual() -> None:
+def test_limits_speeds_to_the_range_of_the_manual() -> None:
     fast = DifferentialDrive(wheel_radius_m=0.001, gear=100.0, max_wheel_mps=20.0)
-    assert told(Roboteq(fast).drive(VelocityCommand(0, 20.0, 0.0, 0.0), 0.0)).startswith(b"!S 1 65535\r!S 2 65535\r")
+    assert written(Roboteq(fast).drive(VelocityCommand(0, 20.0, 0.0, 0.0), 0.0)).startswith(b"!S 1 65535\r!S 2 65535\r")

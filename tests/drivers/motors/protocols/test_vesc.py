@@ -1,4 +1,4 @@
-"""VESC: packets, the pair on CAN, and a timeout that can only be read."""
+"""VESC: packets, the pair on CAN, and the timeout, which can only be read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import MASK, PacketFramer, Vesc, packet
-from tests.drivers.motors.transactions import Unfinished, result, told
+from tests.drivers.motors.transactions import UnfinishedError, result, written
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, pole_pairs=7, can_id=9)  # 420 erpm at 1 m/s
 TURN = VelocityCommand(0, 0.5, 0.0, 1.0)
@@ -35,10 +35,10 @@ def test_bytes_of_a_command() -> None:
     asked = bytes.fromhex("32") + MASK.to_bytes(4, "big")
     speeds = bytes.fromhex("08 00000069"), bytes.fromhex("08 0000013b")  # 105 and 315
     whole = [asked, b"\x22\x09" + asked, speeds[0], b"\x22\x09" + speeds[1]]
-    assert told(Vesc(DRIVE).drive(TURN, 0.0)) == b"".join(map(packet, whole))
+    assert written(Vesc(DRIVE).drive(TURN, 0.0)) == b"".join(map(packet, whole))
 
 
-def test_status_in_the_units_of_the_base_whoever_answers_first() -> None:
+def test_status_in_the_units_of_the_base_in_any_order_of_replies() -> None:
     for answers in ([values(3, 105), values(9, 315)], [values(9, 315), values(3, 105)]):
         status = result(Vesc(DRIVE).drive(TURN, 0.0), *answers)
         assert (status.velocity_mps, status.yaw_rate_radps) == pytest.approx((0.5, 1.0))
@@ -52,26 +52,26 @@ def test_fault_and_timeout_of_either() -> None:
 
 
 @pytest.mark.parametrize("answer", [values(9, 0)[:-3], values(9, 0, mask=1), b"\x04" + bytes(14), values(9, 0) + b"xx"])
-def test_what_is_no_answer(answer: bytes) -> None:
+def test_ignores_other_payloads(answer: bytes) -> None:
     protocol = Vesc(DRIVE)
-    with pytest.raises(Unfinished):
+    with pytest.raises(UnfinishedError):
         result(protocol.drive(TURN, 0.0), values(3, 0), answer)
     assert protocol.bad_frames == 1
 
 
-def test_two_answers_of_one_are_not_both() -> None:
-    with pytest.raises(Unfinished):
+def test_waits_for_a_reply_of_each_controller() -> None:
+    with pytest.raises(UnfinishedError):
         result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0), values(3, 0), values(3, 0))
 
 
 @pytest.mark.parametrize("timeout_ms", [0, 501, 1000])
-def test_a_timeout_that_is_off_or_longer_is_refused(timeout_ms: int) -> None:
-    with pytest.raises(DriverError, match=f"500 ms asked, {timeout_ms} ms in force in the VESC with id 9"):
+def test_refuses_a_timeout_that_is_off_or_longer(timeout_ms: int) -> None:
+    with pytest.raises(DriverError, match=f"500 ms requested, {timeout_ms} ms in force in the VESC with id 9"):
         result(Vesc(DRIVE).connect(500), config(3, 500), config(9, timeout_ms))
     assert result(Vesc(DRIVE).connect(500), config(9, 500), config(3, 400)) == 400
 
 
-def test_the_framer_finds_the_next_packet() -> None:
+def test_framer_finds_the_next_packet() -> None:
     framer = PacketFramer()
     damaged = bytearray(packet(b"hello"))
     damaged[4] ^= 1
@@ -79,7 +79,7 @@ def test_the_framer_finds_the_next_packet() -> None:
     assert framer.garbage == 2 + len(damaged)
 
 
-def test_the_framer_gives_up_on_lengths_that_cannot_be() -> None:
+def test_framer_skips_invalid_lengths() -> None:
     framer = PacketFramer()
     assert framer.feed(b"\x02\x00" + b"\x03\x00\x05" + b"\x03\xff\xff" + packet(b"\x04")) == [b"\x04"]
     framer.feed(b"\x03\x01\xff")
