@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from types import MappingProxyType
 from typing import Final
@@ -184,6 +184,17 @@ class Config:
     graph: GraphConfig = field(default_factory=GraphConfig)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     service: ServiceConfig = field(default_factory=ServiceConfig)
+
+    def stereo_settings(self) -> StereoConfig:
+        """Return the stereo settings that go with the odometry's method.
+
+        The paper's odometry works on the enhanced SAD (Dang et al. 2012, III.B). Any stereo.matching.method other than
+        "auto" wins, with either odometry.
+        """
+        matching = self.stereo.matching
+        if self.odometry.method == "paper" and matching.method == "auto":
+            return replace(self.stereo, matching=replace(matching, method="enhanced"))
+        return self.stereo
 
 
 # Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.

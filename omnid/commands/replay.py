@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map=args.map, plan=args.plan,
                             record=args.record, publish=args.publish, inline=args.inline, realtime=args.realtime,
                             settings=args.config)
-    config = load_config(args.config, [*_presets(args), *args.overrides, *_shortcuts(args)])
+    config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     return replay_and_print(args.log, config, options, quiet=args.quiet)
 
 
@@ -88,11 +88,6 @@ def _print_result(result: RunResult, options: ReplayOptions) -> None:
         print(f"omnid: warning: {warning}", file=sys.stderr)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
     print(run_summary(result.counters, result.timings.values()), file=stream)
-
-
-def _presets(args: argparse.Namespace) -> list[str]:
-    """Settings that go with an option as long as nobody says otherwise with --set."""
-    return ["stereo.matching.method=enhanced"] if args.method == "paper" else []
 
 
 def _shortcuts(args: argparse.Namespace) -> list[str]:

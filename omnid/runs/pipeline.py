@@ -45,7 +45,7 @@ class WiredStages(NamedTuple):
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
-    stereo = Stereo(geometry, config.stereo)
+    stereo = Stereo(geometry, config.stereo_settings())
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)

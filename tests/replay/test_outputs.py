@@ -194,13 +194,20 @@ def test_every_knob_says_what_it_is(omnid: Command) -> None:
         assert lines[i - 2].startswith("# ") and lines[i - 2] != "# " + name.replace("_", " "), name
 
 
-def test_papers_method_brings_its_own_stereo_unless_told_otherwise(
+def test_the_papers_method_selects_the_enhanced_sad_unless_the_matching_is_set(
     omnid: Command, tmp_path: Path, scene: Path
 ) -> None:
-    for words, expected in (((), "enhanced"), (("--set", "stereo.matching.method=sad"), "sad")):
-        recorded = tmp_path / f"{expected}.mcap"
-        method = ("--method", "paper", *words)
-        assert omnid.replay(scene / "log.mcap", *method, "--record", recorded, rig=scene / "rig.toml").code == 0
-        with recorded.open("rb") as file:
-            attachments = {a.name: a.data for a in make_reader(file).iter_attachments()}
-        assert parse(Config, attachments["omnid.toml"], origin="attached").stereo.matching.method == expected
+    """By option, by --set and by a file; a matching method that is set explicitly wins."""
+    settings = tmp_path / "omnid.toml"
+    settings.write_text(omnid("config").out.replace('method = "default"', 'method = "paper"'))
+    explicit = ("--set", "stereo.matching.method=enhanced")
+    other = ("--set", "stereo.matching.method=sad")
+    cases = {"option": ("--method", "paper"), "set": ("--set", "odometry.method=paper"),
+             "file": ("--config", settings), "explicit": ("--method", "paper", *explicit),
+             "other": ("--method", "paper", *other)}
+    for name, words in cases.items():
+        result = omnid.replay(scene / "log.mcap", *words, "--tum", tmp_path / name, rig=scene / "rig.toml")
+        assert result.code == 0, result.err
+    trajectories = {name: (tmp_path / name).read_bytes() for name in cases}
+    assert trajectories["option"] == trajectories["set"] == trajectories["file"] == trajectories["explicit"]
+    assert trajectories["other"] != trajectories["option"]

@@ -35,7 +35,10 @@ LEFT_RIGHT_PX = 1  # largest disagreement of the disparities that both panoramas
 class MatchingSettings:
     """Settings of the matching: method, window and threshold of the SAD, choice of edges."""
 
-    method: str = knob("semiglobal", "method that chooses among several candidates", choices=METHODS)
+    method: str = knob(
+        "auto", "chooses among several candidates; auto: enhanced for the paper's odometry, else semiglobal",
+        choices=("auto", *METHODS)
+    )
     window_px: int = knob(9, "side of the matching window, px; odd", low=3, high=15)
     disparities: int = knob(
         128, "largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer", low=8, high=512
@@ -179,7 +182,7 @@ class EnhancedSearch:
 
 
 SEARCHES: dict[str, Callable[[tuple[int, int], MatchingSettings], CandidateSearch]] = {
-    "semiglobal": SemiGlobalSearch, "enhanced": EnhancedSearch, "sad": ColumnSearch,
+    "auto": SemiGlobalSearch, "semiglobal": SemiGlobalSearch, "enhanced": EnhancedSearch, "sad": ColumnSearch,
 }
 
 

@@ -1,0 +1,162 @@
+"""The public Python API: replay of a log, and odometry of images at hand. Import it from `omnid`."""
+
+from __future__ import annotations
+
+import operator
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import CalibError
+from calib.models.camera import OmniCamera
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from drivers.errors import DriverError
+from drivers.frame import Camera, Frame
+from omnid.config import Config, load_config
+from omnid.errors import OmnidError
+from omnid.messages import FramePair, OdometryUpdate
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.runs.run_result import RunResult
+from omnid.settings import dump, parse
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.odometry import OdometryStage
+from omnid.stages.stereo import Stereo
+
+FilePath: TypeAlias = str | PathLike[str]
+GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
+InputImage: TypeAlias = NDArray[Any] | None  # what cv2.imread gives; a GreyImage is expected and checked
+
+
+def replay(
+    log: FilePath,
+    rig: FilePath | Rig | None = None,
+    *,
+    config: FilePath | Config | None = None,
+    overrides: Sequence[str] = (),
+    method: Literal["default", "paper"] | None = None,
+    lower: str | None = None,
+    upper: str | None = None,
+) -> RunResult:
+    """Run a recorded log through the stages and return poses, covariances, map, counters, timings and warnings.
+
+    log: an MCAP file, or the folder of `ros2 bag record -s mcap`. rig: a rig.toml or a Rig; None: the one attached to
+    the log. config: a TOML file or a Config; None: the defaults. overrides: settings such as "stereo.min_range_m=0.5"
+    over those of the file. method: odometry.method. lower, upper: topics of the images; None: those of the rig, else
+    by their names.
+
+    All poses and the map stay in memory (see PoseCollector: about 50 MB an hour at 30 Hz). Ctrl-C ends the run and
+    raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
+    result up to an error after the first pose.
+    """
+    settings = [*overrides, *([f"odometry.method={method}"] if method else [])]
+    with _user_errors():
+        options = ReplayOptions(rig=rig if rig is None or isinstance(rig, Rig) else Path(rig), topics=(lower, upper),
+                                collect=True)
+        result = run_log(Path(log), _config(config, settings), options)
+    if result.signal:
+        signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
+    return result
+
+
+class Odometry:
+    """Odometry of image pairs at hand, one call a pair, in the caller's thread.
+
+    The poses are the same, to the last bit, as those of a replay of the same images.
+    """
+
+    def __init__(
+        self,
+        rig: FilePath | Rig,
+        config: FilePath | Config | None = None,
+        *,
+        overrides: Sequence[str] = (),
+        mask_images: Iterable[tuple[InputImage, InputImage]] = (),
+    ) -> None:
+        """Prepare the stages; that takes about a second.
+
+        rig, config, overrides: as in `replay`. mask_images: pairs (lower, upper), such as the first 60 of a drive, in
+        which the rims of the mirrors are searched if the rig has no masks. A camera without a mask counts as far as
+        its image reaches, which costs accuracy where the image shows more than the mirror.
+        Raises OmnidError for a rig or a configuration that cannot be used.
+        """
+        with _user_errors():
+            settings = _config(config, overrides)
+            loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
+            self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
+            place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
+            self._dewarp = Dewarp(place, settings.panorama)
+            self._stereo = Stereo(place, settings.stereo_settings())
+            self._odometry = OdometryStage(place, settings.odometry)
+        self.rig = place.rig  # with the masks that were found
+        self._pairs = 0
+        self._stamp_ns: int | None = None
+
+    def process(self, stamp_ns: int, lower: InputImage, upper: InputImage) -> OdometryUpdate:
+        """Return the pose at a pair of grey images (H, W) uint8 that were taken at stamp_ns, in ns of any clock.
+
+        Of the result: `T_odom_rig` (4, 4) maps points of the rig frame into odom, which is the rig frame of the first
+        pair (m); `covariance` (6, 6) of x y z rx ry rz in odom axes (m^2, rad^2); `velocity` (6,) in the rig frame;
+        `state`; `inliers` of `tracks` landmarks. `depth.points` (N, 3) in the rig frame (m) with `depth.variance_m2`
+        (N,) along the ray, `depth.disparity` (H, W) in px, NaN where unknown, and the panoramas
+        `depth.panoramas.lower.panorama` and `.upper.panorama` (H, W) uint8.
+
+        Raises OmnidError for an image of another type or size than the rig's, and for a stamp that is not later than
+        the previous one; such a pair changes nothing.
+        """
+        stamp_ns = self._later_stamp_ns(stamp_ns)
+        images = (self._checked("lower", lower), self._checked("upper", upper))
+        pair = FramePair(self._pairs, stamp_ns, *images)
+        self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
+        return self._odometry.process(self._stereo.process(self._dewarp.process(pair)))
+
+    def _later_stamp_ns(self, stamp_ns: int) -> int:
+        try:
+            stamp_ns = operator.index(stamp_ns)
+        except TypeError as error:
+            raise OmnidError(f"stamp_ns: expected an integer number of nanoseconds, found {stamp_ns!r}") from error
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            raise OmnidError(f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
+                             f"{stamp_ns}: give the pairs in the order of time, each once")
+        return stamp_ns
+
+    def _checked(self, name: Camera, image: InputImage) -> GreyImage:
+        """Return the image, contiguous; OmnidError where it is not one of this camera."""
+        width, height = self._cameras[name].size
+        expected = f"{name} image: expected a grey image ({height}, {width}) uint8 as the rig's"
+        if not isinstance(image, np.ndarray):
+            found = "nothing: could the file be read?" if image is None else type(image).__name__
+            raise OmnidError(f"{expected}, found {found}")
+        if image.shape != (height, width) or image.dtype != np.uint8:
+            advice = ": convert colour images with cv2.COLOR_BGR2GRAY" if image.ndim > 2 else ""
+            raise OmnidError(f"{expected}, found {image.shape} {image.dtype}{advice}")
+        return np.ascontiguousarray(image)
+
+    def _frames(self, pairs: Iterable[tuple[InputImage, InputImage]]) -> Iterator[Frame]:
+        names: tuple[Camera, Camera] = ("lower", "upper")
+        for seq, pair in enumerate(pairs):
+            for name, image in zip(names, pair, strict=True):
+                grey = self._checked(name, image)
+                yield Frame(seq, seq, name, "mono8", grey, width=grey.shape[1], height=grey.shape[0])
+
+
+def _config(config: FilePath | Config | None, overrides: Sequence[str]) -> Config:
+    if isinstance(config, Config):
+        return parse(Config, dump(config).encode(), origin="config", overrides=overrides) if overrides else config
+    return load_config(config, overrides)
+
+
+@contextmanager
+def _user_errors() -> Iterator[None]:
+    """Raise the errors of calib and drivers as OmnidError, the one error class of this API."""
+    try:
+        yield
+    except (CalibError, DriverError) as error:
+        raise OmnidError(str(error)) from error

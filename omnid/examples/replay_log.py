@@ -1,0 +1,14 @@
+"""A recorded log becomes a trajectory and a map: `python -m omnid.examples.replay_log LOG.mcap [RIG.toml]`."""
+
+import sys
+
+import omnid
+
+log, *rig = sys.argv[1:]
+result = omnid.replay(log, rig=rig[0] if rig else None)
+for warning in result.warnings:
+    print("warning:", warning, file=sys.stderr)
+x_m, y_m, _ = result.T_odom_rig[-1, :3, 3]
+print(f"{len(result.stamps_ns)} poses, {result.counters.length_m:.2f} m, the end is at ({x_m:.2f}, {y_m:.2f}) m")
+result.save_tum("trajectory.tum")
+result.save_ply("map.ply")

@@ -1,0 +1,266 @@
+"""The public Python API: lazy imports, replay, odometry of images, and the example programs."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import omnid
+from calib.rig_file import read_rig, write_rig
+from drivers.frame import gray
+from drivers.logs.mcap_reader import LogReader
+from omnid.engine.graph import Graph
+from omnid.errors import OmnidError
+from omnid.formats.ply import read_ply
+from omnid.formats.tum import tum_row
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.runs.run_result import RunFailedError
+from omnid.stages.synchronise import Synchronise
+from tests.conftest import PAIRS
+from tests.replay.command import Command
+
+ROOT = Path(__file__).parents[2]
+Pair = tuple[int, np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def pairs(scene: Path) -> list[Pair]:
+    """The pairs of the scene: stamp of the lower image, lower and upper image."""
+    frames = list(LogReader(scene / "log.mcap").frames())
+    lower, upper = ([frame for frame in frames if frame.camera == name] for name in ("lower", "upper"))
+    return [(below.stamp_ns, gray(below), gray(above)) for below, above in zip(lower, upper, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def result(scene: Path) -> omnid.RunResult:
+    """The result of a replay of the scene."""
+    return omnid.replay(scene / "log.mcap", rig=scene / "rig.toml")
+
+
+@pytest.fixture
+def omnid_command(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(capsys)
+
+
+def test_import_loads_neither_numpy_nor_opencv() -> None:
+    program = "import omnid, sys; print(sorted({'numpy', 'cv2', 'zenoh', 'omnid.config'} & set(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True).stdout
+    assert out == "[]\n"
+
+
+def test_every_public_name_is_found_and_no_other() -> None:
+    for name in omnid.__all__:
+        assert getattr(omnid, name) is not None and name in dir(omnid)
+    with pytest.raises(AttributeError, match="no attribute 'play'"):
+        omnid.play  # type: ignore[attr-defined]  # noqa: B018
+    assert find_spec("omnid.replay") is None, "a submodule of this name would replace the function"
+
+
+@pytest.mark.parametrize("package", ["omnid", "drivers", "calib"])
+def test_the_packages_are_typed(package: str) -> None:
+    assert (ROOT / package / "py.typed").is_file()
+
+
+def test_replay_gives_what_the_command_writes(
+    omnid_command: Command, tmp_path: Path, scene: Path, result: omnid.RunResult
+) -> None:
+    files = ("--tum", tmp_path / "a.tum", "--map", tmp_path / "a.ply")
+    assert omnid_command.replay(scene / "log.mcap", *files, rig=scene / "rig.toml").code == 0
+    result.save_tum(tmp_path / "b.tum")
+    result.save_ply(str(tmp_path / "b.ply"))
+    for suffix in ("tum", "ply"):
+        assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+    assert len(read_ply(tmp_path / "b.ply").xyz) > 500
+
+
+def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -> None:
+    assert result.stamps_ns.shape == (PAIRS,) and result.stamps_ns.dtype == np.int64
+    assert result.T_odom_rig.shape == (PAIRS, 4, 4) and result.covariances.shape == (PAIRS, 6, 6)
+    assert set(result.states) == {omnid.TrackingState.TRACKING} and len(result.states) == PAIRS
+    counters = result.counters
+    assert (counters.pairs, counters.poses, counters.resets) == (PAIRS, PAIRS, 0)
+    assert counters.states[omnid.TrackingState.TRACKING] == PAIRS and not any(counters.drops.values())
+    steps = np.diff(result.T_odom_rig[:, :3, 3], axis=0)
+    assert counters.length_m == pytest.approx(np.linalg.norm(steps, axis=1).sum())
+    assert result.warnings == () and result.signal == 0
+    for stage in ("pair", "dewarp", "stereo", "odometry", "mapping"):
+        timing = result.timings[stage]
+        assert timing.n >= PAIRS and 0 < timing.p50_ms <= timing.p99_ms <= timing.max_ms
+    assert not {"statistics", "collect-poses"} & result.timings.keys()
+
+
+def test_replay_takes_settings_a_rig_and_a_method(scene: Path, result: omnid.RunResult) -> None:
+    rig = read_rig(scene / "rig.toml")
+    config = replace(omnid.Config(), mapping=replace(omnid.Config().mapping, voxel_m=0.2))
+    coarse = omnid.replay(scene / "log.mcap", rig, config=config)
+    assert result.map is not None and coarse.map is not None and len(coarse.map.xyz) < len(result.map.xyz) / 2
+    assert np.array_equal(coarse.T_odom_rig, result.T_odom_rig)
+    paper = omnid.replay(scene / "log.mcap", rig, config=config, method="paper", overrides=["log.reorder_frames=8"])
+    assert len(paper.stamps_ns) == PAIRS and not np.array_equal(paper.T_odom_rig, result.T_odom_rig)
+
+
+def test_images_give_the_bytes_of_a_replay(scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
+    odometry = omnid.Odometry(scene / "rig.toml")
+    poses = [odometry.process(*pair) for pair in pairs]
+    assert np.array_equal([pose.T_odom_rig for pose in poses], result.T_odom_rig)
+    assert np.array_equal([pose.covariance for pose in poses], result.covariances)
+    rows = [tum_row(pose.stamp_ns, pose.T_odom_rig) for pose in poses]
+    assert rows == [tum_row(int(s), T) for s, T in zip(result.stamps_ns, result.T_odom_rig, strict=True)]
+    depth = poses[-1].depth
+    assert depth.disparity.shape == depth.panoramas.lower.panorama.shape == depth.panoramas.upper.panorama.shape
+    assert depth.points.shape == (len(depth.variance_m2), 3) and len(depth.points) > 500
+
+
+def test_images_give_the_bytes_of_a_replay_with_the_papers_method(scene: Path, pairs: list[Pair]) -> None:
+    expected = omnid.replay(scene / "log.mcap", scene / "rig.toml", method="paper")
+    odometry = omnid.Odometry(scene / "rig.toml", overrides=["odometry.method=paper"])
+    assert np.array_equal([odometry.process(*pair).T_odom_rig for pair in pairs], expected.T_odom_rig)
+
+
+def test_masks_are_found_in_images(scene: Path, pairs: list[Pair]) -> None:
+    rig = read_rig(scene / "rig.toml")
+    bare = replace(rig, lower=replace(rig.lower, mask=None), upper=replace(rig.upper, mask=None))
+    odometry = omnid.Odometry(bare, mask_images=[(lower, upper) for _, lower, upper in pairs])
+    expected = omnid.replay(scene / "log.mcap", bare)
+    assert odometry.rig.lower.mask is not None and odometry.rig.upper.mask is not None
+    assert np.array_equal([odometry.process(*pair).T_odom_rig for pair in pairs], expected.T_odom_rig)
+    assert omnid.Odometry(bare).rig.lower.mask is None
+
+
+def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pairs: list[Pair]) -> None:
+    odometry, whole = omnid.Odometry(scene / "rig.toml"), omnid.Odometry(scene / "rig.toml")
+    first_ns, lower, upper = pairs[0]
+    wrong = {
+        "found nothing": (first_ns, None, upper),
+        "found list": (first_ns, lower, upper.tolist()),
+        r"found \(256, 256, 3\) uint8: convert": (first_ns, cv2.cvtColor(lower, cv2.COLOR_GRAY2BGR), upper),
+        r"lower image.*found \(255, 256\)": (first_ns, lower[1:], upper),
+        r"upper image.*found \(256, 256\) float64": (first_ns, lower, upper.astype(float)),
+        "expected an integer": (first_ns * 1e-9, lower, upper),
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(OmnidError, match=message):
+            odometry.process(*arguments)  # type: ignore[arg-type]
+    np.testing.assert_allclose(odometry.process(*pairs[0]).T_odom_rig, np.eye(4), atol=1e-12)
+    for stamp_ns in (first_ns, first_ns - 1):
+        with pytest.raises(OmnidError, match="expected a stamp after"):
+            odometry.process(stamp_ns, lower, upper)
+    whole.process(*pairs[0])
+    assert np.array_equal(odometry.process(*pairs[1]).T_odom_rig, whole.process(*pairs[1]).T_odom_rig)
+
+
+def test_images_may_be_views(scene: Path, pairs: list[Pair]) -> None:
+    odometry = omnid.Odometry(scene / "rig.toml")
+    stamp_ns, lower, upper = pairs[0]
+    wide = np.repeat(lower, 2, axis=1)[:, ::2]
+    assert not wide.flags.c_contiguous
+    assert len(odometry.process(np.int64(stamp_ns), wide, upper).depth.points) > 500  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [(("absent.mcap", "rig.toml"), "absent.mcap"), (("log.mcap", "absent.toml"), "absent.toml"),
+     (("log.mcap",), "rig")],
+)
+def test_one_error_class_for_all_wrong_input(scene: Path, arguments: tuple[str, ...], named: str) -> None:
+    with pytest.raises(OmnidError, match=named):
+        omnid.replay(*(scene / name for name in arguments))
+    with pytest.raises(OmnidError, match=r"absent\.toml"):
+        omnid.Odometry(scene / "absent.toml")
+    with pytest.raises(OmnidError, match="sterio"):
+        omnid.Odometry(scene / "rig.toml", overrides=["sterio.noise_px=1"])
+
+
+def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path) -> None:
+    found = run_log(scene / "log.mcap", omnid.Config(), ReplayOptions(rig=scene / "rig.toml"))
+    assert found.counters.poses == PAIRS and found.stamps_ns.shape == (0,) and found.map is None
+    with pytest.raises(OmnidError, match="collect=True"):
+        found.save_tum(tmp_path / "a")
+    with pytest.raises(OmnidError, match="no map"):
+        found.save_ply(tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, result: omnid.RunResult) -> None:
+    for save in (result.save_tum, result.save_ply):
+        with pytest.raises(OmnidError, match="absent"):
+            save(tmp_path / "absent" / "x")
+
+
+def test_a_late_error_holds_the_result_so_far(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails_at_the_tenth(self: Synchronise, frame: object, process: object = Synchronise.process) -> object:
+        if self.counts["pairs"] == 10:
+            raise OmnidError("the disk is gone")
+        return process(self, frame)  # type: ignore[operator]
+
+    monkeypatch.setattr(Synchronise, "process", fails_at_the_tenth)
+    with pytest.raises(RunFailedError, match="the disk is gone") as caught:
+        omnid.replay(scene / "log.mcap", scene / "rig.toml")
+    assert len(caught.value.result.stamps_ns) == caught.value.result.counters.poses == 10
+
+
+def test_ctrl_c_ends_a_replay_with_a_keyboard_interrupt(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Graph.run
+
+    def interrupt() -> Iterator[object]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return iter(())
+
+    def interrupted(self: Graph) -> None:
+        self.source("interrupt", interrupt)
+        run(self)
+
+    monkeypatch.setattr(Graph, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        omnid.replay(scene / "log.mcap", scene / "rig.toml")
+
+
+def example(name: str, *words: object, cwd: Path) -> str:
+    """The output of an example that is run as a program."""
+    command = [sys.executable, "-m", f"omnid.examples.{name}", *map(str, words)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=True).stdout
+
+
+def test_examples_are_short() -> None:
+    programs = [path for path in (ROOT / "omnid" / "examples").glob("*.py") if path.name != "__init__.py"]
+    assert len(programs) >= 3
+    assert all(len(path.read_text().splitlines()) <= 20 for path in programs)
+
+
+def test_example_of_a_replay(tmp_path: Path, scene: Path, result: omnid.RunResult) -> None:
+    out = example("replay_log", scene / "log.mcap", scene / "rig.toml", cwd=tmp_path)
+    assert out.startswith(f"{PAIRS} poses, {result.counters.length_m:.2f} m")
+    result.save_tum(tmp_path / "expected.tum")
+    assert (tmp_path / "trajectory.tum").read_bytes() == (tmp_path / "expected.tum").read_bytes()
+    assert (tmp_path / "map.ply").stat().st_size > 1000
+
+
+def test_example_of_images(tmp_path: Path, scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
+    for name, index in (("lower", 1), ("upper", 2)):
+        (tmp_path / name).mkdir()
+        for pair in pairs[:5]:
+            cv2.imwrite(str(tmp_path / name / f"{pair[0]}.png"), pair[index])
+    lines = example("images_to_poses", scene / "rig.toml", tmp_path, cwd=tmp_path).splitlines()
+    x_m, y_m = result.T_odom_rig[4, :2, 3]
+    assert len(lines) == 5 and f"tracking ({x_m:.3f}, {y_m:.3f}) m" in lines[4]
+
+
+def test_example_of_the_geometry(tmp_path: Path, scene: Path, pairs: list[Pair]) -> None:
+    write_rig(tmp_path / "rig.toml", read_rig(scene / "rig.toml"))
+    cv2.imwrite(str(tmp_path / "lower.png"), pairs[0][1])
+    out = example("rectify_image", "rig.toml", "lower.png", "panorama.png", cwd=tmp_path)
+    panorama = cv2.imread(str(tmp_path / "panorama.png"), cv2.IMREAD_GRAYSCALE)
+    assert "is at pixel" in out and panorama is not None and panorama.shape[1] > 4 * panorama.shape[0] / 2
