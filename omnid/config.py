@@ -12,7 +12,7 @@ from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l
 from drivers.logs.log_folder import RotationSettings
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
-from omnid.core.odometry.odometry import OdometryLimits
+from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
@@ -205,6 +205,9 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType({
     "motor.stale_s": "controller.deadlines.command_s",
     "stereo.matching.rival": "stereo.matching.runner_up_ratio",
     "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
+    "odometry.limits.min_share": "odometry.limits.min_inlier_ratio",
+    "odometry.limits.sure_inliers": "odometry.limits.good_inliers",
+    "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
 })
 
 

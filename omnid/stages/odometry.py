@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import OdometryConfig
-from omnid.core.odometry.odometry import OdometryEstimate, VisualOdometry
+from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.geometry import Geometry

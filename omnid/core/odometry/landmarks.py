@@ -1,146 +1,190 @@
-"""A small map of landmarks about the robot, each anchored in the keyframe that saw it first."""
+"""Store of landmarks and keyframes: points relative to their keyframes, and all observations of each landmark.
+
+A landmark is anchored in the keyframe that saw it first. Its position is kept in that keyframe's rectified frame, so
+that a keyframe can be moved (bundle adjustment of a window, loop closing) and its landmarks move with it. Every later
+keyframe in which the landmark is an inlier adds an observation.
+
+Bounds: at most max_keyframes keyframes K; a keyframe adds at most as many landmarks as the caller passes (F, the
+features wanted), so N <= K F landmarks and at most K observations of each, K N rows of 40 bytes. A landmark leaves with
+its anchor or after max_misses frames without it; a keyframe leaves when it is the oldest of too many or anchors no
+landmark any more; an observation leaves with its landmark or its keyframe.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, warped_templates
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
-from omnid.core.stereo.triangulation import point_covariance, triangulate, view
+from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-EDGE_ROWS = 3  # a landmark predicted nearer than this to the panorama's upper or lower edge is not looked for
-
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A panorama that landmarks are anchored in; T_odom_rect places its rectified frame, covariance (6, 6) in it."""
+    """Panorama in which landmarks are anchored; T_odom_rect is the pose of its rectified frame, covariance its own."""
 
     seq: int
     lower: PaddedPanorama
     T_odom_rect: Array
-    covariance: Array
+    covariance: Array  # (6, 6) [t; r] in the rectified frame
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
-    """Landmarks found in a new panorama: their indices (M,), pixels (M, 2), predicted views (M, 3); how many to see."""
+class LandmarkTable:
+    """One row for each landmark.
 
-    index: Indices
-    pixels: Array
-    predicted: Array
-    visible: int
+    points and covariance in odom are computed from those in the keyframe when the keyframe is added, and again only
+    when it is moved. In between they cost nothing, and their last bits stay the same whatever else is in the map.
+    """
+
+    id: Indices  # (N,) unique, in the order of addition
+    anchor: Indices  # (N,) seq of the keyframe that saw the landmark first
+    anchor_points: Array  # (N, 3) m in the rectified frame of the anchor
+    anchor_covariance: Array  # (N, 3, 3) m^2 in the same axes
+    views: Array  # (N, 3) px in the anchor: column, lower row, upper row
+    slopes: Array  # (N, 2) px/px of the disparity about the view, along column and row
+    points: Array  # (N, 3) m in odom
+    covariance: Array  # (N, 3, 3) m^2 in odom
+    pixels: Array  # (N, 2) px in the last accepted panorama, NaN: not found there
+    misses: Indices  # (N,) consecutive accepted frames in which the landmark was no inlier
+
+    @staticmethod
+    def empty() -> LandmarkTable:
+        """Return a table without rows."""
+        none, vectors, matrices = np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3))
+        return LandmarkTable(none, none, vectors, matrices, vectors, np.zeros((0, 2)), vectors, matrices,
+                             np.zeros((0, 2)), none)
 
 
-class LocalMap:
-    """Landmarks (N) with position in odom, covariance, keyframe and pixel there; bounded by the keyframes kept."""
+@dataclass(frozen=True, slots=True)
+class ObservationTable:
+    """One row for each landmark in each keyframe that observed it, its anchor included."""
 
-    def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 5, max_misses: int = 3) -> None:
-        self._model, self._klt = model, klt
-        self._max_keyframes, self._max_misses = max_keyframes, max_misses
+    landmark: Indices  # (M,) id
+    keyframe: Indices  # (M,) seq
+    views: Array  # (M, 3) px: column, lower row, upper row; NaN: not measured in the upper panorama
+
+    @staticmethod
+    def empty() -> ObservationTable:
+        """Return a table without rows."""
+        return ObservationTable(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)))
+
+
+Table = TypeVar("Table", LandmarkTable, ObservationTable)
+
+
+class LandmarkStore:
+    """Keyframes by seq, their landmarks and the observations."""
+
+    def __init__(self, model: StereoModel, max_keyframes: int = 8, max_misses: int = 3) -> None:
+        self._model, self._max_keyframes, self._max_misses = model, max_keyframes, max_misses
+        self._next_id = 0
         self.clear()
 
     def clear(self) -> None:
-        """Forgets everything."""
+        """Remove all keyframes, landmarks and observations."""
         self.keyframes: dict[int, Keyframe] = {}
-        self.points = np.zeros((0, 3))  # (N, 3) m in odom
-        self.covariance = np.zeros((0, 3, 3))  # (N, 3, 3) m^2 in odom
-        self.views = np.zeros((0, 3))  # (N, 3) px: column, lower row, upper row in the keyframe
-        self.slopes = np.zeros((0, 2))  # (N, 2) px/px of the disparity about the view
-        self.anchor = np.zeros(0, np.intp)  # (N,) seq of the keyframe
-        self._seen = np.zeros((0, 2))  # (N, 2) px in the last panorama whose pose was accepted; NaN: not there
-        self._misses = np.zeros(0, np.intp)
-        self._last: PaddedPanorama | None = None
+        self.table = LandmarkTable.empty()
+        self.observations = ObservationTable.empty()
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.table.id)
 
-    def add(self, keyframe: Keyframe, views: Array, slopes: Array) -> None:
-        """Takes a keyframe and its new landmarks: views (N, 3) [px] and the slopes (N, 2) of the disparity there."""
+    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array) -> None:
+        """Add a keyframe with new landmarks, observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
+
+        Views that cannot be triangulated are left out. The oldest keyframe beyond the bound leaves.
+        """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
         views, slopes, points = views[finite], slopes[finite], points[finite]
         covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px)
-        R = keyframe.T_odom_rect[:3, :3]
+        count = len(points)
+        ids = np.arange(self._next_id, self._next_id + count)
+        self._next_id += count
+        in_odom = _in_odom(keyframe, points, covariance)
+        new = LandmarkTable(ids, np.full(count, keyframe.seq), points, covariance, views, slopes, *in_odom,
+                            pixels=views[:, :2], misses=np.zeros(count, np.intp))
         self.keyframes[keyframe.seq] = keyframe
-        self.points = np.concatenate([self.points, se3.apply(keyframe.T_odom_rect, points)])
-        self.covariance = np.concatenate([self.covariance, R @ covariance @ R.T])
-        self.views = np.concatenate([self.views, views])
-        self.slopes = np.concatenate([self.slopes, slopes])
-        self.anchor = np.concatenate([self.anchor, np.full(len(points), keyframe.seq)])
-        self._seen = np.concatenate([self._seen, views[:, :2]])
-        self._misses = np.concatenate([self._misses, np.zeros(len(points), np.intp)])
-        self._last = keyframe.lower
-        self._forget_oldest()
-
-    def track(self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None) -> Tracks:
-        """Looks for the landmarks of the last panorama in a new one, from where a guessed pose predicts them.
-
-        most: only about so many, evenly chosen, to compare guesses cheaply.
-        """
-        index, predicted = self.visible(T_odom_rect)
-        known = np.isfinite(self._seen[index, 0])
-        index, predicted = index[known], predicted[known]
-        if most is not None:
-            every = max(1, -(-len(index) // most))
-            index, predicted = index[::every], predicted[::every]
-        if self._last is None:
-            return Tracks(index[:0], np.zeros((0, 2)), predicted[:0], 0)
-        pixels, found = track(self._last, lower, self._seen[index], predicted[:, :2], self._klt)
-        return Tracks(index[found], pixels[found], predicted[found], len(index))
-
-    def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
-        """Landmarks (M,) that a pose predicts within the panorama, and their views (M, 3)."""
-        predicted = view(se3.apply(se3.inverse(T_odom_rect), self.points), self._model.cylinder, self._model.baseline_m)
-        bottom = self._model.cylinder.height - 1 - EDGE_ROWS
-        index = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
-        return index, predicted[index]
-
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, index: Indices) -> tuple[Array, Flags]:
-        """Pixels (M, 2) of landmarks (indices) by warped patches, in a panorama whose pose is known well; which fit."""
-        T_rect_odom = se3.inverse(T_odom_rect)
-        points = se3.apply(T_rect_odom, self.points[index])
-        predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2]
-        templates = np.zeros((len(index), CELL_PX, CELL_PX), np.uint8)
-        anchors = self.anchor[index]
-        T_curr_ref = np.array([T_rect_odom @ self.keyframes[seq].T_odom_rect for seq in anchors.tolist()])
-        warps = affine_warps(self.views[index], self.slopes[index], T_curr_ref.reshape(-1, 4, 4), self._model)
-        for seq in np.unique(anchors).tolist():
-            at = np.flatnonzero(anchors == seq)
-            pixels = self.views[index[at], :2]
-            templates[at] = warped_templates(self.keyframes[seq].lower, pixels, warps[at], predicted[at])
-        return align(templates, lower, predicted)
-
-    def anchor_shares(self, index: Indices) -> dict[int, float]:
-        """For each keyframe the share of the landmarks (indices) that it anchors."""
-        anchors, counts = np.unique(self.anchor[index], return_counts=True)
-        return {int(a): float(n) / len(index) for a, n in zip(anchors, counts, strict=True)}
-
-    def saw(self, lower: PaddedPanorama, index: Indices, pixels: Array) -> None:
-        """Takes note of the landmarks (indices) seen in a panorama at pixels (M, 2); drops those missed too often."""
-        self._last = lower
-        self._seen[:] = np.nan
-        self._seen[index] = pixels
-        self._misses += 1
-        self._misses[index] = 0
-        self._select(self._misses < self._max_misses)
-
-    def _forget_oldest(self) -> None:
+        self.table = _joined(self.table, new)
+        self._observe(ids, keyframe.seq, views)
         while len(self.keyframes) > self._max_keyframes:
             self.keyframes.pop(min(self.keyframes))
-        self._select(np.isin(self.anchor, list(self.keyframes)))
+        self._select(np.isin(self.table.anchor, list(self.keyframes)))
+
+    def add_observations(self, seq: int, ids: Indices, views: Array) -> None:
+        """Add observations (M, 3) [px] in a keyframe of landmarks (ids) that were known before.
+
+        Landmarks and keyframes that have been removed are ignored.
+        """
+        known = np.isin(ids, self.table.id) & (seq in self.keyframes)
+        self._observe(ids[known], seq, views[known])
+
+    def move_keyframe(self, seq: int, T_odom_rect: Array, covariance: Array) -> None:
+        """Set the pose of a keyframe and its covariance (6, 6), and compute its landmarks' points in odom again.
+
+        KeyError for a keyframe that is not kept.
+        """
+        keyframe = replace(self.keyframes[seq], T_odom_rect=T_odom_rect, covariance=covariance)
+        self.keyframes[seq] = keyframe
+        own = self.table.anchor == seq
+        points, spread = self.table.points.copy(), self.table.covariance.copy()
+        points[own], spread[own] = _in_odom(keyframe, self.table.anchor_points[own], self.table.anchor_covariance[own])
+        self.table = replace(self.table, points=points, covariance=spread)
+
+    def update_tracked(self, rows: Indices, pixels: Array) -> None:
+        """Record the inliers (rows of the table) of an accepted frame with their pixels (M, 2).
+
+        Landmarks that were no inliers in max_misses consecutive frames are removed.
+        """
+        seen = np.full((len(self), 2), np.nan)
+        seen[rows] = pixels
+        misses = self.table.misses + 1
+        misses[rows] = 0
+        self.table = replace(self.table, pixels=seen, misses=misses)
+        self._select(misses < self._max_misses)
+
+    def anchor_shares(self, rows: Indices) -> dict[int, float]:
+        """Return for each keyframe the share of the landmarks (rows of the table) that it anchors."""
+        anchors, counts = np.unique(self.table.anchor[rows], return_counts=True)
+        return {int(a): float(n) / len(rows) for a, n in zip(anchors, counts, strict=True)}
+
+    def _observe(self, ids: Indices, seq: int, views: Array) -> None:
+        self.observations = _joined(self.observations, ObservationTable(ids, np.full(len(ids), seq), views))
 
     def _select(self, kept: Flags) -> None:
-        self.points, self.covariance = self.points[kept], self.covariance[kept]
-        self.views, self.slopes = self.views[kept], self.slopes[kept]
-        self.anchor, self._seen, self._misses = self.anchor[kept], self._seen[kept], self._misses[kept]
-        anchors = set(self.anchor.tolist())
-        self.keyframes = {seq: k for seq, k in self.keyframes.items() if seq in anchors}
+        """Keep some landmarks (flags (N,)), the keyframes that anchor them, and the observations between both."""
+        self.table = _selected(self.table, kept)
+        anchors = set(self.table.anchor.tolist())
+        self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
+        rows = self.observations
+        self.observations = _selected(
+            rows, np.isin(rows.landmark, self.table.id) & np.isin(rows.keyframe, list(self.keyframes))
+        )
+
+
+def _in_odom(keyframe: Keyframe, points: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return points (N, 3) [m] and covariances (N, 3, 3) [m^2] of a keyframe's rectified frame in odom."""
+    R = keyframe.T_odom_rect[:3, :3]
+    return se3.apply(keyframe.T_odom_rect, points), R @ covariance @ R.T
+
+
+def _selected(table: Table, kept: Flags) -> Table:
+    """Return the rows of a table for which kept (N,) is true."""
+    return type(table)(*(getattr(table, column.name)[kept] for column in fields(table)))
+
+
+def _joined(first: Table, second: Table) -> Table:
+    """Return the rows of two tables."""
+    return type(first)(
+        *(np.concatenate([getattr(first, column.name), getattr(second, column.name)]) for column in fields(first))
+    )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import nearby_disparity
+from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.pose_estimate import PoseEstimate
 from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.stereo.triangulation import point_covariance, triangulate

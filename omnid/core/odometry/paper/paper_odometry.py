@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
+from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.odometry import OdometryEstimate
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame

@@ -1,4 +1,4 @@
-"""The landmarks about the robot: where they are, which are seen again, and that they stay few."""
+"""The store of landmarks: positions relative to keyframes, observations, bounds."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.landmarks import Keyframe, LocalMap
+from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import point_covariance, triangulate
-from tests.omnid.core.scenery import texture, turned, wrapped
+from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]
 
@@ -34,114 +34,111 @@ def views(count: int, seed: int = 0) -> Array:
     return np.column_stack([points, points[:, 1] + MODEL.cylinder.focal_px * 0.2 / rng.uniform(1, 3, len(points))])
 
 
-def add(landmarks: LocalMap, seen_in: Keyframe, seen: Array) -> None:
-    """Adds landmarks on upright surfaces."""
-    landmarks.add(seen_in, seen, np.zeros((len(seen), 2)))
+def add(store: LandmarkStore, seen_in: Keyframe, seen: Array) -> None:
+    """Add landmarks on upright surfaces."""
+    store.add_keyframe(seen_in, seen, np.zeros((len(seen), 2)))
 
 
 @pytest.fixture
-def landmarks() -> LocalMap:
-    return LocalMap(MODEL, KltSettings(), max_keyframes=3, max_misses=2)
+def store() -> LandmarkStore:
+    return LandmarkStore(MODEL, max_keyframes=3, max_misses=2)
 
 
-def test_landmarks_stand_in_odom_with_their_covariance(landmarks: LocalMap) -> None:
+def test_points_are_kept_relative_to_their_keyframe_and_in_odom(store: LandmarkStore) -> None:
     seen = views(50)
-    add(landmarks, keyframe(1), seen)
+    add(store, keyframe(1), seen)
     points = triangulate(seen, MODEL.cylinder, MODEL.baseline_m)
-    np.testing.assert_allclose(landmarks.points, se3.apply(POSE, points))
     covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
-    np.testing.assert_allclose(landmarks.covariance, POSE[:3, :3] @ covariance @ POSE[:3, :3].T)
-    assert len(landmarks) == len(seen) > 40
+    table, R = store.table, POSE[:3, :3]
+    np.testing.assert_array_equal(table.anchor_points, points)
+    np.testing.assert_array_equal(table.anchor_covariance, covariance)
+    np.testing.assert_array_equal(table.points, se3.apply(POSE, points))
+    np.testing.assert_array_equal(table.covariance, R @ covariance @ R.T)
+    assert len(store) == len(seen) > 40
 
 
-def test_what_cannot_be_triangulated_is_left_out(landmarks: LocalMap) -> None:
+def test_views_that_cannot_be_triangulated_are_left_out(store: LandmarkStore) -> None:
     seen = views(20)
     seen[3, 2] = np.nan
     seen[5, 2] = seen[5, 1] - 2
-    add(landmarks, keyframe(1), seen)
-    assert len(landmarks) == len(seen) - 2
-    np.testing.assert_array_equal(landmarks.views, np.delete(seen, [3, 5], axis=0))
+    add(store, keyframe(1), seen)
+    np.testing.assert_array_equal(store.table.views, np.delete(seen, [3, 5], axis=0))
+    np.testing.assert_array_equal(store.observations.views, store.table.views)
 
 
-def test_they_are_found_where_the_guess_predicts_them(landmarks: LocalMap) -> None:
-    add(landmarks, keyframe(1), views(60))
-    turn = 150 * 2 * np.pi / 480
-    after = wrapped(turned(texture(1), 150))
-    T_turned = POSE @ se3.exp([0, 0, 0, 0, 0, turn])
-    tracks = landmarks.track(after, T_turned)
-    assert tracks.visible == len(landmarks)
-    assert len(tracks.index) > 0.95 * len(landmarks)
-    expected = landmarks.views[tracks.index, :2] + (150, 0)
-    assert np.abs(MODEL.cylinder.wrap(tracks.pixels[:, 0] - expected[:, 0])).max() < 0.1
-    assert np.abs(MODEL.cylinder.wrap(tracks.predicted[:, 0] - expected[:, 0])).max() < 1e-6
-    assert len(landmarks.track(after, POSE).index) < 0.2 * len(landmarks)
+def test_moving_a_keyframe_moves_its_landmarks_and_no_others(store: LandmarkStore) -> None:
+    for seq in (1, 2):
+        add(store, keyframe(seq), views(30))
+    before, own = store.table, store.table.anchor == 1
+    T_moved = se3.exp([0.3, 0.1, 0, 0, 0, -0.2]) @ POSE
+    store.move_keyframe(1, T_moved, 4e-6 * np.eye(6))
+    np.testing.assert_allclose(store.table.points[own], se3.apply(T_moved, before.anchor_points[own]))
+    R = T_moved[:3, :3]
+    np.testing.assert_allclose(store.table.covariance[own], R @ before.anchor_covariance[own] @ R.T)
+    np.testing.assert_array_equal(store.table.points[~own], before.points[~own])
+    np.testing.assert_array_equal(store.table.anchor_points, before.anchor_points)
+    assert store.keyframes[1].covariance[0, 0] == 4e-6
+    np.testing.assert_array_equal(store.keyframes[1].T_odom_rect, T_moved)
+    store.move_keyframe(1, POSE, 1e-6 * np.eye(6))
+    np.testing.assert_allclose(store.table.points, before.points, atol=1e-12)
+    with pytest.raises(KeyError):
+        store.move_keyframe(7, POSE, np.eye(6))
 
 
-def test_patches_are_aligned_to_hundredths_where_the_pose_is_known(landmarks: LocalMap) -> None:
-    add(landmarks, keyframe(1), views(60))
-    turn = 150 * 2 * np.pi / 480
-    T_turned = POSE @ se3.exp([0, 0, 0, 0, 0, turn])
-    pixels, fitted = landmarks.align(wrapped(turned(texture(1), 150.4)), T_turned, np.arange(len(landmarks)))
-    assert fitted.mean() > 0.95
-    error = pixels[fitted] - landmarks.views[fitted, :2] - (150.4, 0)
-    assert np.abs(MODEL.cylinder.wrap(error[:, 0])).max() < 0.05 and np.abs(error[:, 1]).max() < 0.05
-    _, fitted = landmarks.align(wrapped(turned(texture(1), 155)), T_turned, np.arange(len(landmarks)))
-    assert fitted.mean() < 0.2
+def test_all_observations_of_a_landmark_are_kept_by_keyframe(store: LandmarkStore) -> None:
+    seen = views(30)
+    add(store, keyframe(1), seen)
+    ids = store.table.id[:10]
+    add(store, keyframe(2), views(20, seed=1))
+    later = seen[:10] + np.array([1.0, 0.5, 0.5])
+    store.add_observations(2, ids, later)
+    observations = store.observations
+    of_first = observations.landmark == ids[0]
+    np.testing.assert_array_equal(observations.keyframe[of_first], [1, 2])
+    np.testing.assert_array_equal(observations.views[of_first], [seen[0], later[0]])
+    assert len(observations.landmark) == len(store) + 10
+    assert len(set(store.table.id)) == len(store)
 
 
-def test_each_is_looked_for_in_its_own_keyframe(landmarks: LocalMap) -> None:
-    """Two keyframes at one pose, whose images have nothing in common."""
-    other = wrapped(texture(2))
-    add(landmarks, keyframe(1), views(40))
-    usable = np.ones((120, 480), bool)
-    usable[:20] = usable[100:] = False
-    points = corners(other, usable, 40)
-    add(landmarks, keyframe(2, image=other), np.column_stack([points, points[:, 1] + 8]))
-    for image, seq in ((wrapped(texture(1)), 1), (other, 2)):
-        shown = landmarks.views.copy()
-        pixels, fitted = landmarks.align(image, POSE, np.arange(len(landmarks)))
-        close = fitted & (np.abs(pixels - shown[:, :2]).max(axis=1) < 0.1)
-        assert landmarks.anchor_shares(np.flatnonzero(close))[seq] > 0.8
-        assert close.sum() > 30
+def test_observations_of_removed_landmarks_or_keyframes_are_ignored(store: LandmarkStore) -> None:
+    add(store, keyframe(1), views(30))
+    store.add_observations(1, np.array([1000]), np.zeros((1, 3)))
+    store.add_observations(9, store.table.id[:1], np.zeros((1, 3)))
+    assert len(store.observations.landmark) == len(store)
 
 
-def test_keyframes_are_bounded_and_the_oldest_goes_with_its_landmarks(landmarks: LocalMap) -> None:
+def test_the_oldest_keyframe_leaves_with_its_landmarks_and_observations(store: LandmarkStore) -> None:
+    each = len(views(30))
     for seq in range(10):
-        add(landmarks, keyframe(seq), views(30))
-        assert len(landmarks.keyframes) <= 3
-    assert sorted(landmarks.keyframes) == [7, 8, 9]
-    assert set(landmarks.anchor) == {7, 8, 9}
-    parts = landmarks.points, landmarks.covariance, landmarks.views, landmarks.slopes, landmarks.anchor
-    assert {len(part) for part in parts} == {3 * len(views(30))}
-    assert landmarks.anchor_shares(np.arange(len(landmarks))) == pytest.approx({7: 1 / 3, 8: 1 / 3, 9: 1 / 3})
+        known = store.table.id
+        add(store, keyframe(seq), views(30))
+        store.add_observations(seq, known, np.zeros((len(known), 3)))
+        assert len(store.keyframes) <= 3
+        assert len(store) <= 3 * each and len(store.observations.landmark) <= 3 * len(store)
+    assert sorted(store.keyframes) == [7, 8, 9]
+    assert set(store.table.anchor) == set(store.observations.keyframe) == {7, 8, 9}
+    assert set(store.observations.landmark) == set(store.table.id)
+    assert len(store.observations.landmark) == each * (3 + 2 + 1)
+    assert store.anchor_shares(np.arange(len(store))) == pytest.approx({7: 1 / 3, 8: 1 / 3, 9: 1 / 3})
 
 
-def see(landmarks: LocalMap, index: NDArray[np.intp]) -> None:
-    landmarks.saw(wrapped(texture(1)), index, landmarks.views[index, :2])
-
-
-def test_only_what_was_seen_last_is_tracked(landmarks: LocalMap) -> None:
-    add(landmarks, keyframe(1), views(30))
-    see(landmarks, np.arange(10))
-    assert set(landmarks.track(wrapped(texture(1)), POSE).index) <= set(range(10))
-    assert len(landmarks.track(wrapped(texture(1)), POSE).index) > 5
-
-
-def test_what_is_missed_several_times_running_is_forgotten(landmarks: LocalMap) -> None:
-    add(landmarks, keyframe(1), views(30))
-    positions = landmarks.points.copy()
-    see(landmarks, np.arange(10))
-    see(landmarks, np.arange(5, 15))
-    np.testing.assert_array_equal(landmarks.points, positions[:15])
+def test_landmarks_missed_in_several_consecutive_frames_are_removed(store: LandmarkStore) -> None:
+    add(store, keyframe(1), views(30))
+    before = store.table
+    for rows in (np.arange(10), np.arange(5, 15)):
+        store.update_tracked(rows, before.views[rows, :2])
+    np.testing.assert_array_equal(store.table.points, before.points[:15])
+    np.testing.assert_array_equal(store.observations.landmark, before.id[:15])
+    assert np.isnan(store.table.pixels[:5]).all() and np.isfinite(store.table.pixels[5:]).all()
     for _ in range(2):
-        see(landmarks, np.arange(0))
-    assert len(landmarks) == 0 and not landmarks.keyframes
+        store.update_tracked(np.arange(0), np.zeros((0, 2)))
+    assert len(store) == 0 and not store.keyframes and not len(store.observations.landmark)
 
 
-def test_clearing_forgets_all_and_an_empty_map_sees_nothing(landmarks: LocalMap) -> None:
-    add(landmarks, keyframe(1), views(30))
-    landmarks.clear()
-    assert len(landmarks) == 0 and not landmarks.keyframes
-    tracks = landmarks.track(wrapped(texture(1)), POSE)
-    assert tracks.visible == 0 and tracks.pixels.shape == (0, 2)
-    assert landmarks.anchor_shares(tracks.index) == {}
+def test_clearing_removes_everything_and_ids_are_not_used_again(store: LandmarkStore) -> None:
+    add(store, keyframe(1), views(30))
+    last = store.table.id[-1]
+    store.clear()
+    assert len(store) == 0 and not store.keyframes and not len(store.observations.landmark)
+    add(store, keyframe(2), views(30))
+    assert store.table.id[0] == last + 1

@@ -53,7 +53,7 @@ def test_another_place_and_darkness_fit_nowhere(cameras: Eyes, keyframe: StereoF
     assert places.locate(keyframe) is None
     _remember(places, keyframe, T_ODOM_KEYFRAME)
     fit = places.locate(elsewhere)
-    assert fit is None or fit.inliers < 20 or fit.share < 0.4
+    assert fit is None or fit.inliers < 20 or fit.inlier_ratio < 0.4
     assert places.locate(cameras.darkness(4)) is None
     places.forget()
     assert places.locate(keyframe) is None

@@ -1,0 +1,55 @@
+"""Results of the odometry: the pose that a frame supports, and the estimate that is published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.odometry.stereo_frame import Features
+from omnid.tracking_state import TrackingState
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """Pose of a frame in odom with its covariance, and the number of landmarks predicted, tracked and inliers.
+
+    The covariance takes the landmarks of the local map as exact; that of a pose found by the relocaliser is complete.
+    """
+
+    T_odom_rect: Array
+    covariance: Array  # (6, 6) [t; r] in the rectified frame
+    visible: int  # landmarks that the guessed pose predicts in the panorama
+    tracked: int
+    inliers: int
+    landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) rows of the local map
+    views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them in this frame, NaN: not in upper
+    rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
+
+    @property
+    def pixels(self) -> Array:
+        """Pixels (M, 2) of the inliers in the lower panorama."""
+        return self.views[:, :2]
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the tracked landmarks that are inliers."""
+        return self.inliers / max(1, self.tracked)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryEstimate:
+    """Pose T_odom_rect after a frame and its quality; covariances in the axes of the rectified frame, [t; r]."""
+
+    T_odom_rect: Array
+    covariance: Array  # (6, 6) m^2, rad^2
+    velocity: Array  # (6,) m/s, rad/s
+    velocity_covariance: Array
+    state: TrackingState
+    resets: int
+    tracked: int
+    inliers: int
+    features: Features = field(default_factory=Features)

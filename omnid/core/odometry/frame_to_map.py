@@ -1,0 +1,134 @@
+"""Pose of a frame in the local map, in three steps: track, estimate, refine; and the choice between yaw hypotheses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.corners import rows_in_upper
+from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.local_map import LocalMap, Tracks
+from omnid.core.odometry.pose_estimation import GaussNewtonResult, StereoModel, gauss_newton, ransac
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+MIN_LANDMARKS = 6  # below which six unknowns are no estimate
+OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
+ROUNDS = 2  # of Gauss-Newton, each on the inliers of the one before
+YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
+ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
+COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet warped to the new viewpoint
+# Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
+# errors are correlated.
+CORRELATED_LANDMARKS = 4.0
+VIEW_DIMENSIONS = 3  # expected value of the squared Mahalanobis distance of a view
+
+
+@dataclass(frozen=True, slots=True)
+class CoarsePose:
+    """Pose from the tracks, and the inliers among them."""
+
+    T_curr_odom: Array
+    landmarks: Indices  # (M,) rows of the local map
+    disparity: Array  # (M,) px in this frame, NaN: not found in the upper panorama
+    tracks: Tracks
+
+
+class FrameToMap:
+    """Steps 2 to 4 of the odometry, for one guess of the pose."""
+
+    def __init__(self, local_map: LocalMap, model: StereoModel, klt: KltSettings) -> None:
+        self._map, self._model = local_map, model
+        self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
+        self._stereo_klt = replace(klt, levels=1)  # the predicted disparity is good to a few pixels
+
+    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array) -> CoarsePose | None:
+        """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
+
+        RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
+        place of the paper's eq. (9).
+        """
+        if len(tracks.landmarks) < MIN_LANDMARKS:
+            return None
+        views = self._views(frame, tracks)
+        T_guess_odom = se3.inverse(T_odom_guess)
+        in_guess = se3.apply(T_guess_odom, self._map.store.table.points[tracks.landmarks])
+        T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
+        landmarks, views = tracks.landmarks[is_inlier], views[is_inlier]
+        solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model)
+        if solution is None:
+            return None
+        disparity = (views[:, 2] - views[:, 1])[kept]
+        return CoarsePose(solution.T, landmarks[kept], disparity, tracks)
+
+    def refine(self, frame: StereoFrame, coarse: CoarsePose) -> PoseEstimate | None:
+        """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
+
+        The disparity of the tracked landmarks was measured between images of one instant, so it is kept and goes along
+        with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
+        supports of the pose: the number of inliers is the smaller one of both.
+        """
+        T_odom_curr = se3.inverse(coarse.T_curr_odom)
+        landmarks, _ = self._map.visible(T_odom_curr)
+        pixels, aligned = self._map.align(frame.lower, T_odom_curr, landmarks)
+        landmarks, pixels = landmarks[aligned], pixels[aligned]
+        disparity = np.full(len(self._map), np.nan)
+        disparity[coarse.landmarks] = coarse.disparity
+        views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
+        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model)
+        if solution is None:
+            return None
+        # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
+        scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
+        landmarks, views, tracks = landmarks[kept], views[kept], coarse.tracks
+        rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
+        inliers = min(len(coarse.landmarks), len(landmarks))
+        return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, tracks.visible,
+                            len(tracks.landmarks), inliers, landmarks, views, rejected)
+
+    def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float]) -> Array:
+        """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
+
+        The search ends at the first hypothesis that keeps more than ENOUGH_RATIO (section IV.F).
+        """
+        best, highest = T_odom_rect, -1.0
+        for yaw_rad in yaws_rad:
+            turned = T_odom_rect @ se3.exp([0, 0, 0, 0, 0, yaw_rad])
+            tracks = self._map.track(frame.lower, turned, most=YAW_SAMPLE)
+            ratio = len(tracks.landmarks) / max(1, tracks.visible)
+            if ratio > highest:
+                best, highest = turned, ratio
+            if highest > ENOUGH_RATIO:
+                break
+        return best
+
+    def _views(self, frame: StereoFrame, tracks: Tracks) -> Array:
+        """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there."""
+        rows = tracks.pixels[:, 1] + tracks.predicted[:, 2] - tracks.predicted[:, 1]
+        found = rows_in_upper((frame.lower, frame.upper), tracks.pixels, rows, self._stereo_klt)
+        return np.column_stack([tracks.pixels, found])
+
+    def _solve(
+        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel
+    ) -> tuple[GaussNewtonResult | None, Flags]:
+        """Return the solution of Gauss-Newton in ROUNDS, and flags (M,) of the inliers; None where they are too few."""
+        kept = np.ones(len(landmarks), bool)
+        solution = None
+        for _ in range(ROUNDS):
+            if kept.sum() < MIN_LANDMARKS:
+                return None, kept
+            rows, table = landmarks[kept], self._map.store.table
+            solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model)
+            T_curr_odom = solution.T
+            squared = np.full(len(landmarks), np.inf)
+            squared[kept] = solution.squared
+            kept = squared < OUTLIER_SQUARED
+        return (solution if kept.sum() >= MIN_LANDMARKS else None), kept

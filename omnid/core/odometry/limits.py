@@ -1,0 +1,34 @@
+"""Limits of the odometry: landmarks wanted, and the support below which a pose is degraded or refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omnid.settings import knob
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryLimits:
+    """Number of landmarks and keyframes, and the thresholds of the acceptance test and of the tracking state."""
+
+    features: int = knob(500, "landmarks wanted in a keyframe", low=20, high=10_000)
+    refresh: float = knob(
+        0.9, "a keyframe is added when less than this share of the last one's landmarks is left", low=0, high=1
+    )
+    sparse_every: int = knob(
+        5, "frames after which a keyframe is added where the features wanted are not reached", low=1, high=1000
+    )
+    keyframes: int = knob(8, "keyframes in the local map; 1: frame to frame", low=1, high=50)
+    min_inliers: int = knob(20, "inliers below which a pose is refused", low=4, high=10_000)
+    min_inlier_ratio: float = knob(
+        0.4, "inliers, as a share of the tracked landmarks, below which a pose is refused", low=0, high=1
+    )
+    good_inliers: int = knob(50, "inliers below which a pose is degraded", low=4, high=10_000)
+    good_inlier_ratio: float = knob(0.6, "inlier ratio below which other yaw angles are tried", low=0, high=1)
+    max_speed_mps: float = knob(5.0, "poses that imply a higher speed are refused, m/s", low=0.1, high=100)
+    lost_after: int = knob(3, "consecutive refused frames after which the state is lost", low=1, high=1000)
+    restart_after: int = knob(
+        10, "frames with enough corners that match no landmark, after which the map is started again", low=1,
+        high=10_000,
+    )
+    max_gap_s: float = knob(0.5, "a pose after a longer time without frames is degraded, s", low=0.01, high=60)

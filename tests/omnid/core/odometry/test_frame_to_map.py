@@ -1,0 +1,82 @@
+"""Steps 2 to 4 of the odometry: a pose needs the tracks from the last frame and the patches of the keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.frame_to_map import FrameToMap
+from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings
+from tests.omnid.core.scenery import Image, motion_errors, texture, turned, wrapped
+
+MODEL = StereoModel(Cylinder(480, 120, 60.0), 0.2)
+DISPARITY_PX = 8
+
+
+def stereo_frame(lower: Image) -> StereoFrame:
+    """A frame with the same disparity everywhere; its disparity image is empty."""
+    upper = np.roll(lower, DISPARITY_PX, axis=0)
+    return StereoFrame(1, wrapped(lower), wrapped(upper), np.full(lower.shape, np.nan, np.float32),
+                       np.ones(lower.shape, bool))
+
+
+def map_of(lower: Image, keyframe_image: Image) -> LocalMap:
+    """A map with landmarks seen in `lower`, whose keyframe at the origin shows another image."""
+    usable = np.ones((120, 480), bool)
+    usable[:20] = usable[100:] = False
+    points = corners(wrapped(lower), usable, 200)
+    local_map = LocalMap(MODEL, KltSettings())
+    keyframe = Keyframe(0, wrapped(keyframe_image), np.eye(4), np.zeros((6, 6)))
+    views = np.column_stack([points, points[:, 1] + DISPARITY_PX])
+    local_map.add_keyframe(keyframe, views, np.zeros((len(views), 2)))
+    local_map.update_tracked(wrapped(lower), np.arange(len(local_map)), local_map.store.table.views[:, :2])
+    return local_map
+
+
+def located(local_map: LocalMap, frame: StereoFrame) -> PoseEstimate | None:
+    """The estimate from a guess at the origin."""
+    steps = FrameToMap(local_map, MODEL, KltSettings())
+    coarse = steps.estimate(frame, local_map.track(frame.lower, np.eye(4)), np.eye(4))
+    return steps.refine(frame, coarse) if coarse else None
+
+
+@pytest.mark.parametrize(("columns_shown", "supported"), [(480, True), (60, False)])
+def test_tracks_alone_do_not_support_a_pose(columns_shown: int, supported: bool) -> None:
+    """All landmarks are tracked at the same pixels, but most of the second keyframe shows another image there."""
+    shown = np.where(np.arange(480) < columns_shown, texture(1), texture(2))
+    estimate = located(map_of(texture(1), shown), stereo_frame(texture(1)))
+    assert estimate is not None and estimate.tracked > 100
+    assert estimate.inliers > 100 if supported else estimate.inlier_ratio < 0.4
+    if supported:
+        np.testing.assert_allclose(estimate.T_odom_rect, np.eye(4), atol=1e-3)
+
+
+def test_the_estimate_carries_the_views_of_its_inliers() -> None:
+    estimate = located(map_of(texture(1), texture(1)), stereo_frame(texture(1)))
+    assert estimate is not None
+    assert len(estimate.landmarks) == len(estimate.views) == len(estimate.pixels)
+    disparity = estimate.views[:, 2] - estimate.views[:, 1]
+    assert np.isfinite(disparity).mean() > 0.8
+    np.testing.assert_allclose(disparity[np.isfinite(disparity)], DISPARITY_PX, atol=0.1)
+
+
+def test_no_pose_without_tracks() -> None:
+    assert located(map_of(texture(1), texture(1)), stereo_frame(np.zeros((120, 480), np.uint8))) is None
+
+
+@pytest.mark.parametrize("columns", [70, -70])
+def test_the_best_yaw_is_the_hypothesis_that_keeps_the_landmarks(columns: int) -> None:
+    local_map = map_of(texture(1), texture(1))
+    frame = stereo_frame(turned(texture(1), columns))
+    yaw_rad = columns / 480 * 2 * np.pi
+    steps = FrameToMap(local_map, MODEL, KltSettings())
+    T = steps.best_yaw(frame, np.eye(4), [0.0, -yaw_rad, yaw_rad, 3.0])
+    assert motion_errors(T, se3.exp([0, 0, 0, 0, 0, yaw_rad]))[1] < 1e-9
