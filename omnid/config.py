@@ -16,7 +16,8 @@ from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
-from omnid.settings import knob, load
+from omnid.errors import OmnidError
+from omnid.settings import changed, knob, load
 from omnid.transport.bus_config import BusConfig
 
 
@@ -217,3 +218,47 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
     Raises OmnidError, also for keys of earlier versions: it names the new one.
     """
     return load(Config, path, overrides, renamed=RENAMED)
+
+
+# Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
+USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
+    "bus.panorama_hz": "run",
+    "cameras": "run",
+    "controller.setpoint": "replay",
+    "graph.depth": "replay",
+    "live": "run",
+    "log": "replay",
+    "realtime": "run",
+    "record": "run",
+    "record.cloud_points": "",
+    "service": "run",
+})
+
+
+def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> list[str]:
+    """Return the warning, if there is one, that a command ignores settings of the configuration file.
+
+    command: run or replay. Raises OmnidError for an override that the command ignores, and for a setpoint in `run`:
+    a robot must not be expected to drive by itself.
+    """
+    for override in overrides:
+        path = ".".join(part.strip() for part in override.partition("=")[0].split("."))
+        if _ignores(command, path):
+            raise OmnidError(f"override {override!r}: `omnid {command}` does not use {path}: leave it out")
+    ignored = [path for path in changed(config) if _ignores(command, path)]
+    if command == "run":
+        for path in ignored:
+            if path.startswith("controller.setpoint."):
+                raise OmnidError(f"{path} is set, but `omnid run` drives by the setpoints that it receives, as "
+                                 "cmd/twist or cmd/heading: remove it from the configuration")
+    return [f"`omnid {command}` does not use these settings: {', '.join(ignored)}"] if ignored else []
+
+
+def _ignores(command: str, path: str) -> bool:
+    """True if only the other command uses the key."""
+    parts = path.split(".")
+    for depth in range(len(parts), 0, -1):
+        only = USED_ONLY_BY.get(".".join(parts[:depth]))
+        if only is not None:
+            return only not in ("", command)
+    return False

@@ -22,6 +22,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
+from functools import reduce
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
@@ -154,6 +155,21 @@ def parse(
 def dump(settings: object) -> str:
     """Commented TOML with every knob, what it is, its range and its default; `load` gives the same object again."""
     return "\n".join(_dumped(settings, type(settings)(), ())).strip("\n") + "\n"
+
+
+def changed(settings: object) -> list[str]:
+    """Return the dotted paths of the knobs that differ from their defaults."""
+    default = type(settings)()
+    return [path for path in knob_paths(type(settings)) if _at(settings, path) != _at(default, path)]
+
+
+def knob_paths(root: type) -> list[str]:
+    """Return the dotted paths of all knobs."""
+    return [".".join(path) for path in _paths(root)]
+
+
+def _at(settings: object, path: str) -> object:
+    return reduce(getattr, path.split("."), settings)
 
 
 def _bytes_of(path: str | PathLike[str]) -> bytes:

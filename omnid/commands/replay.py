@@ -52,13 +52,15 @@ def _add_manner(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
-    from omnid.config import load_config
+    from omnid.config import load_config, unused_settings
     from omnid.runs.replay import ReplayOptions
 
     options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map=args.map, plan=args.plan,
                             record=args.record, publish=args.publish, inline=args.inline, realtime=args.realtime,
                             settings=args.config)
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
+    for warning in unused_settings(config, "replay", args.overrides):
+        print(f"omnid: warning: {warning}", file=sys.stderr)
     return replay_and_print(args.log, config, options, quiet=args.quiet)
 
 

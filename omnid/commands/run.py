@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import time
 from contextlib import closing
 from pathlib import Path
@@ -35,13 +36,15 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.malloc_settings import use_one_malloc_arena
 
     use_one_malloc_arena()  # before anything else: the next line loads numpy, which starts threads
-    from omnid.config import load_config
+    from omnid.config import load_config, unused_settings
     from omnid.engine.logging_setup import log
     from omnid.runs.live import LiveRun
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
     config = load_config(args.config, [*args.overrides, *shortcuts])
+    for warning in unused_settings(config, "run", args.overrides):
+        log(logging.WARNING, warning)
     if args.log is None:
         _refuse_what_needs_a_log(args)
         return LiveRun(config, _devices(config), log).run()

@@ -11,6 +11,7 @@ from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
 from omnid.engine.flow import nothing
 
@@ -92,11 +93,12 @@ class Controller:
         return dt_ns * S_PER_NS, (now_ns - due_ns) * S_PER_NS
 
     def _count_stop(self, reason: str) -> None:
-        """Keep the reason; count and report it where it ends a drive."""
+        """Keep the reason; count it where it ends a drive, and report it unless the end was asked for."""
         before, self.state.reason = self.state.reason, reason
         if reason and not before:
             self.state.stops[reason] += 1
-            self._report(f"the wheels stop: {reason}")
+            if reason != ENDS:
+                self._report(f"the wheels stop: {reason}")
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""

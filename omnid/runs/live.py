@@ -112,7 +112,7 @@ class LiveRun:
 
     def _wire(self, session: Session, geometry: Geometry, cameras: Mapping[Camera, LiveCamera]) -> None:
         config, graph, rig = self._config, self._graph, geometry.rig
-        controller = session.start_controller() if config.motor.port else None
+        controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]

@@ -23,6 +23,7 @@ from omnid.diagnostics.status import stage_status
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import PlaybackClock
+from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import SummaryRow, Telemetry
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate
@@ -44,6 +45,7 @@ from omnid.transport.codec import OK, DiagnosticStatus
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
 BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
+UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 
 
 class ProgressDisplay(Protocol):
@@ -168,7 +170,7 @@ class _Replay:
                       bus=self._bus(session, geometry) if options.publish else None)
         if config.motor.port:
             setpoint, T_base_rig = config.controller.setpoint.setpoint(), geometry.rig.T_base_rig
-            self._drive = ReplayDrive(session.start_controller(), setpoint, T_base_rig)
+            self._drive = ReplayDrive(session.start_controller(UNPRIVILEGED), setpoint, T_base_rig)
             sinks = replace(sinks, replay_drive=self._drive)
         if options.record:
             sinks = replace(sinks, recorder=self._recorder(session, geometry, options.record))
@@ -222,7 +224,7 @@ class _Replay:
             self._poses.states,
             counters,
             results.timings(),
-            (*self._warnings, *results.warnings()),
+            (*dict.fromkeys(self._warnings), *results.warnings()),
             None if newest is None else newest.points,
             session.signal,
         )

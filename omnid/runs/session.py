@@ -15,6 +15,7 @@ from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph
+from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
 from omnid.settings import dump
@@ -57,12 +58,12 @@ class Session:
             self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
         return bus
 
-    def start_controller(self) -> ControllerLink:
+    def start_controller(self, realtime: RealtimeSettings) -> ControllerLink:
         """Start the controller process; DriverError where the motor cannot be opened.
 
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
-        start = ControllerStart(self.config.motor, self.config.controller, self.config.realtime)
+        start = ControllerStart(self.config.motor, self.config.controller, realtime)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)
         return link

@@ -32,7 +32,7 @@ class SafetyInputs:
     ending: bool = False
 
 
-ENDS: Final = "the daemon ends"
+ENDS: Final = "the run ends"
 ASKED: Final = "a stop was asked for"
 FAILED: Final = "the motor controller failed"
 STOPPED: Final = "the motor controller had stopped by itself"

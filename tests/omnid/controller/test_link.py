@@ -119,6 +119,12 @@ def test_poses_and_commands_turn_the_wheels_and_the_book_is_kept(robot: Robot) -
     assert robot.error is None and robot.stats.busy_since_ns == 0
 
 
+def test_the_running_process_has_no_perception_in_its_memory(robot: Robot) -> None:
+    robot.drive()
+    maps = Path(f"/proc/{robot.pid}/maps").read_text()
+    assert "python" in maps and "numpy" not in maps and "cv2" not in maps
+
+
 def test_at_the_end_the_wheels_slow_down(robot: Robot) -> None:
     robot.drive()
     robot.link.end()
