@@ -1,4 +1,4 @@
-"""Every knob on one page. `omnid config` prints it as TOML; what `omnid replay --config FILE` reads is the same."""
+"""The configuration: all sections on one page. `omnid config` prints it as TOML, --config FILE reads it."""
 
 from __future__ import annotations
 
@@ -23,136 +23,136 @@ from omnid.transport.bus_config import BusConfig
 
 @dataclass(frozen=True, slots=True)
 class LogConfig:
-    """How a log is read."""
+    """Reading of logs."""
 
-    reorder_frames: int = knob(32, "images that may wait for one that was written late", low=1, high=1000)
+    reorder_frames: int = knob(32, "images sorted by their stamps: how late one may be in the log", low=1, high=1000)
 
 
 @dataclass(frozen=True, slots=True)
 class CamerasConfig:
-    """The cameras of the robot and how they are set; both alike."""
+    """Devices and settings of the cameras; both have the same settings."""
 
-    rig: str = knob("/etc/omnid/rig.toml", "the calibration of the cameras, see `omnid calibrate`")
-    lower: str = knob("/dev/omnid/lower", "device of the lower camera, by a name that stays, see `omnid cameras`")
+    rig: str = knob("/etc/omnid/rig.toml", "calibration of the cameras, see `omnid calibrate`")
+    lower: str = knob("/dev/omnid/lower", "device of the lower camera, by a persistent name, see `omnid cameras`")
     upper: str = knob("/dev/omnid/upper", "device of the upper camera")
     width_px: int = knob(1280, "width of the images, px", low=16, high=16384)
     height_px: int = knob(960, "height of the images, px", low=16, high=16384)
-    rate_hz: float = knob(30.0, "images per second; 0: what the camera does by itself", low=0, high=1000)
-    pixel_format: str = knob("auto", "how images come over the wire", choices=PIXEL_FORMATS)
+    rate_hz: float = knob(30.0, "images per second; 0: the camera's own rate", low=0, high=1000)
+    pixel_format: str = knob("auto", "pixel format of the images on USB", choices=PIXEL_FORMATS)
     auto_exposure: str = knob("keep", "automatic exposure", choices=SWITCH)
     exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
     auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
     gain: int = knob(-1, "fixed gain in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
     auto_white_balance: str = knob("keep", "automatic white balance", choices=SWITCH)
-    auto_focus: str = knob("keep", "automatic focus; best off: every move of the lens spoils the calibration",
+    auto_focus: str = knob("keep", "automatic focus; best off: each focus has another calibration",
                            choices=SWITCH)
     focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
-    power_line: str = knob("keep", "against the flicker of lamps, Hz", choices=POWER_LINE)
-    controls: tuple[str, ...] = knob((), "other controls, as v4l2-ctl --list-ctrls names them: 'sharpness=2'")
-    buffers: int = knob(4, "images the kernel holds", low=2, high=32)
-    timeout_s: float = knob(2.0, "a camera without a image for so long is opened anew, s", low=0.05, high=60)
+    power_line: str = knob("keep", "mains frequency against the flicker of lamps, Hz", choices=POWER_LINE)
+    controls: tuple[str, ...] = knob((), "other controls by their names in v4l2-ctl --list-ctrls: 'sharpness=2'")
+    buffers: int = knob(4, "image buffers of the kernel", low=2, high=32)
+    timeout_s: float = knob(2.0, "a camera without an image for so long is opened again, s", low=0.05, high=60)
     retry_s: float = knob(2.0, "longest wait between two tries to open a lost camera, s", low=0.05, high=60)
 
     def settings(self, camera: str) -> V4l2Settings:
-        """The settings of the lower or the upper camera; DriverError where they contradict each other."""
+        """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
 
 @dataclass(frozen=True, slots=True)
 class LiveConfig:
-    """What `omnid run` says while it runs."""
+    """Reports of `omnid run`."""
 
-    status_s: float = knob(1.0, "between two reports of the state, s", low=0.1, high=60)
-    cloud_s: float = knob(2.0, "between two maps on the bus, s; 0: only at the end", low=0, high=3600)
-    cloud_points: int = knob(50_000, "most points of the map on the bus: the most confident ones", low=0,
+    status_s: float = knob(1.0, "period of the status, s", low=0.1, high=60)
+    cloud_s: float = knob(2.0, "period of the maps on the bus, s; 0: only at the end", low=0, high=3600)
+    cloud_points: int = knob(50_000, "largest number of map points on the bus: the most confident ones", low=0,
                              high=10_000_000)
-    check_s: float = knob(5.0, "between two looks at whether the cameras still stand as calibrated, s; 0: none", low=0,
+    check_s: float = knob(5.0, "period of the check of the rig's calibration, s; 0: none", low=0,
                           high=3600)
 
 
 @dataclass(frozen=True, slots=True)
 class PairConfig:
-    """What counts as one instant."""
+    """Synchronisation of the cameras."""
 
-    tolerance_ms: float = knob(10.0, "largest difference of the stamps of a pair, ms", low=0, high=1000)
+    tolerance_ms: float = knob(10.0, "largest difference between the stamps of a pair, ms", low=0, high=1000)
 
 
 @dataclass(frozen=True, slots=True)
 class PanoramaConfig:
-    """What is shown on the cylinder."""
+    """Size and borders of the panoramas."""
 
     width_px: int = knob(0, "columns of a full turn, px; 0: the images' own resolution", low=0, high=4096)
     elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
     pad_px: int = knob(48, "columns repeated on either side, so that windows run across the seam", low=16, high=256)
-    rim_margin_px: float = knob(4.0, "what is left out along rim and hub in the images, px", low=0, high=100)
-    margin_px: int = knob(7, "what is left out along the border of what both cameras show, px", low=0, high=100)
+    rim_margin_px: float = knob(4.0, "margin along rim and hub in the images, px", low=0, high=100)
+    margin_px: int = knob(7, "margin along the border of the common view of both cameras, px", low=0, high=100)
 
 
 @dataclass(frozen=True, slots=True)
 class StereoConfig:
-    """Depth by matching along the columns."""
+    """Depth by matching along the columns of the panoramas."""
 
-    min_range_m: float = knob(0.65, "the nearest points wanted, m from the rig's axis", low=0.01, high=100)
-    noise_px: float = knob(0.5, "deviation of a disparity, px: how far the map trusts a point", low=0.01, high=10)
+    min_range_m: float = knob(0.65, "distance of the nearest points from the rig's axis, m", low=0.01, high=100)
+    noise_px: float = knob(0.5, "sigma of a disparity, px: sets the weight of a point in the map", low=0.01, high=10)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryConfig:
-    """The motion of the rig."""
+    """Visual odometry."""
 
-    method: str = knob("default", "how the motion is found", choices=("default", "paper"))
+    method: str = knob("default", "method of the odometry", choices=("default", "paper"))
     tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
-    reference: str = knob("previous", "what the paper's method measures against", choices=("previous", "keyframe"))
-    noise_px: float = knob(0.1, "deviation of a tracked corner, px", low=0.01, high=10)
+    reference: str = knob("previous", "reference frame of the paper's method", choices=("previous", "keyframe"))
+    noise_px: float = knob(0.1, "sigma of a tracked corner, px", low=0.01, high=10)
     klt: KltSettings = field(default_factory=KltSettings)
     limits: OdometryLimits = field(default_factory=OdometryLimits)
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
-    """The map of the whole run."""
+    """Voxel map of the whole run."""
 
     voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
     log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
-    max_sigma_m: float = knob(0.15, "points less certain than this stay out of the map, m", low=0.001, high=100)
-    min_frames: int = knob(6, "frames that must have seen a voxel before it is written; fewer in a short run", low=1,
-                           high=1000)
-    heights_m: tuple[float, float] = knob((-1.0, 1.5), "of what stands in the way in the grid on the bus, m over the "
-                                          "base at the start", low=-1000, high=1000)
-    path_poses: int = knob(100_000, "poses kept for the plan view; beyond, every second is forgotten", low=100,
+    max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)
+    min_frames: int = knob(6, "frames that must have observed a voxel that is written; fewer in a short run",
+                           low=1, high=1000)
+    heights_m: tuple[float, float] = knob((-1.0, 1.5), "heights of obstacles in the grid on the bus, m above the base "
+                                          "at the start", low=-1000, high=1000)
+    path_poses: int = knob(100_000, "poses kept for the plan view; when full, every second one is dropped", low=100,
                            high=10_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
-    """What `omnid run`, `omnid record` and `--record` write."""
+    """Recordings of `omnid run`, `omnid record` and `omnid replay --record`."""
 
-    enabled: bool = knob(False, "omnid run records what the cameras see and what is made of it")
-    folder: str = knob("recordings", "where the recordings are kept; one that is missing is made")
-    file_mb: int = knob(500, "a new file is begun after so many MB", low=1, high=1_000_000)
-    file_s: float = knob(600.0, "or after so many seconds", low=1, high=86_400)
-    keep_files: int = knob(1000, "files kept; the oldest are deleted", low=1, high=100_000)
-    keep_mb: int = knob(20_000, "MB of all files together; the oldest are deleted", low=2, high=1_000_000_000)
-    free_mb: int = knob(1000, "MB left on the disk to others; where there is less, nothing is recorded", low=0,
+    enabled: bool = knob(False, "omnid run records images and results")
+    folder: str = knob("recordings", "folder of the recordings; it is made if it is missing")
+    file_mb: int = knob(500, "size at which a new file begins, MB", low=1, high=1_000_000)
+    file_s: float = knob(600.0, "duration at which a new file begins, s", low=1, high=86_400)
+    keep_files: int = knob(1000, "number of files kept; the oldest are deleted", low=1, high=100_000)
+    keep_mb: int = knob(20_000, "total size of all files, MB; the oldest are deleted", low=2, high=1_000_000_000)
+    free_mb: int = knob(1000, "free space left on the disk, MB; with less nothing is recorded", low=0,
                         high=1_000_000)
-    sync_s: float = knob(3.0, "the files are brought to the disk this often, s: what a power cut may cost", low=0.1,
+    sync_s: float = knob(3.0, "period of syncing the files to the disk, s: a power cut loses no more", low=0.1,
                          high=3600)
-    queue: int = knob(20, "messages of each kind that may wait for the disk; the oldest are dropped and counted",
+    queue: int = knob(20, "messages of each kind that may wait for the disk; more drop the oldest",
                       low=1, high=1000)
-    cloud_points: int = knob(200_000, "most points of the map in the log: the most confident ones", low=0,
+    cloud_points: int = knob(200_000, "largest number of map points in the log: the most confident ones", low=0,
                              high=10_000_000)
 
     def rotation(self) -> RotationSettings:
-        """The same for the driver of the files."""
+        """Return these settings in the units of the driver."""
         return RotationSettings(self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6,
                                 self.free_mb * 10**6, self.sync_s)
 
 
 @dataclass(frozen=True, slots=True)
 class GraphConfig:
-    """How the stages are run."""
+    """Inboxes and threads of the stages."""
 
     depth: int = knob(2, "messages that may wait in front of a stage", low=1, high=100)
     opencv_threads: int = knob(1, "threads OpenCV may use within a stage", low=1, high=64)
@@ -160,15 +160,15 @@ class GraphConfig:
 
 @dataclass(frozen=True, slots=True)
 class ServiceConfig:
-    """How the daemon is watched."""
+    """Supervision by systemd."""
 
-    hung_s: float = knob(10.0, "a stage that has been at one message for longer is hung: systemd is to restart, s",
-                         low=0.5, high=600)
+    stall_timeout_s: float = knob(10.0, "systemd restarts the daemon if a stage works on one message for longer, s",
+                                  low=0.5, high=600)
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All of it."""
+    """The whole configuration."""
 
     log: LogConfig = field(default_factory=LogConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -203,6 +203,7 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType({
     "guidance": "controller.setpoint",
     "guidance.limits": "controller.heading",
     "helm": "controller",
+    "service.hung_s": "service.stall_timeout_s",
     "motor.stale_s": "controller.deadlines.command_s",
     "stereo.matching.rival": "stereo.matching.runner_up_ratio",
     "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",

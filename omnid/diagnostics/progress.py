@@ -1,4 +1,4 @@
-"""How far a run is, on a terminal or in a journal."""
+"""Progress of a run, as a bar on a terminal or as lines in a journal."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from omnid.diagnostics.run_statistics import RunStatistics
 
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0
-BAR = 24
-COLUMNS = 80  # of a terminal that does not say
+BAR_COLUMNS = 24
+DEFAULT_COLUMNS = 80  # of a terminal that does not report its size
 
 
 class Progress:
-    """Draws a bar, or writes a line where stderr is no terminal; called at a fixed rate."""
+    """The action of a ticker: draws a bar, or writes a line where the stream is no terminal."""
 
     def __init__(self, statistics: RunStatistics, expected: int | None, stream: TextIO | None = None) -> None:
         self._statistics, self._expected = statistics, expected
@@ -27,16 +27,16 @@ class Progress:
 
     @property
     def period_s(self) -> float:
-        """How often it is worth looking."""
+        """Time between two calls."""
         return TERMINAL_PERIOD_S if self._terminal else JOURNAL_PERIOD_S
 
     def __call__(self) -> None:
-        """Shows the state now."""
+        """Show the progress now."""
         if self._statistics.poses:
             self._show(self._line())
 
     def close(self) -> None:
-        """Leaves the terminal as it was."""
+        """Clear the bar."""
         if self._terminal and self._drawn:
             self._write("\r" + " " * self._drawn + "\r")
 
@@ -49,13 +49,13 @@ class Progress:
     def _share(self, done: int) -> str:
         if not self._expected:
             return f"{done} pairs"
-        filled = min(BAR, BAR * done // self._expected)
-        bar = f"[{'#' * filled}{'.' * (BAR - filled)}] " if self._terminal else ""
+        filled = min(BAR_COLUMNS, BAR_COLUMNS * done // self._expected)
+        bar = f"[{'#' * filled}{'.' * (BAR_COLUMNS - filled)}] " if self._terminal else ""
         return f"{bar}{done}/{self._expected}"
 
     def _show(self, line: str) -> None:
         if self._terminal:
-            line = line[: self._columns() - 1]  # a line that wraps could not be drawn over
+            line = line[: self._columns() - 1]  # a wrapped line could not be overwritten
             self._write("\r" + line.ljust(self._drawn))
             self._drawn = len(line)
         else:
@@ -63,13 +63,13 @@ class Progress:
 
     def _columns(self) -> int:
         try:
-            return os.get_terminal_size(self._stream.fileno()).columns or COLUMNS
+            return os.get_terminal_size(self._stream.fileno()).columns or DEFAULT_COLUMNS
         except OSError:
-            return COLUMNS
+            return DEFAULT_COLUMNS
 
     def _write(self, text: str) -> None:
         try:
             self._stream.write(text)
             self._stream.flush()
-        except OSError:  # nobody reads it any more: no reason to end the run
+        except OSError:  # the reader has gone: no reason to end the run
             self._stream = open("/dev/null", "w", encoding="ascii")  # noqa: SIM115 - lives as long as the run

@@ -29,7 +29,7 @@ from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.record import open_recorder
 from omnid.runs.session import CAMERAS, TICKERS, Session
-from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
+from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import command_recorder
 from omnid.sinks.drive import LiveDrive
@@ -67,7 +67,7 @@ class LiveRun:
 
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
-        show_stacks_at_the_end()
+        print_stacks_when_killed()
         compile_serialisers()
         offset_ns = time.time_ns() - time.monotonic_ns()
         with ExitStack() as outputs:
@@ -146,7 +146,8 @@ class LiveRun:
             publishers.append(_status_in_recording(recorder, session.offset_ns))
         self._graph.ticker("status", self._config.live.status_s, StatusTick(report, *publishers))
         telemetry = self._graph.telemetry
-        service = Service(telemetry, StatusLine(session.statistics, telemetry, TICKERS), self._config.service.hung_s)
+        status_line = StatusLine(session.statistics, telemetry, TICKERS)
+        service = Service(telemetry, status_line, self._config.service.stall_timeout_s)
         self._graph.ticker("watchdog", service.period_s, service)
 
     def _recorder(self, session: Session, rig: Rig) -> Recorder:

@@ -1,7 +1,7 @@
-"""The daemon as a systemd service: says when it is ready and how it is, and that it is alive as long as it is.
+"""The daemon as a systemd service: readiness, status line and watchdog (sd_notify(3)).
 
-Alive means that no stage has been at one message, with or without others waiting, for longer than it may. A daemon
-whose cameras are gone has nothing to do, which is not that.
+The watchdog is fed as long as no stage works on one message for longer than service.stall_timeout_s. A daemon that
+waits for images has no message in work, so it stays alive.
 """
 
 from __future__ import annotations
@@ -21,101 +21,100 @@ from omnid.engine.logging_setup import log
 from omnid.engine.telemetry import StageStats, Telemetry
 
 STATUS_PERIOD_S: Final = 1.0
-_FEEDS_A_PERIOD: Final = 3
-_LONGEST_STATUS: Final = 500  # characters
+_FEEDS_PER_TIMEOUT: Final = 3
+_MAX_STATUS: Final = 500  # characters
 
 
 def notify(state: str) -> bool:
-    """Sends the state, such as "READY=1", to systemd (sd_notify(3)); False where there is none that listens now.
-
-    Never waits.
-    """
+    """Send the state, such as "READY=1", to systemd without waiting; return False if nothing received it."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address[:1] not in ("/", "@"):
         return False
-    with suppress(OSError, ValueError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as line:
-        place = address.replace("@", "\0", 1) if address[0] == "@" else address
-        line.sendto(state.encode("utf-8", "replace"), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, place)
+    kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC
+    with suppress(OSError, ValueError), socket.socket(socket.AF_UNIX, kind) as sender:
+        destination = address.replace("@", "\0", 1) if address[0] == "@" else address
+        sender.sendto(state.encode("utf-8", "replace"), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, destination)
         return True
     return False
 
 
 def watchdog_s() -> float | None:
-    """Within which time systemd wants to hear that this process is alive, s; None if it does not ask."""
-    asked, whom = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
-    if whom not in ("", str(os.getpid())) or not (asked.isascii() and asked.isdigit()) or int(asked) == 0:
+    """Return the timeout of systemd's watchdog [s]; None if it does not watch this process."""
+    timeout_us, pid = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
+    is_number = timeout_us.isascii() and timeout_us.isdigit()
+    if pid not in ("", str(os.getpid())) or not is_number or int(timeout_us) == 0:
         return None
-    return int(asked) * 1e-6
+    return int(timeout_us) * 1e-6
 
 
-def show_stacks_at_the_end() -> None:
-    """Has a daemon that is killed for being stuck write on stderr, if that is a file, where each of its threads was."""
+def print_stacks_when_killed() -> None:
+    """Print the stacks of all threads on stderr, if that is a file, when the process is killed for a stalled thread."""
     with suppress(OSError, ValueError):
-        faulthandler.enable()  # SIGABRT, by which systemd's watchdog ends a service
-        faulthandler.register(signal.SIGXCPU, chain=True)  # by which the kernel ends what runs on at real-time priority
+        faulthandler.enable()  # SIGABRT, sent by systemd's watchdog
+        faulthandler.register(signal.SIGXCPU, chain=True)  # sent by the kernel to a real-time thread that never waits
 
 
-def hung(stages: Collection[StageStats], now_ns: int, longest_s: float) -> dict[str, float]:
-    """For how long each stage has been at one message that has been at it for longer than longest_s, s."""
+def stalled_stages(stages: Collection[StageStats], now_ns: int, timeout_s: float) -> dict[str, float]:
+    """Return the stages that have worked on one message for longer than timeout_s, with that time [s]."""
     busy_s = {stats.name: (now_ns - since_ns) * 1e-9 for stats in stages if (since_ns := stats.busy_since_ns)}
-    return {name: duration_s for name, duration_s in busy_s.items() if duration_s > longest_s}
+    return {name: duration_s for name, duration_s in busy_s.items() if duration_s > timeout_s}
 
 
 class Service:
-    """An action for a ticker of the graph: the first call says READY, each one the status, and that we are alive.
+    """The action of a ticker: notifies systemd that the daemon is ready, and of its status, and feeds the watchdog.
 
-    The watchdog is not fed while a stage is hung; which one it is is said once, and again when it has gone on.
+    The watchdog is not fed while a stage is stalled. A stage that stalls, or goes on, is logged once.
     """
 
-    def __init__(self, telemetry: Telemetry, status: Callable[[], str], hung_s: float) -> None:
-        """hung_s: how long a stage may be at one message."""
-        self._telemetry, self._status, self._hung_s = telemetry, status, hung_s
-        self._hung: frozenset[str] = frozenset()
+    def __init__(self, telemetry: Telemetry, status: Callable[[], str], stall_timeout_s: float) -> None:
+        """stall_timeout_s: longest time that a stage may work on one message."""
+        self._telemetry, self._status, self._stall_timeout_s = telemetry, status, stall_timeout_s
+        self._stalled: frozenset[str] = frozenset()
         self._ready = False
 
     @property
     def period_s(self) -> float:
-        """How often to call."""
-        return min(STATUS_PERIOD_S, (watchdog_s() or STATUS_PERIOD_S * _FEEDS_A_PERIOD) / _FEEDS_A_PERIOD)
+        """Time between two calls."""
+        return min(STATUS_PERIOD_S, (watchdog_s() or STATUS_PERIOD_S * _FEEDS_PER_TIMEOUT) / _FEEDS_PER_TIMEOUT)
 
     def __call__(self) -> None:
-        """Tells systemd how we are."""
-        stuck = hung(self._telemetry.stages, time.monotonic_ns(), self._hung_s)
-        self._tell_of(stuck)
+        """Notify systemd."""
+        stalled = stalled_stages(self._telemetry.stages, time.monotonic_ns(), self._stall_timeout_s)
+        self._log_changes(stalled)
         ready = [] if self._ready else ["READY=1"]
-        alive = [] if stuck else ["WATCHDOG=1"]
-        self._ready = notify("\n".join([*ready, *alive, f"STATUS={self._line(stuck)}"])) or self._ready
+        alive = [] if stalled else ["WATCHDOG=1"]
+        self._ready = notify("\n".join([*ready, *alive, f"STATUS={self._line(stalled)}"])) or self._ready
 
     def close(self) -> None:
-        """Says that the end has begun; from now on nobody watches but the clock (TimeoutStopSec)."""
+        """Notify systemd that the daemon stops; from now on only TimeoutStopSec limits it."""
         notify("STOPPING=1\nSTATUS=stopping")
 
-    def _line(self, stuck: dict[str, float]) -> str:
-        words = [f"{name} hung for {duration_s:.0f} s" for name, duration_s in stuck.items()]
-        return " ".join(", ".join([*words, self._status()]).split())[:_LONGEST_STATUS]
+    def _line(self, stalled: dict[str, float]) -> str:
+        parts = [f"{name} stalled for {duration_s:.0f} s" for name, duration_s in stalled.items()]
+        return " ".join(", ".join([*parts, self._status()]).split())[:_MAX_STATUS]
 
-    def _tell_of(self, stuck: dict[str, float]) -> None:
-        for name in stuck.keys() - self._hung:
-            log(logging.ERROR, f"stage '{name}' is hung: {stuck[name]:.1f} s at one message; systemd's watchdog is fed "
-                "no more")
-        for name in self._hung - stuck.keys():
-            log(logging.INFO, f"stage '{name}' has gone on")
-        self._hung = frozenset(stuck)
+    def _log_changes(self, stalled: dict[str, float]) -> None:
+        for name in stalled.keys() - self._stalled:
+            log(logging.ERROR, f"stage '{name}' is stalled: {stalled[name]:.1f} s at one message; systemd's watchdog "
+                "is no longer fed")
+        for name in self._stalled - stalled.keys():
+            log(logging.INFO, f"stage '{name}' goes on")
+        self._stalled = frozenset(stalled)
 
 
 class StatusLine:
-    """One line about the run: state, poses per second since the last look, what was lost."""
+    """One line about the run: state, poses per second since the last call, dropped messages, missed deadlines."""
 
     def __init__(self, statistics: RunStatistics, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
-        """tickers: the names whose `dropped` are deadlines, not messages."""
+        """tickers: names of the stages whose `dropped` are deadlines, not messages."""
         self._statistics, self._telemetry, self._tickers = statistics, telemetry, frozenset(tickers)
-        self._poses, self._looked_ns = statistics.poses, time.monotonic_ns()
+        self._poses, self._called_ns = statistics.poses, time.monotonic_ns()
 
     def __call__(self) -> str:
-        """The line now."""
+        """Return the line."""
         now_ns, poses, newest = time.monotonic_ns(), self._statistics.poses, self._statistics.newest
-        rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._looked_ns) * 1e-9)
-        self._poses, self._looked_ns = poses, now_ns
+        rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * 1e-9)
+        self._poses, self._called_ns = poses, now_ns
         state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"
         dropped = sum(stats.dropped for stats in self._telemetry.stages if stats.name not in self._tickers)
         late = sum(stats.dropped for stats in self._telemetry.stages if stats.name in self._tickers)

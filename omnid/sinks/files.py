@@ -1,4 +1,4 @@
-"""Where a run may write, found out before it starts; and the files that it writes."""
+"""The output files of a run, and the check of their paths before it starts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ Named: TypeAlias = Sequence[tuple[str, Path]]
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
-    """OmnidError unless every (option, path) can be written, no two are one file and none is an input (what, path)."""
+    """Check that all outputs (option, path) can be written and none is another one or an input (name, path).
+
+    Raises OmnidError.
+    """
     taken = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
         _require_writable(option, path)
@@ -31,7 +34,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
 
 
 def on_stdout(outputs: Named) -> bool:
-    """Whether one of the outputs is the standard output, so that nothing else may be said there."""
+    """True if one of the outputs is the standard output, so that no other text may be printed there."""
     try:
         found = os.fstat(1)
     except OSError:
@@ -40,7 +43,7 @@ def on_stdout(outputs: Named) -> bool:
 
 
 def _identity(path: Path) -> tuple[int, int] | str:
-    """The same for all names of a file, links of either kind among them."""
+    """Return a key that is the same for all names of a file, hard and symbolic links included."""
     try:
         found = path.stat()
         return found.st_dev, found.st_ino
@@ -50,15 +53,15 @@ def _identity(path: Path) -> tuple[int, int] | str:
 
 def _require_writable(option: str, path: Path) -> None:
     try:
-        _refuse_what_is_no_file(option, path)
-        _try(path)
+        _require_file(option, path)
+        _try_to_open(path)
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be written: {error.strerror or error}; name another file") from error
 
 
-def _refuse_what_is_no_file(option: str, path: Path) -> None:
+def _require_file(option: str, path: Path) -> None:
     if str(path) == "-":
-        raise OmnidError(f"{option} -: expected the name of a file; the standard output is called /dev/stdout")
+        raise OmnidError(f"{option} -: expected the name of a file; use /dev/stdout for the standard output")
     if path.is_dir():
         raise OmnidError(f"{option} {path}: expected a file to write, found a folder")
     if not path.parent.is_dir():
@@ -67,10 +70,10 @@ def _refuse_what_is_no_file(option: str, path: Path) -> None:
         raise OmnidError(f"{option} {path}: expected a file that can be replaced, found a device or a pipe")
 
 
-def _try(path: Path) -> None:
-    """Raises OSError where a file cannot be opened for writing; leaves no trace."""
+def _try_to_open(path: Path) -> None:
+    """Raise OSError where the file cannot be opened for writing; leave no file behind."""
     if path.exists() and not path.is_file():
-        return  # opening a pipe to try it would end its reader
+        return  # a pipe that is opened and closed would end its reader
     fresh = not path.exists()
     with path.open("ab"):
         pass
@@ -79,9 +82,9 @@ def _try(path: Path) -> None:
 
 
 class TrajectoryFile:
-    """T_odom_rig as TUM, a whole line for every pair as soon as it is known.
+    """The trajectory T_odom_rig as TUM, one line a pair, written as soon as the pose is known.
 
-    The file is opened for the first of them: a run that finds none leaves what was there.
+    The file is opened for the first pose: a run without poses leaves an existing file as it was.
     """
 
     def __init__(self, path: Path) -> None:
@@ -90,14 +93,14 @@ class TrajectoryFile:
         self._whole_bytes = 0
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Adds the row of a pose."""
+        """Write the row of a pose."""
         try:
             self._append(tum_row(odometry.stamp_ns, odometry.T_odom_rig).encode("ascii") + b"\n")
         except OSError as error:
-            raise OmnidError(f"{self._path}: cannot be written any more: {error.strerror or error}") from error
+            raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
 
     def finish(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
 
@@ -106,34 +109,34 @@ class TrajectoryFile:
             self._file = self._path.open("wb", buffering=0)
         try:
             written = self._file.write(row)
-            while written < len(row):  # a disk that fills takes a part, then nothing
+            while written < len(row):  # a full disk takes a part of the row, then nothing
                 written += self._file.write(row[written:])
         except OSError:
             with suppress(OSError):
-                self._file.truncate(self._whole_bytes)  # half a row would be none
+                self._file.truncate(self._whole_bytes)  # remove the part of a row
             raise
         self._whole_bytes += len(row)
 
 
 class MapFile:
-    """The map as PLY, at the end."""
+    """The map as PLY; each map replaces the previous one."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def process(self, update: MapUpdate) -> None:
-        """Writes the map."""
+        """Write the map."""
         write_ply(self._path, update.points)
 
 
 class PlanFile:
-    """The map from above with the path, as PNG, at the end."""
+    """The plan view of the map with the path, as PNG; each map replaces the previous one."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def process(self, update: MapUpdate) -> None:
-        """Writes the image."""
+        """Write the image."""
         image = cv2.imencode(".png", plan_view(update.points, update.path_xy))[1]
         try:
             self._path.write_bytes(image.tobytes())

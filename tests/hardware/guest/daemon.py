@@ -74,7 +74,7 @@ free_mb = 10
 [realtime]
 longest_run_ms = 10000
 [service]
-hung_s = 30.0
+stall_timeout_s = 30.0
 """
 
 
@@ -121,7 +121,7 @@ def unit() -> Iterator[None]:
         path.write_text(text)
     Path("/opt/omnid/bin/omnid").chmod(0o755)
     shutil.copy("/mnt/job/rig.toml", "/etc/omnid")
-    shutil.copy(SYSTEMD / "omnid.runs.systemd", DROP_INS.parent)
+    shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
     run("udevadm", "control", "--reload")
     run("udevadm", "trigger", "--settle", "--subsystem-match=video4linux", "--subsystem-match=tty")
     run("systemctl", "daemon-reload")

@@ -92,12 +92,12 @@ def test_this_machine_is_all_its_network_unless_more_is_allowed() -> None:
     assert reported()["reached"] == {"127.0.0.1": "done", "192.168.1.5": "done"}
 
 
-def test_a_hung_stage_is_told_of_and_the_daemon_restarted() -> None:
+def test_a_stalled_stage_is_logged_and_the_daemon_restarted() -> None:
     pid = reported()["pid"]
     Path("/run/omnid/hang").touch()
     restarted(pid)
     lines = said()
-    assert any(priority == 3 and text.startswith("stage 'image' is hung") for priority, text in lines)
+    assert any(priority == 3 and text.startswith("stage 'image' is stalled") for priority, text in lines)
     assert any("in where_it_hangs" in text for _, text in lines)
     assert any(text == "omnid.service: Failed with result 'watchdog'." for _, text in lines)
 

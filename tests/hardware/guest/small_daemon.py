@@ -22,7 +22,7 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.logging_setup import configure_logging, log
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare, priorities
-from omnid.runs.systemd import Service, StatusLine, show_stacks_at_the_end
+from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.transport.bus import Bus, BusConfig
 
 HANG = Path("/run/omnid/hang")
@@ -126,7 +126,7 @@ class Reporter:
 
 def main() -> None:
     """Runs until SIGTERM."""
-    show_stacks_at_the_end()
+    print_stacks_when_killed()
     configure_logging()
     config, tally, bus = RealtimeSettings(), RunStatistics(), Bus(BusConfig())
     graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))

@@ -1,4 +1,4 @@
-"""The service: what systemd is told, and that a hung stage is told from a daemon that has nothing to do."""
+"""The systemd service: notifications, watchdog, and the difference between a stalled and an idle stage."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ import pytest
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, StatusLine, hung, notify, show_stacks_at_the_end, watchdog_s
+from omnid.runs.systemd import Service, StatusLine, notify, print_stacks_when_killed, stalled_stages, watchdog_s
 
 ROOT = Path(__file__).parents[3]
-LONG_S = 20.0  # a wait that only a broken service exhausts
+TIMEOUT_S = 20.0  # reached by a broken service only
 
 
 class Manager:
@@ -32,18 +32,18 @@ class Manager:
     def __init__(self, address: str) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(address.replace("@", "\0"))
-        self._socket.settimeout(LONG_S)
+        self._socket.settimeout(TIMEOUT_S)
 
-    def hear(self) -> list[str]:
-        """The next message."""
+    def received(self) -> list[str]:
+        """Return the lines of the next message."""
         return self._socket.recv(4096).decode().split("\n")
 
-    def hears_nothing(self) -> bool:
-        """Whether no message waits."""
+    def is_empty(self) -> bool:
+        """True if no message waits."""
         return not select.select([self._socket], [], [], 0)[0]
 
     def close(self) -> None:
-        """Leaves."""
+        """Close the socket."""
         self._socket.close()
 
 
@@ -56,33 +56,33 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 
 
 def wait_until(true: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + LONG_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not true():
         assert time.monotonic() < deadline_s
         time.sleep(0.002)
 
 
-def test_systemd_hears_a_state(manager: Manager) -> None:
+def test_notifies_systemd_of_a_state(manager: Manager) -> None:
     assert notify("READY=1\nSTATUS=all is well")
-    assert manager.hear() == ["READY=1", "STATUS=all is well"]
+    assert manager.received() == ["READY=1", "STATUS=all is well"]
 
 
-def test_a_socket_without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notifies_an_abstract_socket(monkeypatch: pytest.MonkeyPatch) -> None:
     address = f"@omnid-test-{os.getpid()}-{time.monotonic_ns()}"
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     manager = Manager(address)
-    assert notify("READY=1") and manager.hear() == ["READY=1"]
+    assert notify("READY=1") and manager.received() == ["READY=1"]
     manager.close()
 
 
 @pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify", "@nobody", "/" + "x" * 200, "vsock:2:1"])
-def test_nobody_who_listens_is_no_error(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_manager_is_no_error(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     assert not notify("READY=1")
 
 
-def test_a_manager_that_does_not_read_stops_nobody(manager: Manager) -> None:
-    assert not all(notify("STATUS=x") for _ in range(100_000))  # its queue is full: we come back, and say so
+def test_does_not_wait_for_a_manager_that_does_not_read(manager: Manager) -> None:
+    assert not all(notify("STATUS=x") for _ in range(100_000))  # its queue is full: notify returns, with False
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_manager_that_does_not_read_stops_nobody(manager: Manager) -> None:
     [("10000000", "", 10.0), ("3000000", str(os.getpid()), 3.0), ("3000000", "1", None), ("", "", None),
      ("0", "", None), ("-5", "", None), ("²", "", None), ("x", "", None)],
 )
-def test_the_watchdog_is_as_systemd_asks(
+def test_reads_the_timeout_of_the_watchdog(
     usec: str, pid: str, expected: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", usec)
@@ -99,45 +99,46 @@ def test_the_watchdog_is_as_systemd_asks(
     assert Service(Telemetry(), str, 1.0).period_s == pytest.approx(min(1.0, (expected or 3.0) / 3))
 
 
-def test_only_who_has_been_at_one_message_for_too_long_is_hung() -> None:
-    stages = [StageStats("idle"), StageStats("busy", busy_since_ns=9 * 10**9), StageStats("hung", busy_since_ns=10**9)]
-    assert hung(stages, 10 * 10**9, 2.0) == {"hung": 9.0}
+def test_only_a_stage_with_one_message_for_too_long_is_stalled() -> None:
+    stages = [StageStats("idle"), StageStats("busy", busy_since_ns=9 * 10**9),
+              StageStats("stalled", busy_since_ns=10**9)]
+    assert stalled_stages(stages, 10 * 10**9, 2.0) == {"stalled": 9.0}
 
 
-def test_ready_once_then_alive_then_stopping(manager: Manager) -> None:
+def test_sends_ready_once_then_watchdog_then_stopping(manager: Manager) -> None:
     service = Service(Telemetry(), lambda: "3 poses\nREADY=1", 1.0)
     service()
     service()
     service.close()
-    assert manager.hear() == ["READY=1", "WATCHDOG=1", "STATUS=3 poses READY=1"]
-    assert manager.hear() == ["WATCHDOG=1", "STATUS=3 poses READY=1"]
-    assert manager.hear() == ["STOPPING=1", "STATUS=stopping"]
+    assert manager.received() == ["READY=1", "WATCHDOG=1", "STATUS=3 poses READY=1"]
+    assert manager.received() == ["WATCHDOG=1", "STATUS=3 poses READY=1"]
+    assert manager.received() == ["STOPPING=1", "STATUS=stopping"]
 
 
-def test_readiness_that_was_not_heard_is_said_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeats_ready_until_it_is_received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "late"))
     service = Service(Telemetry(), str, 1.0)
     service()
     late = Manager(str(tmp_path / "late"))
     service()
-    assert late.hear()[0] == "READY=1"
+    assert late.received()[0] == "READY=1"
     late.close()
 
 
 class Valve:
-    """A stage that stops in the middle of a message until it is opened."""
+    """A stage that works on a message until it is opened."""
 
     def __init__(self) -> None:
         self.entered, self.open = threading.Event(), threading.Event()
 
     def process(self, number: int) -> int:
         self.entered.set()
-        assert self.open.wait(LONG_S)
+        assert self.open.wait(TIMEOUT_S)
         return number
 
 
 class Tap:
-    """A source that gives what it is told to, and waits in between: a camera, or none."""
+    """A source of as many numbers as it is set to: a camera that delivers images, or none."""
 
     def __init__(self) -> None:
         self.left, self.closed = 0, False
@@ -156,7 +157,7 @@ class Tap:
 
 @pytest.fixture
 def running() -> Iterator[SimpleNamespace]:
-    """A graph at work: tap, valve, sink."""
+    """A running graph: tap, valve, sink."""
     graph, tap, valve, sunk = Graph(policy=NEWEST), Tap(), Valve(), RunStatistics()
     sink = SimpleNamespace(process=lambda number: None)
     graph.sink("sink", sink, graph.stage("valve", valve, graph.source("tap", tap.numbers, wake=tap.close)))
@@ -165,97 +166,97 @@ def running() -> Iterator[SimpleNamespace]:
     yield SimpleNamespace(graph=graph, tap=tap, valve=valve, sunk=sunk)
     valve.open.set()
     graph.stop()
-    thread.join(LONG_S)
+    thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 
-def test_a_hung_stage_is_not_fed_for_and_named_once(
+def test_a_stalled_stage_stops_the_watchdog_and_is_logged_once(
     manager: Manager, running: SimpleNamespace, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "omnid")
     service = Service(running.graph.telemetry, lambda: "tracking", 0.05)
     running.tap.left = 1
-    assert running.valve.entered.wait(LONG_S)
+    assert running.valve.entered.wait(TIMEOUT_S)
     service()
-    assert "WATCHDOG=1" in manager.hear()  # it has only just begun
+    assert "WATCHDOG=1" in manager.received()  # it has only just begun
     time.sleep(0.1)
     service()
     service()
-    (status,) = manager.hear()
-    assert status.startswith("STATUS=valve hung for 0 s, tracking")
-    assert caplog.text.count("stage 'valve' is hung") == 1
+    (status,) = manager.received()
+    assert status.startswith("STATUS=valve stalled for 0 s, tracking")
+    assert caplog.text.count("stage 'valve' is stalled") == 1
     running.valve.open.set()
     wait_until(lambda: not any(stats.busy_since_ns for stats in running.graph.telemetry.stages))
-    assert manager.hear() == [status]
+    assert manager.received() == [status]
     service()
-    assert "WATCHDOG=1" in manager.hear()
-    assert "stage 'valve' has gone on" in caplog.text
+    assert "WATCHDOG=1" in manager.received()
+    assert "stage 'valve' goes on" in caplog.text
 
 
-def test_without_images_the_daemon_is_alive(manager: Manager, running: SimpleNamespace) -> None:
+def test_the_watchdog_is_fed_without_images(manager: Manager, running: SimpleNamespace) -> None:
     running.valve.open.set()
     running.tap.left = 3
     wait_until(lambda: running.graph.telemetry.stages[2].processed)
     time.sleep(0.1)
     Service(running.graph.telemetry, str, 0.05)()
-    assert "WATCHDOG=1" in manager.hear()
+    assert "WATCHDOG=1" in manager.received()
 
 
-def test_work_without_a_pause_is_no_hang(manager: Manager, running: SimpleNamespace) -> None:
-    """Messages always wait, each is soon done: far longer in all than one may take."""
+def test_continuous_work_is_not_stalled(manager: Manager, running: SimpleNamespace) -> None:
+    """There are always messages waiting, and each is soon processed."""
     running.valve.open.set()
     running.tap.left = 10**9
     until_s = time.monotonic() + 0.6
     while time.monotonic() < until_s:
-        assert not hung(running.graph.telemetry.stages, time.monotonic_ns(), 0.5)
+        assert not stalled_stages(running.graph.telemetry.stages, time.monotonic_ns(), 0.5)
     assert running.graph.telemetry.stages[1].processed > 10
 
 
-def test_who_waits_behind_a_hung_reader_is_known_to_wait() -> None:
-    """Where nothing may be lost, a writer stands still with its reader; both are at their message."""
+def test_a_writer_behind_a_stalled_reader_is_stalled() -> None:
+    """Without drops a writer waits for its reader; both work on one message."""
     graph, tap, valve = Graph(policy=LOSSLESS, depth=1), Tap(), Valve()
     through = SimpleNamespace(process=lambda number: number)
     graph.sink("last", valve, graph.stage("first", through, graph.source("tap", tap.numbers, wake=tap.close)))
     thread = threading.Thread(target=graph.run)
     thread.start()
     tap.left = 10
-    wait_until(lambda: len(hung(graph.telemetry.stages, time.monotonic_ns(), 0.05)) == 2)
+    wait_until(lambda: len(stalled_stages(graph.telemetry.stages, time.monotonic_ns(), 0.05)) == 2)
     valve.open.set()
-    wait_until(lambda: not hung(graph.telemetry.stages, time.monotonic_ns(), 0.05))
+    wait_until(lambda: not stalled_stages(graph.telemetry.stages, time.monotonic_ns(), 0.05))
     graph.stop()
-    thread.join(LONG_S)
+    thread.join(TIMEOUT_S)
 
 
-def test_a_ticker_that_does_not_come_back_is_hung() -> None:
+def test_a_ticker_that_does_not_return_is_stalled() -> None:
     graph, valve = Graph(), Valve()
     ticker = graph.ticker("motor", 0.001, lambda: valve.process(0))
     tap = Tap()
     graph.sink("sink", SimpleNamespace(process=lambda number: None), graph.source("tap", tap.numbers, wake=tap.close))
     thread = threading.Thread(target=graph.run)
     thread.start()
-    wait_until(lambda: hung([ticker.stats], time.monotonic_ns(), 0.05))
+    wait_until(lambda: stalled_stages([ticker.stats], time.monotonic_ns(), 0.05))
     valve.open.set()
-    wait_until(lambda: not hung([ticker.stats], time.monotonic_ns(), 0.05))
+    wait_until(lambda: not stalled_stages([ticker.stats], time.monotonic_ns(), 0.05))
     graph.stop()
-    thread.join(LONG_S)
+    thread.join(TIMEOUT_S)
 
 
-def test_a_run_tells_systemd_from_its_first_tick_to_its_end(manager: Manager) -> None:
+def test_a_run_notifies_systemd_from_its_first_tick_to_its_end(manager: Manager) -> None:
     graph, tap = Graph(policy=NEWEST), Tap()
     graph.sink("sink", SimpleNamespace(process=lambda number: None), graph.source("tap", tap.numbers, wake=tap.close))
     graph.ticker("service", 0.01, Service(graph.telemetry, str, 1.0))
     thread = threading.Thread(target=graph.run)
     thread.start()
-    assert manager.hear()[:2] == ["READY=1", "WATCHDOG=1"]
+    assert manager.received()[:2] == ["READY=1", "WATCHDOG=1"]
     graph.stop()
-    thread.join(LONG_S)
-    messages = [manager.hear()]
+    thread.join(TIMEOUT_S)
+    messages = [manager.received()]
     while messages[-1][0] != "STOPPING=1":
-        messages.append(manager.hear())
-    assert manager.hears_nothing()
+        messages.append(manager.received())
+    assert manager.is_empty()
 
 
-def test_the_status_counts_messages_and_deadlines_apart() -> None:
+def test_the_status_line_counts_messages_and_deadlines_apart() -> None:
     telemetry, statistics = Telemetry(), RunStatistics()
     for name, dropped in (("pair", 3), ("stereo", 4), ("motor", 5)):
         telemetry.add(StageStats(name, dropped=dropped))
@@ -267,15 +268,15 @@ def test_the_status_counts_messages_and_deadlines_apart() -> None:
     assert status().startswith("waiting for images, 0.0 poses/s")
 
 
-def test_where_stderr_is_no_file_there_is_nothing_to_show(capsys: pytest.CaptureFixture[str]) -> None:
-    show_stacks_at_the_end()
+def test_does_not_raise_where_stderr_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
+    print_stacks_when_killed()
 
 
 @pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGXCPU], ids=lambda number: number.name)
-def test_who_is_killed_for_being_stuck_shows_where_it_was(number: signal.Signals) -> None:
-    stuck = ("import os, signal, time; from omnid.runs.systemd import show_stacks_at_the_end\n"
-             f"def where_it_hangs():\n  os.kill(os.getpid(), {number.value}); time.sleep(20)\n"
-             "show_stacks_at_the_end()\nwhere_it_hangs()")
+def test_prints_the_stacks_when_killed(number: signal.Signals) -> None:
+    stuck = ("import os, signal, time; from omnid.runs.systemd import print_stacks_when_killed\n"
+             f"def stalled_function():\n  os.kill(os.getpid(), {number.value}); time.sleep(20)\n"
+             "print_stacks_when_killed()\nstalled_function()")
     done = subprocess.run([sys.executable, "-c", stuck], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == -number
-    assert "in where_it_hangs" in done.stderr
+    assert "in stalled_function" in done.stderr
