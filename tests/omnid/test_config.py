@@ -45,9 +45,9 @@ def test_refuses_an_override_that_the_command_ignores(command: str, override: st
 
 
 def test_warns_in_one_line_of_settings_in_the_file_that_a_replay_ignores() -> None:
-    config = load_config(None, ["cameras.width_px=640", "service.hung_s=5", "record.cloud_points=7"])
+    config = load_config(None, ["cameras.width_px=640", "service.stall_timeout_s=5", "record.cloud_points=7"])
     (warning,) = unused_settings(config, "replay", ["record.cloud_points=7"])
-    assert warning == "`omnid replay` does not use these settings: cameras.width_px, service.hung_s"
+    assert warning == "`omnid replay` does not use these settings: cameras.width_px, service.stall_timeout_s"
     assert unused_settings(config, "run", []) == []
 
 
