@@ -1,4 +1,4 @@
-"""A table of errors against the truth: `python -m tests.benchmark.accuracy FOLDER ... [-- OPTION OF omnid replay ...]`.
+"""Table of errors against the truth: `python -m tests.benchmark.accuracy FOLDER ... [-- OPTION OF omnid replay ...]`.
 
 Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.simulation` writes them.
 """
@@ -18,13 +18,13 @@ HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\
 
 
 def omnid(*arguments: str | Path) -> str:
-    """What the command prints on stdout; its error is ours."""
+    """Run the command and return its stdout; raise CalledProcessError if it fails."""
     command = [sys.executable, "-m", "omnid", *map(str, arguments)]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 def measure(folder: Path, options: list[str]) -> tuple[Metrics, str]:
-    """The errors of one log, and the shares of its states."""
+    """Return the errors of one log and the shares of its tracking states."""
     with tempfile.TemporaryDirectory() as work:
         rig, estimate = Path(work) / "rig.toml", Path(work) / "estimate.txt"
         if (folder / "camchain.yaml").exists():
@@ -37,7 +37,7 @@ def measure(folder: Path, options: list[str]) -> tuple[Metrics, str]:
 
 
 def row(folder: Path, options: list[str]) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     m, states = measure(folder, options)
     shown = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
              f"{1e3 * m.end_error_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
@@ -46,7 +46,7 @@ def row(folder: Path, options: list[str]) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Prints the table, a row as soon as it is known."""
+    """Print the table, each row as soon as it is known."""
     split = arguments.index("--") if "--" in arguments else len(arguments)
     print(HEAD)
     for folder in arguments[:split]:

@@ -1,6 +1,6 @@
-"""What the bus costs and how fast it is: `python -m pytest -m benchmark -s tests/benchmark/test_bus.py`.
+"""Cost and latency of the bus: `python -m pytest -m benchmark -s tests/benchmark/test_bus.py`.
 
-Every subscriber, and the router, is a process of its own.
+Every subscriber and the router run in processes of their own.
 """
 
 from __future__ import annotations
@@ -32,37 +32,38 @@ from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wa
 pytestmark = pytest.mark.benchmark
 RATE_HZ = 30.0
 
-# Notes of each robot's poses: how many came, were missed, and how long they took.
+# Counts the poses of each robot that arrive and that are missing, and measures their latency.
 COUNTER = """
 import json, sys, time, zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
 config.insert_json5("scouting/multicast/enabled", "false")
-last, ways_s, missed = {}, [], [0]
+last, latencies_s, missed = {}, [], [0]
 def take(sample):
     now_ns = time.time_ns()
     note = json.loads(sample.attachment.to_bytes())
     key, seq = str(sample.key_expr), note["seq"]
     missed[0] += seq - last.get(key, seq - 1) - 1
     last[key] = seq
-    ways_s.append((now_ns - note["sent_ns"]) * 1e-9)
+    latencies_s.append((now_ns - note["sent_ns"]) * 1e-9)
 with zenoh.open(config) as session:
     poses = session.declare_subscriber("**/odom", take)
     rest = session.declare_subscriber("**/pose", lambda sample: None)
     print("ready", flush=True)
     for line in sys.stdin:
-        ways_s.sort()
+        latencies_s.sort()
         print(json.dumps({
-            "came": len(ways_s), "missed": missed[0], "newest": min(last.values()),
-            "p50_ms": 1e3 * ways_s[len(ways_s) // 2], "p99_ms": 1e3 * ways_s[int(0.99 * len(ways_s))],
+            "received": len(latencies_s), "missed": missed[0], "newest": min(last.values()),
+            "p50_ms": 1e3 * latencies_s[len(latencies_s) // 2],
+            "p99_ms": 1e3 * latencies_s[int(0.99 * len(latencies_s))],
         }), flush=True)
-        ways_s.clear(); missed[0] = 0
+        latencies_s.clear(); missed[0] = 0
 """
 
 
-def told(process: subprocess.Popen[str]) -> dict[str, float]:
-    """What a counter has counted since the last time of asking."""
+def new_counts(process: subprocess.Popen[str]) -> dict[str, float]:
+    """Return the counts of a counter since the last call."""
     assert process.stdin is not None and process.stdout is not None
     process.stdin.write("\n")
     process.stdin.flush()
@@ -88,9 +89,9 @@ def odometry(seq: int) -> OdometryUpdate:
 
 
 def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:
-    """The cost of each pose with all that is said of it, every sink's each 1 / RATE_HZ.
+    """Publish poses on all sinks with RATE_HZ and return the cost of each pose with its accompanying messages.
 
-    This process sleeps in between, so its caches are cold: for the daemon itself see the table of its stages.
+    This process sleeps between the poses, so its caches are cold: the daemon's own cost is in its stage statistics.
     """
     cost = Histogram()
     next_s = time.monotonic()
@@ -119,16 +120,17 @@ def test_latency_and_cost(way: str) -> None:
         listener = ends.enter_context(counter(there if way == "router" else here))
         sink = sink_on(bus)
         publish([sink], 0, 30)
-        told(listener)
+        new_counts(listener)
         cost = publish([sink], 30, 300)
         time.sleep(0.5)
-        found = told(listener)
-    print(f"\n{way}: one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms, {found['came']:.0f} of 300 "
-          f"came; publishing a frame p50 {1e3 * cost.p(0.5):.2f} ms, p99 {1e3 * cost.p(0.99):.2f} ms")
+        found = new_counts(listener)
+    print(f"\n{way}: one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms, "
+          f"{found['received']:.0f} of 300 poses; publishing a frame p50 {1e3 * cost.p(0.5):.2f} ms, "
+          f"p99 {1e3 * cost.p(0.99):.2f} ms")
     assert found["newest"] == 329 and found["missed"] == 0
 
 
-def test_a_router_is_back_within_five_seconds() -> None:
+def test_poses_pass_a_restarted_router_within_five_seconds() -> None:
     here, there = free_endpoint(), free_endpoint()
     with contextlib.ExitStack() as ends:
         router = ends.enter_context(script(ROUTER, there))
@@ -136,7 +138,7 @@ def test_a_router_is_back_within_five_seconds() -> None:
         direct, behind = ends.enter_context(counter(here)), ends.enter_context(counter(there))
         sink = sink_on(bus)
         publish([sink], 0, 30)
-        told(direct), told(behind)
+        new_counts(direct), new_counts(behind)
         router.kill()
         router.wait()
         publish([sink], 30, 90)
@@ -144,10 +146,10 @@ def test_a_router_is_back_within_five_seconds() -> None:
         back_s = time.monotonic()
         publish([sink], 120, 180)
         time.sleep(0.3)
-        near, far = told(direct), told(behind)
+        near, far = new_counts(direct), new_counts(behind)
     missed_s = far["missed"] / RATE_HZ - 3.0
-    print(f"\nrouter killed for 3 s: direct {near['missed']:.0f} of {near['came']:.0f} missed; behind the router again "
-          f"{missed_s:.1f} s after it was back ({time.monotonic() - back_s:.0f} s watched)")
+    print(f"\nrouter killed for 3 s: direct {near['missed']:.0f} of {near['received']:.0f} missed; behind the router "
+          f"poses again {missed_s:.1f} s after its restart ({time.monotonic() - back_s:.0f} s measured)")
     assert near["missed"] == 0 and near["newest"] == far["newest"] == 299 and missed_s < 5.0
 
 
@@ -164,8 +166,8 @@ with zenoh.open(config) as session:
 """
 
 
-def test_a_slow_subscriber_slows_nobody_else(scene: Path) -> None:
-    """The daemon on a log, alone and with one who takes half a second for each message."""
+def test_a_slow_subscriber_does_not_delay_others(scene: Path) -> None:
+    """Run the daemon on a log, alone and with a subscriber that takes half a second for each message."""
     endpoint = free_endpoint()
     words = [sys.executable, "-m", "omnid", "run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml",
              "--set", f"bus.listen=['{endpoint}']", "--set", "bus.panorama_hz=10", "--set", "live.cloud_s=0.5"]
@@ -189,7 +191,7 @@ def test_a_slow_subscriber_slows_nobody_else(scene: Path) -> None:
 
 
 def measured(robot: Robot) -> tuple[float, float, float]:
-    """Over ten seconds: poses per second that the daemon finds; from capture to network, median and 99 of 100, ms."""
+    """Return poses/s of the daemon over ten seconds, and p50 and p99 of the time from capture to network [ms]."""
     ages_ms: list[float] = []
 
     def take(topic: str, payload: bytes, note: bytes) -> None:
@@ -207,7 +209,7 @@ def measured(robot: Robot) -> tuple[float, float, float]:
 
 
 def full(reports: Subscription[Diagnostics]) -> Diagnostics:
-    """The next report of all parts."""
+    """Return the next complete report."""
     while (report := reports.wait(5.0)) is None or not report.value("omnid: odometry", "rate_hz"):
         pass
     return report
@@ -228,19 +230,19 @@ def test_a_fleet_on_one_router_loses_no_pose() -> None:
             wait_until(lambda bus=bus: bus.connect() is None and bus._session is not None)
             sinks.append(sink_on(bus))
         publish(sinks, 0, 30)
-        told(listener)
+        new_counts(listener)
         before_s, started_s = cpu_s(router.pid), time.monotonic()
         publish(sinks, 30, 300)
         share = (cpu_s(router.pid) - before_s) / (time.monotonic() - started_s)
         time.sleep(0.5)
-        found = told(listener)
-    print(f"\n{FLEET} robots at {RATE_HZ:.0f} Hz: {found['came']:.0f} of {FLEET * 300} poses came, "
+        found = new_counts(listener)
+    print(f"\n{FLEET} robots at {RATE_HZ:.0f} Hz: {found['received']:.0f} of {FLEET * 300} poses received, "
           f"{found['missed']:.0f} missed; one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms; "
           f"the router took {100 * share:.0f} % of a core")
     assert found["newest"] == 329 and found["missed"] == 0
 
 
 def cpu_s(pid: int) -> float:
-    """Processor time of a process so far."""
+    """Return the processor time of a process so far [s]."""
     fields = re.sub(r".*\)", "", Path(f"/proc/{pid}/stat").read_text()).split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,6 +1,6 @@
-"""The live daemon in real time: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`, its soak: `-m slow`.
+"""Latencies of the live daemon: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`; soak test: `-m slow`.
 
-OMNID_BENCHMARK_S: seconds a measurement (60). OMNID_SOAK_MINUTES: how long the soak takes (2; 10 for the full one).
+OMNID_BENCHMARK_S: duration of a measurement in s (60). OMNID_SOAK_MINUTES: duration of the soak test (2; 10: full).
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from tests.replay.live import Base, Daemon, Operator, answers, free_port, starte
 LOG = Path(str(files("omnid.sample") / "log.mcap"))  # 10 pairs a second of 512x512, its rig attached
 MEASURE_S = float(os.environ.get("OMNID_BENCHMARK_S", "60"))
 SOAK_S = 60 * float(os.environ.get("OMNID_SOAK_MINUTES", "2"))
-LATEST_MS = 20.0  # the motor's tick, 99.9 % of them
+LATEST_MS = 20.0  # largest lateness of the motor's tick, 99.9th percentile
 MOTOR_HZ = 50.0
-PERIOD_S = 5.0  # between two looks of the soak
-GROWTH_MB = 8.0  # of the second half over the first: noise of the allocator
+PERIOD_S = 5.0  # between two samples of the soak test
+GROWTH_MB = 8.0  # allowed growth from the first half to the second: noise of the allocator
 STAGES = ("lower", "upper", "pair", "dewarp", "stereo", "odometry", "mapping", "bus", "bus-drive", "bus-map")
 
 
 @contextmanager
 def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, Operator, Base]]:
-    """`omnid run` on the sample log with a twin, an operator who drives, and a state told every second."""
+    """Run `omnid run` on the sample log with a simulated motor controller and an operator who sends commands."""
     port = free_port()
     with ExitStack() as ends:
         base = Base(folder)
@@ -39,7 +39,7 @@ def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, 
         command = [sys.executable, "-m", "omnid", "run", "--log", str(LOG), "--pace", str(pace), "--motor",
                    str(base.port), *(part for word in words for part in ("--set", word))]
         process = ends.enter_context(started(command, port))
-        wait_until(lambda: answers(port) or not process.alive, "the daemon's voice")
+        wait_until(lambda: answers(port) or not process.alive, "the daemon's answer")
         operator = Operator(port)
         ends.callback(operator.close)
         wait_until(lambda: operator.poses and operator.states, "a pose")
@@ -51,34 +51,34 @@ def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, 
 
 
 @contextmanager
-def hogs(count: int) -> Iterator[None]:
-    """So many processes that do nothing but run."""
+def busy_processes(count: int) -> Iterator[None]:
+    """Run processes that only compute."""
     with ExitStack() as ends:
         for _ in range(count):
-            hog = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
-            ends.callback(hog.kill)
+            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            ends.callback(process.kill)
         yield
 
 
 def figures(operator: Operator, load: float) -> dict[str, str]:
-    """What the daemon has measured by now."""
+    """Return the measurements that the daemon has published."""
     odometry, wheels = operator.values("odometry"), operator.values("wheels")
-    told = {f"pose {q}": odometry.get(f"capture_to_pose_{q}_ms", "") for q in ("p50", "p99", "max")}
-    told |= {f"wheel {q}": wheels.get(f"capture_to_wheel_{q}_ms", "") for q in ("p50", "p99", "max")}
-    told |= {f"tick {q}": wheels.get(f"tick_late_{q}_ms", "") for q in ("p50", "p99", "p999", "max")}
+    values = {f"pose {q}": odometry.get(f"capture_to_pose_{q}_ms", "") for q in ("p50", "p99", "max")}
+    values |= {f"wheel {q}": wheels.get(f"capture_to_wheel_{q}_ms", "") for q in ("p50", "p99", "max")}
+    values |= {f"tick {q}": wheels.get(f"tick_late_{q}_ms", "") for q in ("p50", "p99", "p999", "max")}
     missed, untold = operator.values("stage motor")["missed"], wheels["untold"]
     drops = {name: operator.values(f"stage {name}").get("dropped", "?") for name in STAGES}
     lost = " ".join(f"{name} {count}" for name, count in drops.items() if count != "0")
-    told |= {f"publishing cpu {q}": operator.values("stage bus").get(f"cpu_{q}_ms", "") for q in ("p50", "p99")}
-    return told | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed, "untold": untold,
-                   "dropped": lost or "0", "load": f"{load:.1f}"}
+    values |= {f"publishing cpu {q}": operator.values("stage bus").get(f"cpu_{q}_ms", "") for q in ("p50", "p99")}
+    return values | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed,
+                     "untold": untold, "dropped": lost or "0", "load": f"{load:.1f}"}
 
 
 @pytest.mark.benchmark
-@pytest.mark.parametrize("per_core", [0, 1, 4], ids=["alone", "hogged", "crowded"])
+@pytest.mark.parametrize("per_core", [0, 1, 4], ids=["alone", "busy", "overloaded"])
 @pytest.mark.parametrize("rate_hz", [10, 30])
-def test_latencies_and_the_motors_deadline(tmp_path: Path, rate_hz: int, per_core: int) -> None:
-    with hogs(per_core * (os.cpu_count() or 1)), \
+def test_latencies_and_the_deadline_of_the_motor_tick(tmp_path: Path, rate_hz: int, per_core: int) -> None:
+    with busy_processes(per_core * (os.cpu_count() or 1)), \
             daemon(tmp_path, rate_hz / 10, f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base):
         time.sleep(MEASURE_S)
         found = figures(operator, os.getloadavg()[0])
@@ -92,17 +92,17 @@ class Size(tuple[float, int, int]):
 
     @staticmethod
     def of(pid: int) -> Size:
-        """As the kernel has them."""
+        """Read them from /proc."""
         status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
         resident_mb = int(status["VmRSS"].split()[0]) / 1024
         return Size((resident_mb, len(os.listdir(f"/proc/{pid}/fd")), int(status["Threads"])))
 
 
 @pytest.mark.slow
-def test_memory_descriptors_and_threads_stay_as_they_are(tmp_path: Path) -> None:
-    """30 pairs a second, an operator who drives, maps and states on the bus."""
+def test_memory_descriptors_and_threads_do_not_grow(tmp_path: Path) -> None:
+    """Run 30 pairs a second with commands, maps and status reports on the bus."""
     with daemon(tmp_path, 3.0) as (process, operator, base):
-        time.sleep(20)  # caches, pools and the map of a scene that is seen again and again fill up
+        time.sleep(20)  # until caches, pools and the map of the repeated scene are full
         sizes = []
         deadline_s = time.monotonic() + SOAK_S
         while time.monotonic() < deadline_s:

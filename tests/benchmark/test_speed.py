@@ -1,4 +1,4 @@
-"""Pairs a second through the whole pipeline, and where the time goes: `python -m pytest -m benchmark -s`."""
+"""Pairs per second through the whole pipeline and the time of each stage: `python -m pytest -m benchmark -s`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WANTED_HZ = 20.0
 
 
 def recording() -> tuple[LogReader, Rig]:
-    """Images of 768x768 where they are at hand, else the sample's of 512x512."""
+    """Return images of 768x768 if they are available, else those of the sample, 512x512."""
     if TWO_WALLS.is_dir():
         return LogReader(TWO_WALLS / "log.mcap"), import_kalibr(TWO_WALLS / "camchain.yaml")
     reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))

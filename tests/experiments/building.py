@@ -1,4 +1,4 @@
-"""The paper's building (section V.D): a corridor around rooms with doors and objects, and a round through it."""
+"""The paper's building (section V.D): a corridor around rooms with doors and objects, and a path around it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tests.simulation.builders import CEILING_M, Point, box, posters, wall
 from tests.simulation.paths import planar_poses
 from tests.simulation.surfaces import Rectangle, Scene
 
-PX_PER_M = 200.0  # of floor and ceiling
+PX_PER_M = 200.0  # resolution of floor and ceiling
 DOOR_M = (0.95, 2.1)  # width, height
 BEND_M = 0.85  # radius of the path in the corners
-FAST, SLOW = 2.6, 1.0  # speeds on the straight and in a turn, in proportion
+FAST, SLOW = 2.6, 1.0  # relative speeds on the straight and in a turn
 Random = np.random.Generator
 KINDS = ("brick", "plaster", "granite", "plaster", "brick", "plain")
 
@@ -32,7 +32,7 @@ class FloorPlan:
 
     @staticmethod
     def drawn(rng: Random) -> FloorPlan:
-        """A plan by chance, some 12 x 9 m."""
+        """Return a random plan of about 12 x 9 m."""
         length, width, corridor = rng.uniform(11.5, 12.5), rng.uniform(8.6, 9.4), rng.uniform(1.7, 2.0)
         inner = length - 2 * corridor
         shares = np.cumsum(rng.uniform(0.8, 1.2, 3))
@@ -41,7 +41,7 @@ class FloorPlan:
 
 
 def building(seed: int) -> tuple[FloorPlan, Scene]:
-    """The plan and the scene of a seed."""
+    """Return the plan and the scene of a seed."""
     rng = np.random.default_rng([seed, 21])
     plan = FloorPlan.drawn(rng)
     outer = _outer_walls(rng, plan)
@@ -50,7 +50,7 @@ def building(seed: int) -> tuple[FloorPlan, Scene]:
 
 
 def _outer_walls(rng: Random, plan: FloorPlan) -> list[Rectangle]:
-    """Left, front, right and back wall of the whole building, seen from within."""
+    """Return the left, front, right and back wall of the whole building, seen from inside."""
     corners: list[Point] = [(0, plan.width_m), (plan.length_m, plan.width_m), (plan.length_m, 0), (0, 0)]
     return [wall(rng, str(rng.choice(KINDS)), a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
 
@@ -64,11 +64,11 @@ def _floor_and_ceiling(rng: Random, plan: FloorPlan) -> list[Rectangle]:
 
 
 def _rooms(rng: Random, plan: FloorPlan) -> list[Rectangle]:
-    """Walls with doors towards the corridor, walls between rooms without, and what stands in the rooms."""
+    """Return walls with doors towards the corridor, walls without doors between rooms, and furniture."""
     x0, x1, y0, y1 = plan.columns[0], plan.columns[-1], plan.corridor_m, plan.width_m - plan.corridor_m
     rows: list[tuple[Point, Point]] = []
     for left, right in zip(plan.columns, plan.columns[1:], strict=False):
-        rows += [((right, y0), (left, y0)), ((left, y1), (right, y1))]  # as seen from within the room
+        rows += [((right, y0), (left, y0)), ((left, y1), (right, y1))]  # as seen from inside the room
     parts = [part for a, b in rows for part in _with_door(rng, wall(rng, str(rng.choice(KINDS)), a, b))]
     inner = [((x, y0), (x, y1)) for x in plan.columns] + [((x0, plan.middle_m), (x1, plan.middle_m))]
     for a, b in inner:
@@ -78,12 +78,12 @@ def _rooms(rng: Random, plan: FloorPlan) -> list[Rectangle]:
 
 
 def _other_side(side: Rectangle) -> Rectangle:
-    """The same wall for whoever stands behind it."""
+    """Return the same wall as seen from behind."""
     return Rectangle(side.origin + side.edge_u, -side.edge_u, side.edge_v, side.texture, side.name)
 
 
 def _with_door(rng: Random, side: Rectangle) -> list[Rectangle]:
-    """The wall without a door's opening: what is left of it, right of it and above; a image where there is room."""
+    """Return a wall without the opening of a door: its parts left, right and above; with posters on wide parts."""
     width, height = DOOR_M
     left = rng.uniform(0.3, side.width_m - width - 0.3)
     right = left + width
@@ -94,7 +94,7 @@ def _with_door(rng: Random, side: Rectangle) -> list[Rectangle]:
 
 
 def cut(side: Rectangle, place_m: tuple[float, float, float, float]) -> Rectangle:
-    """The part of a rectangle at (left, top, width, height) [m] with its part of the texture, to whole pixels."""
+    """Return the part of a rectangle at (left, top, width, height) [m] with its texture, to whole pixels."""
     height, width = side.texture.shape
     u, v = width / side.width_m, height / side.height_m
     left, top = round(place_m[0] * u), round(place_m[1] * v)
@@ -111,7 +111,7 @@ def _room_centres(plan: FloorPlan) -> list[Point]:
 
 
 def _furniture(rng: Random, centre: Point) -> list[Rectangle]:
-    """A table and a cupboard about the middle of a room."""
+    """Return a table and a cupboard near the middle of a room."""
     table, cupboard = rng.uniform((0.5, 0.5, 0.5), (0.9, 0.7, 0.9)), rng.uniform((0.3, 0.3, 1.2), (0.6, 0.5, 1.9))
     faces: list[Rectangle] = []
     for side, size in ((-1, table), (1, cupboard)):
@@ -121,7 +121,7 @@ def _furniture(rng: Random, centre: Point) -> list[Rectangle]:
 
 
 def _clutter(rng: Random, plan: FloorPlan) -> list[Rectangle]:
-    """Low boxes along the outer walls, out of the way."""
+    """Return low boxes along the outer walls, beside the path."""
     faces: list[Rectangle] = []
     for x in np.arange(1.5, plan.length_m - 1.5, 2.6):
         for y in (0.22, plan.width_m - 0.22):
@@ -132,12 +132,12 @@ def _clutter(rng: Random, plan: FloorPlan) -> list[Rectangle]:
 
 
 def round_trip(seed: int, plan: FloorPlan, pairs: int) -> Array:
-    """Poses (pairs, 4, 4) of one round along the corridor, left about, that ends where it began.
+    """Return poses (pairs, 4, 4) of one round along the corridor, counter-clockwise, back to its start.
 
-    Faster on the straight, slower in the turns, a little swaying; the heading follows the path.
+    Faster on the straight, slower in the turns, with small sideways waves; the heading follows the path.
     """
     rng = np.random.default_rng([seed, 22])
-    xy = _swaying(rng, _centre_line(plan))
+    xy = _with_waves(rng, _centre_line(plan))
     ahead = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
     heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     step = np.linalg.norm(np.diff(xy, axis=0, append=xy[:1]), axis=1)
@@ -152,7 +152,7 @@ def round_trip(seed: int, plan: FloorPlan, pairs: int) -> Array:
 
 
 def _centre_line(plan: FloorPlan, spacing_m: float = 0.005) -> Array:
-    """The middle of the corridor (N, 2) with rounded corners, from the middle of the first side, left about."""
+    """Return the middle of the corridor (N, 2), counter-clockwise, with rounded corners."""
     half = plan.corridor_m / 2
     low, high = np.array([half, half]) + BEND_M, np.array([plan.length_m - half, plan.width_m - half]) - BEND_M
     centres = [(high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1])]
@@ -167,8 +167,8 @@ def _centre_line(plan: FloorPlan, spacing_m: float = 0.005) -> Array:
     return np.column_stack([np.interp(s, arc, corners[:, 0]), np.interp(s, arc, corners[:, 1])])
 
 
-def _swaying(rng: Random, line: Array) -> Array:
-    """The closed line shifted sideways by up to 0.15 m in slow waves."""
+def _with_waves(rng: Random, line: Array) -> Array:
+    """Return the closed line shifted sideways by up to 0.15 m in slow waves."""
     ahead = np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0)
     normal = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
     normal = np.column_stack([_smooth(normal[:, k], 61) for k in (0, 1)])
@@ -179,7 +179,7 @@ def _swaying(rng: Random, line: Array) -> Array:
 
 
 def _smooth(values: Array, window: int) -> Array:
-    """Moving mean (N,) over a window of samples of a closed curve."""
+    """Return the moving mean (N,) over a window of samples of a closed curve."""
     padded = np.concatenate([values[-window:], values, values[:window]])
     mean = np.convolve(padded, np.ones(window) / window, mode="same")
     return np.asarray(mean[window:-window])

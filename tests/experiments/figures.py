@@ -1,4 +1,4 @@
-"""The figures of the report; told apart by shade, dash and mark, so that a black and white print will do."""
+"""The figures of the report; curves differ in shade, dash and marker, so that they can be printed without colour."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def wall(clouds: dict[str, Array], wall_m: float, path: Path) -> None:
-    """Points (N, 3) of each method from above and from the front, beside each other: fig. 8."""
+    """Draw the points (N, 3) of each method from above and from the front, side by side (fig. 8)."""
     figure = Figure(figsize=(4 * len(clouds), 5.6), layout="constrained")
     axes = figure.subplots(2, len(clouds), sharex="row", sharey="row", height_ratios=[1.5, 1])
     for (name, points), (above, front) in zip(clouds.items(), axes.T, strict=True):
@@ -41,13 +41,14 @@ def wall(clouds: dict[str, Array], wall_m: float, path: Path) -> None:
 
 
 def turns(rows: list[dict[str, Any]], path: Path) -> None:
-    """Right features over the angle of the turn, the median of all seeds: fig. 7 at every angle."""
+    """Draw the right features over the angle of the turn, median of all seeds (fig. 7, at every angle, both ways)."""
     figure = Figure(figsize=(7, 3), layout="constrained")
     axes = figure.subplots()
     for name, (shade, dash) in zip(rows[0]["found"], STYLES, strict=True):
         right = [[row["found"][name]["right"] for row in rows if row["turn_deg"] == a] for a in _angles(rows)]
         axes.plot(_angles(rows), [np.median(r) for r in right], dash, color=shade, marker=".", label=name)
-    axes.set(xlabel="turn between two images, degrees", ylabel="features found rightly", xticks=range(0, 181, 18))
+    axes.set(xlabel="turn between two images, degrees; to the left is positive", ylabel="features tracked correctly",
+             xticks=range(-180, 181, 36))
     axes.legend(frameon=False)
     _save(figure, path)
 
@@ -57,7 +58,7 @@ def _angles(rows: list[dict[str, Any]]) -> list[float]:
 
 
 def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], path: Path) -> None:
-    """Paths over the true one, and how far each is from it at every pair: fig. 9."""
+    """Draw paths over the true one, and the distance of each from it at every pair (fig. 9)."""
     figure = Figure(figsize=(8, 5.4), layout="constrained")
     above, error = figure.subplots(2, 1, height_ratios=[1, 1.2])
     true_xy = np.array(truth)
@@ -66,17 +67,17 @@ def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], pat
         above.plot(*np.array(xy).T, dash, color=shade, lw=1.2, label=name)
         error.plot(1e3 * np.linalg.norm(np.array(xy) - true_xy[: len(xy)], axis=1), dash, color=shade, label=name)
     above.set(aspect="equal", xlabel="m", ylabel="m")
-    error.set(yscale="log", ylim=(0.03, 300), xlabel="pair", ylabel="off the truth, mm")
+    error.set(yscale="log", ylim=(0.03, 300), xlabel="pair", ylabel="position error, mm")
     figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=2, loc="outside upper center")
     _save(figure, path)
 
 
 def floor_plan(run: Run, points: Array, path_xy: dict[str, Array], path: Path) -> None:
-    """The map's points (N, 3) in the world, black, and paths (N, 2) over the true floor plan, grey: fig. 10."""
+    """Draw the map's points (N, 3) in the world, black, and paths (N, 2) over the true floor plan, grey (fig. 10)."""
     figure = Figure(figsize=(9, 6.8), layout="constrained")
     axes = figure.subplots()
     standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 2.2)]
-    for r in filter(_stands, run.scene.rectangles):
+    for r in filter(_is_upright, run.scene.rectangles):
         axes.plot(*r.corners[:2, :2].T, color="0.8", lw=5 if r.name != "box" else 3, zorder=0)
     axes.scatter(standing[:, 0], standing[:, 1], s=0.5, c="black", linewidths=0)
     for (name, xy), (shade, dash) in zip(path_xy.items(), (("0.8", "-"), ("0.0", "--")), strict=True):
@@ -87,5 +88,5 @@ def floor_plan(run: Run, points: Array, path_xy: dict[str, Array], path: Path) -
     _save(figure, path)
 
 
-def _stands(r: Rectangle) -> bool:
+def _is_upright(r: Rectangle) -> bool:
     return abs(r.normal[2]) < 0.1 and not r.name.startswith("poster")

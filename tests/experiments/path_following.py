@@ -1,10 +1,8 @@
-"""V.C, fig. 9: the length of the path between two walls, and what each step from the paper to omnid contributes."""
+"""V.C, fig. 9: the path between two walls, and the contribution of each step from the paper's method to omnid's."""
 
 from __future__ import annotations
 
 import math
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,56 +10,49 @@ import numpy as np
 
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from tests.benchmark.accuracy import omnid
-from tests.experiments import figures as images
+from tests.experiments import figures
+from tests.experiments.estimation import Method, estimate
 from tests.experiments.views import Experiment
 
-KLT = ("--method", "paper", "--tracker", "klt")
-PAPER = ("--method", "paper")
-METHODS: dict[str, tuple[str, ...]] = {
-    "original SAD, plain KLT, eq. 9": (*KLT, "--set", "stereo.matching.method=sad"),
-    "enhanced SAD, plain KLT, eq. 9": KLT,
-    "original SAD, improved KLT, eq. 9": (*PAPER, "--set", "stereo.matching.method=sad"),
-    "enhanced SAD, improved KLT, eq. 9 (the paper)": PAPER,
-    "eq. 9 with keyframes": (*PAPER, "--set", "odometry.reference=keyframe"),
-    "bearings, frame to frame": ("--set", "odometry.limits.keyframes=1"),
-    "bearings, keyframes, enhanced SAD": ("--set", "stereo.matching.method=enhanced"),
-    "bearings, keyframes, semi-global prior (omnid)": (),
+SAD, ENHANCED = "stereo.matching.method=sad", "stereo.matching.method=enhanced"
+PAPER, KLT, KEYFRAME = "odometry.method=paper", "odometry.tracker=klt", "odometry.reference=keyframe"
+METHODS: dict[str, Method] = {
+    "original SAD, plain KLT, eq. 9": Method((PAPER, SAD, KLT)),
+    "enhanced SAD, plain KLT, eq. 9": Method((PAPER, ENHANCED, KLT)),
+    "original SAD, improved KLT, eq. 9": Method((PAPER, SAD)),
+    "enhanced SAD, improved KLT, eq. 9 (the paper)": Method((PAPER, ENHANCED)),
+    "the paper without its Kalman filter": Method((PAPER, ENHANCED), filtered=False),
+    "eq. 9 with keyframes": Method((PAPER, ENHANCED, KEYFRAME)),
+    "bearings, frame to frame": Method(("odometry.limits.keyframes=1",)),
+    "bearings, keyframes, enhanced SAD": Method((ENHANCED,)),
+    "bearings, keyframes, semi-global prior (omnid)": Method(),
+    "omnid without the Kalman filter": Method(filtered=False),
 }
+THE_PAPER = METHODS["enhanced SAD, improved KLT, eq. 9 (the paper)"]
+SHOWN = ("enhanced SAD, plain KLT, eq. 9", "enhanced SAD, improved KLT, eq. 9 (the paper)",
+         "bearings, keyframes, semi-global prior (omnid)")
 
 
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
-    """For each method: length and ATE and so on, and the path it found (for the image)."""
-    return {name: follow(folder, options) for name, options in METHODS.items()}
+    """Return for each method the errors of the path, and the path itself for the figure."""
+    return {name: against_truth(estimate(folder, method)[0], folder) for name, method in METHODS.items()}
 
 
-def follow(folder: Path, options: Sequence[str]) -> dict[str, Any]:
-    """What `omnid replay` with some options makes of a log, against its truth."""
-    with tempfile.TemporaryDirectory() as work:
-        estimate = Path(work) / "estimate.txt"
-        omnid("replay", folder / "log.mcap", "--rig", folder / "rig.toml", "--tum", estimate, "--quiet", *options)
-        return against_truth(read_tum(estimate), folder) | {"options": " ".join(options)}
-
-
-def against_truth(estimate: Trajectory, folder: Path) -> dict[str, Any]:
-    """The errors of a trajectory and the path in the frame of the first pose, x y [m]."""
-    m = evaluate(estimate, read_tum(folder / "truth.txt"))
+def against_truth(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
+    """Return the errors of a trajectory, and its path in the frame of the first pose, x y [m]."""
+    m = evaluate(trajectory, read_tum(folder / "truth.txt"))
     return {"length_m": m.length_estimate_m, "true_length_m": m.length_truth_m, "length_error": m.length_error_ratio,
             "ate_m": m.ate_rmse_m, "end_m": m.end_error_m, "heading_deg": math.degrees(m.heading_max_rad),
-            "coverage": m.coverage, "xy": np.round(estimate.T[:, :2, 3], 5).tolist()}
-
-
-SHOWN = tuple(METHODS)[1], tuple(METHODS)[3], tuple(METHODS)[-1]
+            "coverage": m.coverage, "xy": np.round(trajectory.T[:, :2, 3], 5).tolist()}
 
 
 def draw(folder: Path, experiment: Experiment, path: Path) -> None:
-    """The paths of plain KLT, of the paper and of omnid over the true one."""
-    found = {name: follow(folder, METHODS[name])["xy"] for name in SHOWN}
-    images.paths(found, true_path(folder), path)
+    """Draw the paths of plain KLT, of the paper and of omnid over the true one."""
+    trajectories = {name: estimate(folder, METHODS[name])[0] for name in SHOWN}
+    figures.paths({name: t.T[:, :2, 3].tolist() for name, t in trajectories.items()}, true_path(folder), path)
 
 
 def true_path(folder: Path) -> list[list[float]]:
-    """The true path in the frame of its first pose, x y [m]."""
+    """Return the true path in the frame of its first pose, x y [m]."""
     poses = read_tum(folder / "truth.txt").T
     return [list(map(float, T[:2, 3])) for T in np.linalg.inv(poses[0]) @ poses]
-

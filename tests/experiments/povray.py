@@ -1,8 +1,9 @@
-"""What a mirror camera sees of a scene, ray-traced by POV-Ray 3.7: a real mirror under a real camera.
+"""Images of a mirror camera, ray-traced by POV-Ray 3.7: a mirror under an ordinary camera.
 
 A parabolic mirror under an orthographic camera (unified model, xi = 1), or a hyperbolic one under a perspective camera
-(0 < xi < 1). Camera and mirror stay on the axes and the world is moved by the inverse pose: POV-Ray loses a paraboloid
-whose axis is not exactly an axis of its world. All light is ambient: no light sources, no shadows, linear grey.
+(0 < xi < 1). Camera and mirror stay on the axes and the world is moved by the inverse pose: POV-Ray does not find
+a paraboloid whose axis is not exactly an axis of its world. All light is ambient: no light sources, no shadows, linear
+grey.
 """
 
 from __future__ import annotations
@@ -23,23 +24,23 @@ from calib.rig import MountedCamera
 from tests.simulation.sensor import Floats
 from tests.simulation.surfaces import Rectangle, Scene
 
-MIRROR_M = 0.01  # the conic's semi-latus rectum: how wide the mirror is at the height of the viewpoint
+MIRROR_M = 0.01  # the conic's semi-latus rectum: radius of the mirror at the height of the viewpoint
 INSTALL = "apt-get install povray"
 OPTIONS = ("-D", "+FN8", "-A", "-GA", "+WT1", "File_Gamma=1.0", "+O-")  # no window, PNG on stdout, one thread
 TIMEOUT_S = 300
 
 
 class PovrayError(Exception):
-    """POV-Ray is missing or refused the scene."""
+    """POV-Ray is not installed or refused the scene."""
 
 
 def available() -> bool:
-    """Whether POV-Ray can be run here."""
+    """True if POV-Ray is installed."""
     return shutil.which("povray") is not None
 
 
 def write_world(folder: Path, scene: Scene) -> None:
-    """Writes world.inc and its textures: every rectangle in world coordinates, then moved by the transform `View`."""
+    """Write world.inc and its textures: every rectangle in world coordinates, then moved by the transform `View`."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, rectangle in enumerate(scene.rectangles):
         cv2.imwrite(str(folder / f"{number}.pgm"), rectangle.texture)
@@ -47,7 +48,7 @@ def write_world(folder: Path, scene: Scene) -> None:
 
 
 def _rectangle(number: int, r: Rectangle) -> str:
-    """A unit square with its image; POV-Ray counts a image's rows from below."""
+    """Return a unit square with its texture; POV-Ray counts the rows of an image from below."""
     axes = (r.edge_u, -r.edge_v, r.normal, r.origin + r.edge_v)
     matrix = ", ".join(f"{x:.12g}" for axis in axes for x in axis)
     return (f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ pgm "{number}.pgm" gamma 1.0 '
@@ -56,16 +57,17 @@ def _rectangle(number: int, r: Rectangle) -> str:
 
 
 def shoot(world: Path, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
-    """The image (H, W) float32, 0 to 255, of a camera on a rig that stands at T_world_rig in a written world.
+    """Return the image (H, W) float32, 0 to 255, of a camera on a rig at T_world_rig in a written world.
 
-    Rendered supersample times larger and shrunk: faster than POV-Ray's own anti-aliasing. 0 beyond the mirror's rim.
+    It is rendered supersample times larger and shrunk, which is faster than POV-Ray's own anti-aliasing; 0 beyond the
+    mirror's rim.
     """
     width, height = mounted.camera.size
     size = (f"+W{width * supersample}", f"+H{height * supersample}")
     data = _run(view_text(mounted, T_world_rig), world, [*OPTIONS, *size])
     large = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if large is None:
-        raise PovrayError(f"{world}: POV-Ray gave {len(data)} bytes that are no image")
+        raise PovrayError(f"{world}: POV-Ray gave {len(data)} bytes that are not an image")
     seen = np.where(_inside_rim(mounted, supersample), large, 0).astype(np.float32)
     return np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
@@ -80,13 +82,13 @@ def _run(text: str, world: Path, options: list[str]) -> bytes:
         except FileNotFoundError:
             raise PovrayError(f"povray is not installed: {INSTALL}") from None
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise PovrayError(f"{world}: POV-Ray ended with {done.returncode}: {' '.join(said[-3:])}")
+        errors = done.stderr.decode(errors="replace").strip().splitlines()
+        raise PovrayError(f"{world}: POV-Ray ended with {done.returncode}: {' '.join(errors[-3:])}")
     return done.stdout
 
 
 def view_text(mounted: MountedCamera, T_world_rig: Array) -> str:
-    """The scene description of one image: camera and mirror on the axes, the world about them."""
+    """Return the scene description of one image: camera and mirror on the axes, the world around them."""
     camera = traceable(mounted.camera)
     T_cam_world = mounted.T_cam_rig @ se3.inverse(T_world_rig)
     columns = ", ".join(f"{x:.15g}" for x in np.concatenate([T_cam_world[:3, :3].T.ravel(), T_cam_world[:3, 3]]))
@@ -96,23 +98,23 @@ def view_text(mounted: MountedCamera, T_world_rig: Array) -> str:
 
 
 def traceable(camera: OmniCamera) -> UnifiedCamera:
-    """The camera, if there is a mirror for it; PovrayError for what mirrors alone cannot do."""
+    """Return the camera if a mirror realises its model; raise PovrayError otherwise."""
     if not isinstance(camera, UnifiedCamera) or any(camera.distortion) or not 0 < camera.xi <= 1:
-        raise PovrayError(f"mirrors make a unified camera with 0 < xi <= 1 and no distortion, asked for {camera}")
+        raise PovrayError(f"expected a unified camera with 0 < xi <= 1 and no distortion, found {camera}")
     return camera
 
 
 def _eccentricity(xi: float) -> float:
-    """Of the mirror's conic: xi = 2 e / (1 + e^2), so a parabola for 1 and a hyperbola below."""
+    """Return the eccentricity of the mirror's conic from xi = 2 e / (1 + e^2): a parabola for 1, a hyperbola below."""
     return float((1 + np.sqrt(1 - xi**2)) / xi)
 
 
 def _camera(camera: UnifiedCamera) -> str:
-    """Looks along -z at the mirror; its axes u and v are x and y by the signs of the focal lengths."""
+    """Return the camera, directed along -z; its axes u and v are x and y by the signs of the focal lengths."""
     width, height = camera.size
     scale = 1.0 if camera.xi == 1 else float(np.sqrt(1 - camera.xi**2))  # focal length behind the mirror, of fu and fv
     right, down = width * scale / camera.focal[0], height * scale / camera.focal[1]
-    # Where the image's middle looks, in the same units: the optical centre may lie off it.
+    # Direction of the middle of the image in the same units: the optical centre may lie beside it.
     aside = scale * ((width - 1) / 2 - camera.center[0]) / camera.focal[0]
     below = scale * ((height - 1) / 2 - camera.center[1]) / camera.focal[1]
     if camera.xi == 1:
@@ -126,25 +128,25 @@ def _camera(camera: UnifiedCamera) -> str:
 
 
 def _mirror(camera: UnifiedCamera, rim_px: float) -> str:
-    """The conic with a focus in the origin, |p| = l - e z, out to its rim (a little beyond: that is masked)."""
+    """Return the conic with a focus in the origin, |p| = l - e z, to a little beyond its rim (that part is masked)."""
     e = _eccentricity(camera.xi)
     m = 1.05 * rim_px / min(abs(f) for f in camera.focal)
-    z = _elevation(m, camera.xi)  # of the ray that the rim sends out
+    z = _elevation(m, camera.xi)  # of the ray reflected at the rim
     rim = MIRROR_M / (1 + e * z) * float(np.sqrt(1 - z**2))
-    top = MIRROR_M / (1 + e) * 1.01  # just beyond the vertex, this side of a hyperbola's second sheet
+    top = MIRROR_M / (1 + e) * 1.01  # just beyond the vertex, before the second sheet of a hyperbola
     return (f"quadric {{ <1, 1, {1 - e**2:.15g}>, <0, 0, 0>, <0, 0, {2 * MIRROR_M * e:.15g}>, {-MIRROR_M**2:.15g} "
             f"clipped_by {{ cylinder {{ <0, 0, {-100 * MIRROR_M}>, <0, 0, {top:.15g}>, {rim:.15g} }} }} "
             "pigment { rgb 0 } finish { ambient 0 diffuse 0 reflection { 1 } } }")
 
 
 def _elevation(m: float, xi: float) -> float:
-    """z of the unit ray that the unified model images at radius m."""
+    """Return z of the unit ray that the unified model projects to radius m."""
     gamma = (xi + np.sqrt(1 + (1 - xi**2) * m**2)) / (m**2 + 1)
     return float(gamma - xi)
 
 
 def _inside_rim(mounted: MountedCamera, supersample: int) -> NDArray[np.bool_]:
-    """Which samples (H, W) of the enlarged image lie on the mirror."""
+    """Return which samples (H, W) of the enlarged image lie on the mirror."""
     width, height = mounted.camera.size
     u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
     v = (np.arange(height * supersample) + 0.5) / supersample - 0.5

@@ -1,4 +1,4 @@
-"""Renders a run image by image, goes on where it stopped, and packs the images as a log with its truth."""
+"""Render a run as a log with its truth: by POV-Ray, image by image and resumable, or by the ray caster."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import sys
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from tests.experiments.povray import shoot, write_world
-from tests.simulation.logs import pack_log
+from tests.simulation.logs import pack_log, write_log
 from tests.simulation.recipes import Run
 from tests.simulation.sensor import Floats
 
@@ -20,10 +21,10 @@ CAMERAS = ("lower", "upper")
 
 
 def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs: int = 2) -> None:
-    """Renders what is missing in folder/frames and writes log.mcap, truth.txt, rig.toml and camchain.yaml beside it.
+    """Render the missing images in folder/frames and write log.mcap, truth.txt, rig.toml and camchain.yaml beside it.
 
-    Does nothing where the log stands already. A image that is there is whole: another run of the same command goes
-    on where this one stopped. The frames are removed once they are packed.
+    Does nothing if the log exists. An image file is always complete, so the same command continues an interrupted
+    run. The images are removed once they are packed.
     """
     if (folder / "log.mcap").exists():
         return
@@ -44,12 +45,19 @@ def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs:
     _remove(frames, folder / "world")
 
 
+def cast_log(folder: Path, run: Run, seed: int, *, supersample: int = 2) -> None:
+    """Render a run by the ray caster of tests/simulation and write the same files; does nothing if the log exists."""
+    if not (folder / "log.mcap").exists():
+        write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=seed, supersample=supersample,
+                  progress=partial(_show_progress, folder.name, time.monotonic()))
+
+
 def _path(frames: Path, pair: int, camera: int) -> Path:
     return frames / f"{pair:04d}_{CAMERAS[camera]}.png"
 
 
 def _save(path: Path, image: Floats) -> None:
-    """Sixteen bits, so that shrinking is not rounded away before the sensor's noise; whole or not at all."""
+    """Save an image with 16 bits, so that the sensor's noise is added before rounding; complete or not at all."""
     part = path.with_suffix(".part.png")
     cv2.imwrite(str(part), np.rint(image * 257).astype(np.uint16))
     part.replace(path)
@@ -62,12 +70,15 @@ def _load(path: Path) -> Floats:
 
 
 def _watch(done: Iterable[None], total: int, name: str) -> None:
-    """Shows how far it is."""
-    started = time.monotonic()
+    """Show the progress on stderr."""
+    started_s = time.monotonic()
     for count, _ in enumerate(done, 1):
-        left_s = (time.monotonic() - started) / count * (total - count)
-        sys.stderr.write(f"\r{name}: {count}/{total} images, {left_s:.0f} s left   ")
-    sys.stderr.write("\n" if total else "")
+        _show_progress(name, started_s, count, total)
+
+
+def _show_progress(name: str, started_s: float, count: int, total: int) -> None:
+    left_s = (time.monotonic() - started_s) / count * (total - count)
+    sys.stderr.write(f"\r{name}: {count}/{total}, {left_s:.0f} s left   " + ("\n" if count == total else ""))
 
 
 def _remove(*folders: Path) -> None:

@@ -1,4 +1,4 @@
-"""What the comparisons measure on small rendered logs, and that the committed report says what was measured."""
+"""Tests of the comparisons on small rendered logs, and of the committed report."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import pytest
 
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.tum import read_tum
+from omnid.runs.replay import ReplayOptions, run_log
 from tests.experiments import path_following, turn_tracking, wall_matching
+from tests.experiments.estimation import Method, PassThroughFilter, estimate
 from tests.experiments.report import RESULTS, about, report, text
 from tests.experiments.scenes import build
-from tests.experiments.tables import percent, spread
+from tests.experiments.tables import angle, percent, spread
 from tests.experiments.views import Experiment
 from tests.experiments.whole_building import map_errors
 from tests.simulation.recipes import Run
@@ -29,48 +31,88 @@ def wall() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def turns() -> list[dict[str, Any]]:
-    return list(turn_tracking.measure(SMALL / "turns_s1", Experiment.read(SMALL / "turns_s1"))["turns"])
+def turns() -> dict[float, dict[str, Any]]:
+    rows = turn_tracking.measure(SMALL / "turns_s1", Experiment.read(SMALL / "turns_s1"))["turns"]
+    return {row["turn_deg"]: row for row in rows}
+
+
+def right(turns: dict[float, dict[str, Any]], tracker: str) -> dict[float, int]:
+    return {turn_deg: row["found"][tracker]["right"] for turn_deg, row in turns.items()}
 
 
 def test_enhanced_sad_has_at_most_a_third_of_the_wrong_matches_on_bricks(wall: dict[str, Any]) -> None:
-    original, enhanced, omnid = (wall[name] for name in wall_matching.METHODS)
+    original, enhanced, omnid = (wall[name] for name in wall_matching.SAD_METHODS)
     assert original["wrong"] > 0.1
     assert enhanced["wrong"] < original["wrong"] / 3 and omnid["wrong"] < original["wrong"] / 3
     assert enhanced["completeness"] > max(0.8, original["completeness"])
+    assert enhanced["coverage"] > original["coverage"]
     assert enhanced["rms_of_right_m"] < 0.03
 
 
-def test_improved_tracking_holds_through_turns_where_plain_klt_fades(turns: list[dict[str, Any]]) -> None:
-    plain, steps, correlation = ([row["found"][name]["right"] for row in turns] for name in turn_tracking.TRACKERS)
-    assert [row["turn_deg"] for row in turns] == [0, 9, 18, 27]
-    assert plain[3] < 0.7 * plain[0]
-    for found in (steps, correlation):
-        assert min(found) > 0.85 * found[1] > 0.8 * turns[1]["features"]
+def test_features_on_bricks_are_fewer_and_more_often_wrong_than_enhanced_sad(wall: dict[str, Any]) -> None:
+    enhanced = wall["enhanced SAD"]
+    for name in wall_matching.FEATURE_METHODS:
+        assert wall[name]["right"] < enhanced["right"] / 2
+        assert wall[name]["wrong"] > 2 * enhanced["wrong"] or wall[name]["matches"] < enhanced["matches"] / 20
 
 
-def test_claims_without_a_way_back_are_wrong_after_a_turn(turns: list[dict[str, Any]]) -> None:
-    plain, steps = (turns[3]["found"][name] for name in ("plain KLT", "18° steps"))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_searches_keep_features_through_turns_where_plain_klt_loses_them(
+    turns: dict[float, dict[str, Any]], sign: int
+) -> None:
+    angles_deg = [0.0, *(sign * a for a in (9.0, 18.0, 27.0))]
+    assert set(angles_deg) <= set(turns)
+    plain = right(turns, "plain KLT")
+    assert plain[angles_deg[3]] < 0.7 * plain[0]
+    for tracker in ("18° steps", "correlation"):
+        found = right(turns, tracker)
+        assert min(found[a] for a in angles_deg) > 0.85 * found[angles_deg[1]]
+        assert found[angles_deg[1]] > 0.8 * turns[angles_deg[1]]["features"]
+
+
+def test_features_claimed_without_a_backward_check_are_wrong_after_a_turn(turns: dict[float, dict[str, Any]]) -> None:
+    plain, steps = (turns[27]["found"][name] for name in ("plain KLT", "18° steps"))
     assert plain["claimed"] > 1.3 * plain["right"] and steps["claimed"] < 1.05 * steps["right"]
 
 
-def test_a_path_is_followed_by_the_command_and_judged_against_the_truth() -> None:
-    """The turns' log, on the spot: no length to speak of, all turned."""
-    found = path_following.follow(SMALL / "turns_s1", path_following.METHODS["eq. 9 with keyframes"])
+def test_a_trajectory_is_compared_with_the_truth() -> None:
+    """Use the log of the turns: the rig stays in place and turns."""
+    method = path_following.METHODS["eq. 9 with keyframes"]
+    found = path_following.against_truth(estimate(SMALL / "turns_s1", method)[0], SMALL / "turns_s1")
     assert found["coverage"] == 1 and found["heading_deg"] < 0.3 and found["ate_m"] < 0.01
     assert np.shape(found["xy"]) == np.shape(path_following.true_path(SMALL / "turns_s1")) == (5, 2)
 
 
-@pytest.mark.parametrize("options", path_following.METHODS.values(), ids=list(path_following.METHODS))
-def test_every_method_of_the_table_is_one_that_the_command_knows(options: tuple[str, ...], tmp_path: Path) -> None:
-    from omnid.cli import main
+def test_the_stages_alone_give_the_poses_and_the_map_of_a_replay() -> None:
+    trajectory, points = estimate(SMALL / "turns_s1", Method())
+    options = ReplayOptions(rig=SMALL / "turns_s1" / "rig.toml", collect=True, inline=True)
+    result = run_log(SMALL / "turns_s1" / "log.mcap", Method().config, options)
+    np.testing.assert_array_equal(trajectory.T, result.T_odom_rig)
+    assert points is not None and result.map is not None
+    np.testing.assert_array_equal(points.xyz, result.map.xyz)
 
-    settings = [word for word in options if "=" in word or word == "--set"]
-    assert main(["config", *settings]) == 0
+
+@pytest.mark.parametrize("overrides", [(), ("odometry.method=paper",)], ids=["omnid", "paper"])
+def test_without_the_filter_the_trajectory_differs_a_little(overrides: tuple[str, ...]) -> None:
+    filtered, unfiltered = (estimate(SMALL / "turns_s1", Method(overrides, filtered=f))[0] for f in (True, False))
+    assert not np.array_equal(filtered.T, unfiltered.T)
+    np.testing.assert_allclose(filtered.T, unfiltered.T, atol=0.01)
+
+
+def test_the_pass_through_filter_returns_what_was_measured() -> None:
+    motion_filter, T = PassThroughFilter(), np.eye(4)
+    T[0, 3] = 0.3
+    np.testing.assert_array_equal(motion_filter.update(T, 1e-4 * np.eye(6), 0.1), T)
+    np.testing.assert_array_equal(motion_filter.predict(0.1), np.eye(4))
+
+
+@pytest.mark.parametrize("method", path_following.METHODS.values(), ids=list(path_following.METHODS))
+def test_every_method_of_the_table_is_a_valid_configuration(method: Method) -> None:
+    assert method.config.stereo.matching.method in wall_matching.SAD_METHODS.values()
 
 
 def points_on(run: Run, off_m: float) -> MapPoints:
-    """Points off_m in front of the first wall, in the frame of the first pose."""
+    """Return points off_m in front of the first wall, in the frame of the first pose."""
     side = run.scene.rectangles[0]
     uv = np.random.default_rng(1).uniform(0.05, 0.95, (500, 2))
     world = side.points(uv) + off_m * side.normal
@@ -79,7 +121,7 @@ def points_on(run: Run, off_m: float) -> MapPoints:
     return MapPoints(xyz.astype(np.float32), ones.astype(np.float32), ones.astype(np.int32), ones.astype(np.int32))
 
 
-def test_the_map_is_judged_by_its_distance_from_what_stands_there() -> None:
+def test_map_errors_are_distances_from_the_true_surfaces() -> None:
     run = build("building", 3, 96)
     exact, off = map_errors(run, points_on(run, 0.0)), map_errors(run, points_on(run, 0.03))
     assert exact["rms_m"] < 1e-4 and exact["off_by_0.05_m"] == 0
@@ -87,7 +129,7 @@ def test_the_map_is_judged_by_its_distance_from_what_stands_there() -> None:
     assert 0.02 < exact["completeness"] < 0.3  # one wall of many
 
 
-def test_a_report_is_made_of_what_is_there_and_nothing_is_measured_twice(tmp_path: Path) -> None:
+def test_a_report_uses_existing_results_and_measures_nothing_twice(tmp_path: Path) -> None:
     shutil.copytree(SMALL / "brick_s1", tmp_path / "logs" / "brick_s1")
     report(tmp_path / "logs", tmp_path / "results")
     data = tmp_path / "results" / "data" / "wall_brick_s1.json"
@@ -97,13 +139,14 @@ def test_a_report_is_made_of_what_is_there_and_nothing_is_measured_twice(tmp_pat
     assert '"seed":7' in data.read_text()
 
 
-def test_the_committed_report_says_what_was_measured() -> None:
+def test_the_committed_report_is_made_of_the_committed_numbers() -> None:
     assert (RESULTS / "README.md").read_text() == text(RESULTS)
 
 
-def test_figures_carry_seed_date_and_machine() -> None:
-    noted = about(Experiment.read(SMALL / "brick_s1"))
-    assert noted["seed"] == 1 and "OpenCV" in noted["machine"] and len(noted["date"]) == 10
+def test_results_carry_seed_date_and_machine() -> None:
+    origin = about(Experiment.read(SMALL / "brick_s1"))
+    assert origin["seed"] == 1 and "OpenCV" in origin["machine"] and len(origin["date"]) == 10
+    assert origin["renderer"] == "povray"
 
 
 def test_a_spread_shows_median_smallest_and_largest() -> None:
@@ -111,5 +154,9 @@ def test_a_spread_shows_median_smallest_and_largest() -> None:
     assert spread([0.01], percent(2, sign=True)) == "+1.00 %"
 
 
-def test_the_small_logs_hold_their_truth() -> None:
+def test_an_angle_shows_its_direction() -> None:
+    assert [angle(a) for a in (-9.0, 0.0, 18.0)] == ["-9°", "0°", "+18°"]
+
+
+def test_the_small_logs_have_their_truth() -> None:
     assert len(read_tum(SMALL / "turns_s1" / "truth.txt").T) == 5

@@ -1,4 +1,4 @@
-"""The scenes are what they say: seeded, closed, clear of walls; and POV-Ray shows what the camera models say."""
+"""Tests of the scenes (seeded, closed, clear of walls) and of POV-Ray's images against the camera models."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.frame import gray
 from drivers.logs.mcap_reader import LogReader
 from tests.experiments.building import building
 from tests.experiments.povray import INSTALL, PovrayError, available, shoot, view_text, write_world
-from tests.experiments.rendering import render_log
+from tests.experiments.rendering import cast_log, render_log
 from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
 from tests.experiments.truth import cast, sees, surface_distance_m
 from tests.experiments.views import Experiment
@@ -26,7 +26,7 @@ MISALIGNED = (1.0, -2.0, 20.0)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_same_seed_is_the_same_run_and_another_is_another(name: str) -> None:
+def test_a_seed_determines_the_run(name: str) -> None:
     one, again, other = (build(name, seed, 96, 5) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.poses, again.poses)
     walls, same, others = (run.scene.rectangles for run in (one, again, other))
@@ -35,7 +35,7 @@ def test_the_same_seed_is_the_same_run_and_another_is_another(name: str) -> None
 
 
 @pytest.mark.parametrize("seed", range(1, 6))
-def test_the_round_through_the_building_closes_and_keeps_clear_of_everything(seed: int) -> None:
+def test_the_round_through_the_building_closes_and_keeps_its_distance_from_walls(seed: int) -> None:
     run = build("building", seed, 96)
     steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
     heading = np.unwrap([float(se3.yaw(T)) for T in run.poses])
@@ -46,18 +46,17 @@ def test_the_round_through_the_building_closes_and_keeps_clear_of_everything(see
     assert surface_distance_m(run.scene, run.poses[:, :3, 3]).min() > 0.35
 
 
-def test_the_rooms_can_be_looked_into_and_not_through() -> None:
-    """From the middle of a room a door shows the corridor, and all other walls are whole."""
+def test_a_door_of_a_room_shows_the_corridor_and_its_walls_are_closed() -> None:
     plan, scene = building(2)
     middle = np.array([(plan.columns[0] + plan.columns[1]) / 2, (plan.corridor_m + plan.middle_m) / 2, 1.5])
     azimuth = np.linspace(-np.pi, np.pi, 720, endpoint=False)
     distance, which = cast(scene, middle, np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth]))
-    out = np.isin(which, range(4))  # the outer walls
-    assert np.isfinite(distance).all() and 0.02 < out.mean() < 0.3
-    assert (np.sin(azimuth[out]) < 0).all()  # the door of a lower row leads to the lower corridor
+    outer = np.isin(which, range(4))
+    assert np.isfinite(distance).all() and 0.02 < outer.mean() < 0.3
+    assert (np.sin(azimuth[outer]) < 0).all()  # the door of a lower row leads to the lower corridor
 
 
-def test_truth_and_caster_see_the_same_distance() -> None:
+def test_rays_hit_the_surfaces_that_visibility_is_checked_against() -> None:
     run = build("two_walls", 3, 96, 4)
     T_world_rig = run.poses[2]
     points = T_world_rig[:3, 3] + np.array([[0.3, 0.2, 0.1], [0.1, -0.3, -0.2]])
@@ -68,16 +67,30 @@ def test_truth_and_caster_see_the_same_distance() -> None:
     assert not sees(run.scene, T_world_rig[:3, 3], hits + 0.1 * (points - T_world_rig[:3, 3])).any()
 
 
-def test_what_no_mirror_can_do_is_refused() -> None:
+def test_a_camera_that_no_mirror_realises_is_refused() -> None:
     for rig in (make_rig(size=96, distortion=(0.1, 0, 0, 0)), make_rig(size=96, xi=1.2)):
         with pytest.raises(PovrayError, match="xi <= 1 and no distortion"):
             view_text(rig.lower, np.eye(4))
 
 
+def test_the_ray_caster_writes_the_same_files(tmp_path: Path) -> None:
+    experiment = Experiment("smooth", 3, 96, 2, RigOptions(baseline_m=0.3), "ray_caster")
+    experiment.write(tmp_path)
+    cast_log(tmp_path, experiment.run, 3, supersample=1)
+    assert Experiment.read(tmp_path) == experiment and experiment.label == "smooth_s3_ray_caster"
+    assert {"log.mcap", "truth.txt", "rig.toml", "camchain.yaml"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_smooth_wall_has_contrast_and_no_edges() -> None:
+    front = build("smooth", 3, 96).scene.rectangles[0]
+    steps = np.abs(np.diff(front.texture.astype(int), axis=0))
+    assert front.name == "wall" and front.texture.std() > 20 and np.percentile(steps, 99) < 6
+
+
 @needs_povray
 @pytest.mark.parametrize(("xi", "rim"), [(1.0, 0.48), (0.9, 0.45), (0.7, 0.42)])
-def test_a_traced_mirror_shows_what_the_camera_model_says(xi: float, rim: float, tmp_path: Path) -> None:
-    """Two renderers that share nothing but the textures, a misaligned camera and an optical centre off the middle."""
+def test_a_ray_traced_mirror_agrees_with_the_camera_model(xi: float, rim: float, tmp_path: Path) -> None:
+    """Compare two independent renderers, for a misaligned camera with an optical centre off the middle."""
     run = build("control", 3, 192, 1)
     rig = make_rig(size=192, xi=xi, rim=rim, misaligned_deg=MISALIGNED, centre_px=(2.3, -3.4))
     write_world(tmp_path, run.scene)
@@ -99,12 +112,12 @@ def _grid(size: int) -> np.ndarray:
 
 
 @needs_povray
-def test_rendering_goes_on_where_it_stopped_and_leaves_a_log_with_its_truth(tmp_path: Path) -> None:
+def test_rendering_continues_an_interrupted_run_and_writes_a_log_with_its_truth(tmp_path: Path) -> None:
     experiment = Experiment("control", 3, 96, 2, RigOptions(baseline_m=0.3))
     frames = tmp_path / "frames"
     frames.mkdir(parents=True)
     black = np.zeros((96, 96), np.uint16)
-    cv2.imwrite(str(frames / "0001_upper.png"), black)  # as if drawn before the stop: it is not drawn again
+    cv2.imwrite(str(frames / "0001_upper.png"), black)  # an existing image is not rendered again
     render_log(tmp_path, experiment.run, 3, supersample=1)
     reader = LogReader(tmp_path / "log.mcap")
     brightness = [gray(frame).mean() for frame in reader.frames()]

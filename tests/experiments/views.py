@@ -1,4 +1,4 @@
-"""What omnid's own stages make of a rendered log, beside the scene it was rendered from."""
+"""The panoramas that omnid's own stages make of a rendered log, with the scene that it was rendered from."""
 
 from __future__ import annotations
 
@@ -21,18 +21,20 @@ from omnid.stages.synchronise import Synchronise
 from tests.experiments.scenes import RigOptions, build
 from tests.simulation.recipes import Run
 
-ORIGIN = "experiment.json"
+DESCRIPTION = "experiment.json"
+RENDERERS = ("povray", "ray_caster")
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """What a folder was rendered from."""
+    """What the log of a folder was rendered from."""
 
     name: str
     seed: int
     size: int
     pairs: int
     options: RigOptions
+    renderer: str = "povray"  # one of RENDERERS
 
     @property
     def run(self) -> Run:
@@ -41,48 +43,59 @@ class Experiment:
 
     @property
     def label(self) -> str:
-        """The folder's own name, as in two_walls_s11."""
-        return f"{self.name}_s{self.seed}"
+        """The folder's name, as in two_walls_s11; two_walls_s11_ray_caster where POV-Ray did not render it."""
+        suffix = "" if self.renderer == "povray" else f"_{self.renderer}"
+        return f"{self.name}_s{self.seed}{suffix}"
 
     def write(self, folder: Path) -> None:
-        """Leaves a note in the folder."""
+        """Write the description into the folder."""
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ORIGIN).write_text(json.dumps(asdict(self), indent=1) + "\n")
+        (folder / DESCRIPTION).write_text(json.dumps(asdict(self), indent=1) + "\n")
 
     @staticmethod
     def read(folder: Path) -> Experiment:
-        """The note of a folder."""
-        noted = json.loads((folder / ORIGIN).read_text())
-        return Experiment(**(noted | {"options": RigOptions(**noted["options"])}))
+        """Read the description in a folder."""
+        values = json.loads((folder / DESCRIPTION).read_text())
+        return Experiment(**(values | {"options": RigOptions(**values["options"])}))
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """The panoramas of a log."""
+    """The panoramas of a log and their geometry."""
 
-    place: Geometry
+    geometry: Geometry
     panoramas: list[Panoramas]
 
     def rays(self, pixels: Array) -> Array:
-        """Rays (N, 3), r = 1, in the rig frame of panorama pixels (N, 2)."""
-        return np.asarray(self.place.cylinder.rays(pixels) @ self.place.T_rig_rect[:3, :3].T)
+        """Return rays (N, 3) with r = 1 in the rig frame of panorama pixels (N, 2)."""
+        return np.asarray(self.geometry.cylinder.rays(pixels) @ self.geometry.T_rig_rect[:3, :3].T)
 
     def viewpoint(self, T_world_rig: Array) -> Array:
-        """Where the lower camera's viewpoint (3,) is in the world."""
-        return np.asarray((T_world_rig @ self.place.T_rig_rect)[:3, 3])
+        """Return the position (3,) of the lower camera's viewpoint in the world."""
+        return np.asarray((T_world_rig @ self.geometry.T_rig_rect)[:3, 3])
 
     def pixels(self, T_world_rig: Array, points: Array) -> Array:
-        """Panorama pixels (N, 2) of points (N, 3) in the world."""
-        T_rect_world = se3.inverse(T_world_rig @ self.place.T_rig_rect)
-        return self.place.cylinder.pixels(se3.apply(T_rect_world, points))
+        """Return the panorama pixels (N, 2) of points (N, 3) in the world."""
+        T_rect_world = se3.inverse(T_world_rig @ self.geometry.T_rig_rect)
+        return self.geometry.cylinder.pixels(se3.apply(T_rect_world, points))
 
 
-def look(folder: Path) -> Views:
-    """All panoramas of a short log."""
+def load_views(folder: Path) -> Views:
+    """Return all panoramas of a short log."""
+    place = log_geometry(folder)
+    return Views(place, list(panoramas_of(folder, place)))
+
+
+def log_geometry(folder: Path) -> Geometry:
+    """Return the geometry of a log's rig, whose file has the masks."""
+    return geometry(read_rig(folder / "rig.toml"), Config().panorama)
+
+
+def panoramas_of(folder: Path, place: Geometry) -> Iterator[Panoramas]:
+    """Yield the panoramas of a log, one pair at a time."""
     config = Config()
-    place = geometry(read_rig(folder / "rig.toml"), config.panorama)
     dewarp = Dewarp(place, config.panorama)
-    return Views(place, [dewarp.process(pair) for pair in _pairs(folder, place, config)])
+    yield from (dewarp.process(pair) for pair in _pairs(folder, place, config))
 
 
 def _pairs(folder: Path, place: Geometry, config: Config) -> Iterator[FramePair]:

@@ -1,8 +1,10 @@
-"""V.B, fig. 8: original SAD against enhanced SAD on a wall of identical bricks, and on one that does not repeat."""
+"""V.B, fig. 8: SAD, enhanced SAD and feature matching on a wall of identical bricks, a control and a smooth wall."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,52 +14,99 @@ from calib import se3
 from calib.models.camera import Array
 from omnid.config import Config
 from omnid.core.stereo.edges import edge_pixels, smooth
+from omnid.core.stereo.triangulation import triangulate
 from omnid.messages import Panoramas
+from omnid.stages.geometry import Geometry
 from omnid.stages.stereo import Stereo
-from tests.experiments import figures as images
+from tests.experiments import figures
+from tests.experiments.feature_matching import Detector, harris, match_pair, sift
 from tests.experiments.scenes import WALL_M
-from tests.experiments.truth import cast
-from tests.experiments.views import Experiment, Views, look
+from tests.experiments.truth import Flags, cast
+from tests.experiments.views import Experiment, Views, load_views
 from tests.simulation.recipes import Run
 
-METHODS = {"original SAD": "sad", "enhanced SAD": "enhanced", "semi-global (omnid)": "semiglobal"}
-WRONG_M = 0.05  # off the wall
-HALF_ANGLE_DEG = 45.0  # of the wall that is looked at: farther along it 5 cm are within the noise of depth
+SAD_METHODS = {"original SAD": "sad", "enhanced SAD": "enhanced", "semi-global (omnid)": "semiglobal"}
+FEATURE_METHODS: dict[str, tuple[Detector, bool]] = {  # detector; candidates from the same column only
+    "SIFT, ratio test": (sift, False),
+    "SIFT, along the column": (sift, True),
+    "Harris corners, ratio test": (harris, False),
+    "Harris corners, along the column": (harris, True),
+}
+WRONG_M = 0.05  # largest distance of a right point from the wall
+MISMATCHED_M = 0.2  # a point farther off is not only located inexactly
+HALF_ANGLE_DEG = 45.0  # from straight ahead; farther along the wall, 5 cm are within the noise of the depth
+CELL_M = 0.1  # side of the squares of the wall of which the covered ones are counted
+Matching = Callable[[Panoramas], tuple[Array, Array]]  # pixels (N, 2) of the lower panorama, points (N, 3) in the rig
+
+
+@dataclass(frozen=True, slots=True)
+class WallMatches:
+    """Matches of one pair that truly lie on the wall."""
+
+    points: Array  # (N, 3) m in the world, as located
+    spots: Array  # (N, 2) m, where they truly are on the wall: to the left of the rig, and height
+    edges: int  # edge pixels on the wall: what every SAD method tries to match
 
 
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
-    """For each method: matches on the wall, share of wrong ones, completeness, RMS to the plane [m]."""
-    run, views = experiment.run, look(folder)
-    return {label: _judge([_on_wall(run, views, method, n) for n in range(len(views.panoramas))])
-            for label, method in METHODS.items()}
+    """Return for each method: matches on the wall, share of wrong ones, completeness, coverage, RMS to the plane."""
+    run, views = experiment.run, load_views(folder)
+    values = {}
+    for name, matching in methods(views.geometry).items():
+        found = [_on_wall(run, views, matching, pair) for pair in range(len(views.panoramas))]
+        values[name] = _errors(run, found, is_dense=name in SAD_METHODS)
+    return values
 
 
-def _judge(errors_and_edges: list[tuple[Array, int]]) -> dict[str, float]:
-    errors = np.concatenate([errors for errors, _ in errors_and_edges])
-    edges = sum(count for _, count in errors_and_edges)
-    right = np.abs(errors) <= WRONG_M
-    return {"matches": len(errors), "wrong": float(1 - right.mean()), "completeness": float(right.sum() / edges),
-            "rms_m": float(np.sqrt(np.mean(errors**2))), "rms_of_right_m": float(np.sqrt(np.mean(errors[right] ** 2)))}
+def methods(place: Geometry) -> dict[str, Matching]:
+    """Return all methods by their names in the table."""
+    dense = {name: partial(_located, stereo(place, method)) for name, method in SAD_METHODS.items()}
+    sparse = {name: partial(_located_features, place, detect, along)
+              for name, (detect, along) in FEATURE_METHODS.items()}
+    return {**dense, **sparse}
 
 
-def _on_wall(run: Run, views: Views, method: str, pair: int) -> tuple[Array, int]:
-    """Distances (N,) [m] behind the wall's plane of one pair's matches on it, and how many edges there are on it."""
-    panoramas, T_world_rig = views.panoramas[pair], run.poses[pair]
-    depth = stereo(views, method).process(panoramas)
-    points = se3.apply(T_world_rig, depth.points)
-    seen = _is_wall(run, views, T_world_rig, depth.pixels)
-    edges = _edges(panoramas)
-    return points[seen, 0] - WALL_M, int(_is_wall(run, views, T_world_rig, edges).sum())
-
-
-def stereo(views: Views, method: str) -> Stereo:
-    """omnid's stage with one of the methods."""
+def stereo(place: Geometry, method: str) -> Stereo:
+    """Return omnid's stereo stage with one of its methods."""
     config = Config().stereo
-    return Stereo(views.place, replace(config, matching=replace(config.matching, method=method)))
+    return Stereo(place, replace(config, matching=replace(config.matching, method=method)))
+
+
+def _located(stage: Stereo, panoramas: Panoramas) -> tuple[Array, Array]:
+    depth = stage.process(panoramas)
+    return depth.pixels, depth.points
+
+
+def _located_features(place: Geometry, detect: Detector, along_column: bool, panoramas: Panoramas
+                      ) -> tuple[Array, Array]:
+    views = match_pair(panoramas, detect, along_column=along_column)
+    points = triangulate(views, place.cylinder, place.rig.baseline_m)
+    finite = np.isfinite(points).all(axis=1)
+    return views[finite, :2], se3.apply(place.T_rig_rect, points[finite])
+
+
+def _on_wall(run: Run, views: Views, matching: Matching, pair: int) -> WallMatches:
+    """Return one pair's matches whose pixels truly show the wall."""
+    panoramas, T_world_rig = views.panoramas[pair], run.poses[pair]
+    pixels, points = matching(panoramas)
+    on_wall, true_points = _wall_points(run, views, T_world_rig, pixels)
+    edges, _ = _wall_points(run, views, T_world_rig, _edges(panoramas))
+    spots = true_points[on_wall, 1:] - [T_world_rig[1, 3], 0.0]
+    return WallMatches(se3.apply(T_world_rig, points)[on_wall], spots, int(edges.sum()))
+
+
+def _wall_points(run: Run, views: Views, T_world_rig: Array, pixels: Array) -> tuple[Array, Array]:
+    """Return which pixels (N, 2) show the wall within HALF_ANGLE_DEG of straight ahead, and their points (N, 3)."""
+    rays = views.rays(pixels) @ T_world_rig[:3, :3].T
+    origin = views.viewpoint(T_world_rig)
+    distance, which = cast(run.scene, origin, rays)
+    walls = [number for number, r in enumerate(run.scene.rectangles) if r.name == "wall"]
+    ahead = np.abs(np.arctan2(rays[:, 1], rays[:, 0])) <= np.deg2rad(HALF_ANGLE_DEG)
+    return np.isin(which, walls) & ahead, origin + np.where(np.isfinite(distance), distance, 0)[:, None] * rays
 
 
 def _edges(panoramas: Panoramas) -> Array:
-    """Pixels (N, 2) of the lower panorama that every method tries to match."""
+    """Return the pixels (N, 2) of the lower panorama that every SAD method tries to match."""
     matching = Config().stereo.matching
     image = smooth(panoramas.lower.panorama, matching.sigma_px)
     flat = edge_pixels(image, panoramas.visible, matching.edge_threshold, matching.max_points)
@@ -65,23 +114,46 @@ def _edges(panoramas: Panoramas) -> Array:
     return np.column_stack([columns, rows]).astype(float)
 
 
-def _is_wall(run: Run, views: Views, T_world_rig: Array, pixels: Array) -> Array:
-    """Which pixels (N, 2) truly show the wall, within HALF_ANGLE_DEG of straight ahead."""
-    rays = views.rays(pixels) @ T_world_rig[:3, :3].T
-    _, which = cast(run.scene, views.viewpoint(T_world_rig), rays)
-    walls = [number for number, r in enumerate(run.scene.rectangles) if r.name == "wall"]
-    ahead = np.abs(np.arctan2(rays[:, 1], rays[:, 0])) <= np.deg2rad(HALF_ANGLE_DEG)
-    return np.asarray(np.isin(which, walls) & ahead)
+def _errors(run: Run, pairs: list[WallMatches], *, is_dense: bool) -> dict[str, float]:
+    """Return the errors over all pairs; completeness only for methods that match every edge pixel."""
+    error_m = np.concatenate([p.points[:, 0] for p in pairs]) - WALL_M
+    right = np.abs(error_m) <= WRONG_M
+    values = {"matches": len(error_m) / len(pairs), "right": float(right.sum()) / len(pairs),
+              "wrong": _share(~right), "mismatched": _share(np.abs(error_m) > MISMATCHED_M), "rms_m": _rms(error_m),
+              "rms_of_right_m": _rms(error_m[right]), "coverage": _coverage(run, pairs)}
+    edges = sum(p.edges for p in pairs)
+    if is_dense and edges:
+        values["completeness"] = float(right.sum() / edges)
+    return values
+
+
+def _share(flags: Flags) -> float:
+    return float(flags.mean()) if len(flags) else 0.0
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def _coverage(run: Run, pairs: list[WallMatches]) -> float:
+    """Return the share of the squares of the wall within HALF_ANGLE_DEG that hold a right match, mean of the pairs."""
+    half_m = WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG))
+    wall = next(r for r in run.scene.rectangles if r.name == "wall")
+    squares = round(2 * half_m / CELL_M) * round(wall.height_m / CELL_M)
+    shares = []
+    for pair in pairs:
+        right = np.abs(pair.points[:, 0] - WALL_M) <= WRONG_M
+        cells = np.unique(np.floor(pair.spots[right] / CELL_M), axis=0)
+        shares.append(len(cells) / squares)
+    return float(np.mean(shares))
+
+
+SHOWN = ("original SAD", "enhanced SAD", "semi-global (omnid)")
 
 
 def draw(folder: Path, experiment: Experiment, path: Path) -> None:
-    """The points of the middle pair by every method."""
-    run, views = experiment.run, look(folder)
+    """Draw the points of the middle pair by the dense methods."""
+    run, views = experiment.run, load_views(folder)
     pair = len(views.panoramas) // 2
-    images.wall({name: _cloud(run, views, method, pair) for name, method in METHODS.items()}, WALL_M, path)
-
-
-def _cloud(run: Run, views: Views, method: str, pair: int) -> Array:
-    """Points (N, 3) of the wall, as located, in the world."""
-    depth = stereo(views, method).process(views.panoramas[pair])
-    return se3.apply(run.poses[pair], depth.points[_is_wall(run, views, run.poses[pair], depth.pixels)])
+    found = methods(views.geometry)
+    figures.wall({name: _on_wall(run, views, found[name], pair).points for name in SHOWN}, WALL_M, path)
