@@ -86,7 +86,7 @@ def estimate(folder: Path, method: Method) -> tuple[Trajectory, MapPoints | None
 
 def depths_of(folder: Path, place: Geometry, config: Config) -> Iterator[StereoDepth]:
     """Yield the disparities and points of a log, one pair at a time."""
-    stereo = Stereo(place, config.stereo)
+    stereo = Stereo(place, config.stereo_settings())
     yield from map(stereo.process, panoramas_of(folder, place))
 
 
