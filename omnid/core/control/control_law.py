@@ -117,7 +117,7 @@ class ControlLaw:
     def motor_heading(self, counted_rad: float, now_ns: int) -> None:
         """Take the heading that the motor controller reported after a step, in its own count; NaN if it knows none."""
         good = self.pose if self.reason in REASONS_WITH_GOOD_POSE else None
-        self._goal.heard(counted_rad, good.heading_at(now_ns) if good else None)
+        self._goal.update(counted_rad, good.heading_at(now_ns) if good else None)
 
     def _inputs(self, now_ns: int, late_s: float, motor_failed: bool, motor_stopped: bool) -> SafetyInputs:
         pose, command = self.pose, self.command

@@ -1,21 +1,22 @@
-"""Heading hold: a setpoint of speed and heading becomes a bounded speed and yaw rate, one tick at a time."""
+"""Heading controller: from a setpoint of speed and heading to a bounded speed and yaw rate, one step a tick."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Final
 
 from omnid.errors import OmnidError
 from omnid.settings import knob
 
-LONGEST_TICK_S = 0.2  # a late tick does not earn a larger jump
-HALF_TURN_RAD = 0.2  # within this of half a turn, noise would flip the side to turn to
-BRAKING_SHARE = 0.8  # of the yaw acceleration is planned for slowing down; the rest is for lag
+LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step
+HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
+BRAKING_SHARE: Final = 0.8  # of the yaw acceleration is planned for braking; the rest is for lag
 
 
 @dataclass(frozen=True, slots=True)
 class HeadingLimits:
-    """What the base may be asked for, in magnitude, and the gain of the heading."""
+    """Limits of the heading controller, in magnitude, and its gain."""
 
     velocity_mps: float = knob(0.5, "highest speed, m/s", low=0.001, high=10)
     acceleration_mps2: float = knob(0.5, "highest acceleration, m/s^2", low=0.001, high=100)
@@ -24,16 +25,16 @@ class HeadingLimits:
     gain_hz: float = knob(1.5, "yaw rate per heading error, 1/s", low=0.001, high=50)
 
     def __post_init__(self) -> None:
-        """OmnidError unless each number is finite and above 0."""
+        """Raise OmnidError unless each number is finite and above 0."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value > 0):
-                raise OmnidError(f"heading hold: {field.name} is {value}; give a finite number above 0")
+                raise OmnidError(f"controller.heading.{field.name} is {value}; give a finite number above 0")
 
 
 @dataclass(frozen=True, slots=True)
 class Setpoint:
-    """What is wanted: a speed, and a heading in odom or, where that is None, a yaw rate."""
+    """A wanted speed, and a wanted heading in odom or, where that is None, a wanted yaw rate."""
 
     velocity_mps: float
     heading_rad: float | None = None
@@ -42,31 +43,32 @@ class Setpoint:
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """What the base is told: forward speed and yaw rate, counter-clockwise."""
+    """A motion of the base: forward speed and yaw rate, counter-clockwise."""
 
     velocity_mps: float = 0.0
     yaw_rate_radps: float = 0.0
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same direction within -pi .. pi; NaN of what is not finite."""
+    """Return the same direction within -pi .. pi; NaN for a number that is not finite."""
     return math.remainder(angle_rad, math.tau) if math.isfinite(angle_rad) else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class HeadingController:
-    """A proportional heading controller that never leaves its limits, whatever it is given.
+    """A proportional heading controller whose output never exceeds its limits, whatever its input.
 
-    Rate and acceleration are bounded; near the goal the rate follows sqrt(2 a e), from which it can still brake.
+    Rate and acceleration are bounded; near the goal the rate is at most sqrt(2 a e) with the acceleration a and the
+    heading error e, from which the base can still brake.
     """
 
     limits: HeadingLimits = HeadingLimits()
 
     def step(self, setpoint: Setpoint, heading_rad: float, dt_s: float, previous: Twist) -> Twist:
-        """The drive dt_s after `previous`; heading_rad is measured, in odom.
+        """Return the motion dt_s after `previous`; heading_rad is measured, in odom.
 
-        A setpoint or heading that is not finite: stops as fast as the limits allow. A time or a previous drive
-        that is not finite: stands still at once, for there is nothing to slow down from.
+        Where setpoint or heading are not finite, the base stops as fast as the limits allow. Where the time or the
+        previous motion are not finite, it stops at once: there is no speed to slow down from.
         """
         if not all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
             return Twist()
@@ -81,7 +83,7 @@ class HeadingController:
         )
 
     def _wanted(self, setpoint: Setpoint, heading_rad: float, yaw_rate_radps: float) -> Twist:
-        """The drive without acceleration limits; a stop where a number is not finite."""
+        """Return the motion without limits of acceleration; a stop where a number is not finite."""
         goal_rad = 0.0 if setpoint.heading_rad is None else setpoint.heading_rad
         numbers = (setpoint.velocity_mps, setpoint.yaw_rate_radps, goal_rad, heading_rad)
         if not all(map(math.isfinite, numbers)):
@@ -93,7 +95,7 @@ class HeadingController:
         return Twist(_clamp(setpoint.velocity_mps, limits.velocity_mps), _clamp(rate_radps, limits.yaw_rate_radps))
 
     def _rate(self, error_rad: float, yaw_rate_radps: float) -> float:
-        """The yaw rate for a heading error; near half a turn it goes on the way it turns."""
+        """Return the yaw rate for a heading error; near half a turn the base goes on to the side it turns to."""
         size_rad = abs(error_rad)
         braking_radps = math.sqrt(2 * BRAKING_SHARE * self.limits.yaw_acceleration_radps2 * size_rad)
         side = error_rad
@@ -107,5 +109,5 @@ def _clamp(value: float, magnitude: float) -> float:
 
 
 def _towards(value: float, goal: float, reach: float) -> float:
-    """The value moved towards the goal by at most reach."""
+    """Return the value, moved towards the goal by at most reach."""
     return value + _clamp(goal - value, reach)

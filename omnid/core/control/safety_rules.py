@@ -1,4 +1,4 @@
-"""Whether the wheels may turn: every reason to stop, in the order in which it is told."""
+"""The safety rules: every reason to stop the wheels, in the order in which it is reported."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from omnid.tracking_state import TrackingState
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
-    """What is too old or too late to drive by, s."""
+    """Ages of pose and setpoint, and lateness of a tick, beyond which the wheels stop."""
 
     pose_s: float = knob(0.5, "the wheels stop when the newest pose's images are older, s", low=0.05, high=10)
-    command_s: float = knob(0.5, "the wheels stop when the newest command came longer ago, s", low=0.05, high=10)
-    tick_s: float = knob(0.25, "the wheels stop when the host lets a tick come so much too late, s", low=0.01, high=10)
+    command_s: float = knob(0.5, "the wheels stop when the newest setpoint arrived longer ago, s", low=0.05, high=10)
+    tick_s: float = knob(0.25, "the wheels stop when a tick is later, because the host is overloaded, s", low=0.01,
+                         high=10)
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyInputs:
-    """What one tick of the wheels knows; inf is the age of what never came."""
+    """Inputs of the rules at one tick; the age of a pose or setpoint that never came is inf."""
 
     pose_age_s: float
     pose_state: str  # tracking | degraded | lost
-    command_age_s: float  # of a command that came after the last stop
+    command_age_s: float  # of a setpoint that arrived after the last stop
     late_s: float = 0.0
     motor_failed: bool = False  # at the last tick
-    motor_stopped: bool = False  # by the controller itself, before the last tick
+    motor_stopped: bool = False  # by the motor controller itself, before the last tick
     stop_asked: bool = False
     ending: bool = False
 
@@ -44,9 +45,9 @@ COMMAND_STALE: Final = "the command is stale"
 
 
 def stop_reason(now: SafetyInputs, deadlines: Deadlines) -> str:
-    """Why the wheels must stand, in a few words; empty where they may turn.
+    """Return the reason why the wheels must stop, in a few words; empty where they may turn.
 
-    A number that is NaN is a reason, and so is an age as far below 0 as it may be above: nothing comes from the future.
+    A NaN is a reason, and so is an age as far below 0 as it may be above: no pose comes from the future.
     """
     reasons = (
         (now.ending, ENDS),

@@ -1,20 +1,21 @@
-"""The last word on a motion before it becomes bytes: no output breaks a limit, whatever comes in."""
+"""Limits of speed, yaw rate and acceleration, applied to every motion before it is sent, whatever its source."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Final
 
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.errors import OmnidError
 from omnid.settings import knob
 
-STOP = Twist()
+STOP: Final = Twist()
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityLimits:
-    """What the wheels may be told, in magnitude; stops are slowed down within the deceleration as well."""
+    """Limits of the commands to the wheels, in magnitude; the deceleration holds for stops as well."""
 
     velocity_mps: float = knob(0.6, "highest speed, m/s", low=0.001, high=10)
     acceleration_mps2: float = knob(0.6, "highest acceleration, m/s^2", low=0.001, high=100)
@@ -23,19 +24,19 @@ class VelocityLimits:
     yaw_acceleration_radps2: float = knob(4.0, "highest yaw acceleration, rad/s^2", low=0.001, high=200)
 
     def __post_init__(self) -> None:
-        """OmnidError unless each number is finite and above 0."""
+        """Raise OmnidError unless each number is finite and above 0."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value > 0):
-                raise OmnidError(f"command limits: {field.name} is {value}; give a finite number above 0")
+                raise OmnidError(f"controller.limits.{field.name} is {value}; give a finite number above 0")
 
     def step(self, wanted: Twist, last: Twist, dt_s: float) -> Twist:
-        """What is sent dt_s after `last` was; a wanted drive that is not finite is a stop.
+        """Return the motion to send dt_s after `last`; a wanted motion that is not finite is a stop.
 
-        A last drive that is not finite counts as standing, one beyond the limits as at them. A time that is not finite
-        or runs backwards counts as none, one that is longer than LONGEST_TICK_S as that: a late tick earns no jump.
+        A last motion that is not finite counts as the stop, one beyond the limits as at the limits. A time that is not
+        finite or negative counts as 0, one longer than LONGEST_TICK_S as that: a late tick allows no larger step.
         """
-        wanted, last = (drive if _finite(drive) else STOP for drive in (wanted, last))
+        wanted, last = (motion if _finite(motion) else STOP for motion in (wanted, last))
         dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
         top_mps, top_radps = self.velocity_mps, self.yaw_rate_radps
         velocity_mps, yaw_rate_radps = _clamp(last.velocity_mps, top_mps), _clamp(last.yaw_rate_radps, top_radps)
@@ -46,7 +47,7 @@ class VelocityLimits:
         )
 
     def _velocity(self, last_mps: float, wanted_mps: float, dt_s: float) -> float:
-        """Towards the wanted speed: first down to a stand where it changes sides, then up for what time is left."""
+        """Return the speed on the way to the wanted one: down to 0 where its sign changes, then up in the time left."""
         speed_mps, goal_mps = math.copysign(1.0, last_mps) * last_mps, math.copysign(1.0, last_mps) * wanted_mps
         if goal_mps >= speed_mps:
             speed_mps = min(goal_mps, speed_mps + self.acceleration_mps2 * dt_s)
@@ -58,8 +59,8 @@ class VelocityLimits:
         return math.copysign(1.0, last_mps) * speed_mps
 
 
-def _finite(drive: Twist) -> bool:
-    return math.isfinite(drive.velocity_mps) and math.isfinite(drive.yaw_rate_radps)
+def _finite(motion: Twist) -> bool:
+    return math.isfinite(motion.velocity_mps) and math.isfinite(motion.yaw_rate_radps)
 
 
 def _clamp(value: float, magnitude: float) -> float:

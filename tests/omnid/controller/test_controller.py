@@ -1,4 +1,4 @@
-"""The base controller: what stops the wheels, what lets them turn again, and that nothing ever breaks a limit."""
+"""The base controller: each reason stops the wheels, a later setpoint starts them again, no limit is exceeded."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ AHEAD = Setpoint(0.3, None, 0.0)
 
 
 class Wheels:
-    """A motor driver that takes notes; `silent` and `expired` are what the controller does next."""
+    """A motor driver that keeps its commands; `silent` and `expired`: behaviour at the next command."""
 
     def __init__(self) -> None:
-        self.told: list[VelocityCommand] = []
+        self.commands: list[VelocityCommand] = []
         self.silent = self.expired = self.closed = False
         self.heading_rad = math.nan
 
     def send(self, command: VelocityCommand) -> MotorStatus:
-        """The notes grow."""
+        """Keep the command."""
         if self.silent:
             raise DriverError("motor on /dev/x gave no answer")
-        self.told.append(command)
+        self.commands.append(command)
         return MotorStatus(0.0, self.heading_rad, 0.0, self.expired, 0, math.nan)
 
     def close(self) -> None:
-        """Noted."""
+        """Note that it was closed."""
         self.closed = True
 
 
@@ -59,19 +59,19 @@ class Bench:
     def __init__(self) -> None:
         self.now_ns = 10**12
         self.wheels = Wheels()
-        self.said: list[str] = []
-        self.controller = Controller(self.wheels, SETTINGS, PERIOD_S, self.said.append, clock_ns=lambda: self.now_ns)
-        self.logbook = ControllerStatistics(StageStats("motor"))
+        self.lines: list[str] = []
+        self.controller = Controller(self.wheels, SETTINGS, PERIOD_S, self.lines.append, clock_ns=lambda: self.now_ns)
+        self.statistics = ControllerStatistics(StageStats("motor"))
 
     @property
     def last(self) -> VelocityCommand:
-        return self.wheels.told[-1]
+        return self.wheels.commands[-1]
 
-    def see(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
+    def send_pose(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
             age_s: float = 0.0) -> None:
         self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
 
-    def ask(self, setpoint: Setpoint = AHEAD) -> None:
+    def send_setpoint(self, setpoint: Setpoint = AHEAD) -> None:
         self.now_ns += 1
         self.controller.set_command(TimedSetpoint(self.now_ns, setpoint))
 
@@ -80,12 +80,12 @@ class Bench:
 
     def tick(self, late_s: float = 0.0) -> None:
         self.now_ns += PERIOD_NS + round(late_s * 1e9)
-        self.logbook.add(self.controller.tick())
+        self.statistics.add(self.controller.tick())
 
     def drive(self, ticks: int = 20, setpoint: Setpoint = AHEAD) -> None:
         for _ in range(ticks):
-            self.see()
-            self.ask(setpoint)
+            self.send_pose()
+            self.send_setpoint(setpoint)
             self.tick()
 
 
@@ -102,183 +102,183 @@ def driving(bench: Bench) -> Bench:
 
 
 def slows_down(bench: Bench, go_on: Callable[[], None]) -> None:
-    """The wheels come to a stand within the deceleration, not at once; go_on is what else happens before each tick."""
-    before = len(bench.wheels.told)
+    """Expect the wheels to stop within the deceleration, not at once; go_on is called before each tick."""
+    before = len(bench.wheels.commands)
     for _ in range(10):
         go_on()
         bench.tick()
-    speeds = [0.3, *(command.velocity_mps for command in bench.wheels.told[before:])]
+    speeds = [0.3, *(command.velocity_mps for command in bench.wheels.commands[before:])]
     assert speeds[-1] == 0.0 and speeds[1] > 0.0
     assert all(0.0 <= a - b <= LIMITS.deceleration_mps2 * PERIOD_S + 1e-6 for a, b in pairwise(speeds))
 
 
-def both(bench: Bench) -> None:
-    bench.see()
-    bench.ask()
+def send_both(bench: Bench) -> None:
+    bench.send_pose()
+    bench.send_setpoint()
 
 
-def test_nothing_moves_without_a_pose_or_without_a_command(bench: Bench) -> None:
+def test_does_not_move_without_a_pose_or_without_a_setpoint(bench: Bench) -> None:
     bench.tick()
     assert bench.controller.state.reason == safety_rules.POSE_STALE
-    bench.ask()
+    bench.send_setpoint()
     bench.tick()
     assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.POSE_STALE
-    bench.see()
+    bench.send_pose()
     bench.tick()
-    assert is_stop(bench.last), "the command came before there was a pose"
+    assert is_stop(bench.last), "the setpoint arrived before the pose"
     assert bench.controller.state.reason == safety_rules.IDLE
-    bench.ask()
+    bench.send_setpoint()
     bench.tick()
     assert bench.last.velocity_mps > 0.0
-    assert bench.controller.state.stops == {} and bench.said == [], "nothing that drove was stopped"
+    assert bench.controller.state.stops == {} and bench.lines == [], "no motion was stopped"
 
 
-def test_a_stale_pose_stops(driving: Bench) -> None:
+def test_stops_where_the_pose_is_stale(driving: Bench) -> None:
     def late() -> None:
-        driving.see(age_s=1.0)
-        driving.ask()
+        driving.send_pose(age_s=1.0)
+        driving.send_setpoint()
 
     slows_down(driving, late)
     assert driving.controller.state.reason == safety_rules.POSE_STALE
     assert driving.controller.state.stops == {safety_rules.POSE_STALE: 1}
-    assert driving.said == ["the wheels stop: the pose is stale"]
+    assert driving.lines == ["the wheels stop: the pose is stale"]
 
 
-def test_a_pose_that_is_lost_stops(driving: Bench) -> None:
+def test_stops_where_the_pose_is_lost(driving: Bench) -> None:
     def lose() -> None:
-        driving.see(state="lost")
-        driving.ask()
+        driving.send_pose(state="lost")
+        driving.send_setpoint()
 
     slows_down(driving, lose)
     assert driving.controller.state.reason == safety_rules.POSE_LOST
-    both(driving)
+    send_both(driving)
     driving.tick()
-    assert driving.last.velocity_mps > 0.0, "found again, and asked anew"
+    assert driving.last.velocity_mps > 0.0, "found again, and a new setpoint"
 
 
-def test_degraded_drives_on(driving: Bench) -> None:
-    driving.see(state="degraded")
-    driving.ask()
+def test_drives_on_where_the_pose_is_degraded(driving: Bench) -> None:
+    driving.send_pose(state="degraded")
+    driving.send_setpoint()
     driving.tick()
     assert driving.last.velocity_mps == 0.3
 
 
-def test_when_commands_cease_the_wheels_stop(driving: Bench) -> None:
+def test_stops_where_no_more_setpoints_come(driving: Bench) -> None:
     for _ in range(9):
-        driving.see()
+        driving.send_pose()
         driving.tick()
     assert driving.last.velocity_mps == 0.3, "0.45 s after the last one"
-    slows_down(driving, driving.see)
+    slows_down(driving, driving.send_pose)
     assert driving.controller.state.stops == {safety_rules.COMMAND_STALE: 1}
     assert driving.controller.state.reason == safety_rules.IDLE
 
 
-def test_a_stop_latches_until_a_command_that_comes_later(driving: Bench) -> None:
-    driving.ask()
+def test_a_stop_latches_until_a_later_setpoint(driving: Bench) -> None:
+    driving.send_setpoint()
     driving.now_ns += 1
     driving.stop()
     driving.now_ns += 1
-    driving.ask()  # within the same tick: the stop counts
+    driving.send_setpoint()  # within the same tick: the stop counts
     driving.tick()
     assert driving.controller.state.reason == safety_rules.ASKED
     slows_down_from = driving.last.velocity_mps
     assert 0.0 < slows_down_from < 0.3
     for _ in range(10):
-        driving.see()
+        driving.send_pose()
         driving.tick()
     assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.IDLE
-    both(driving)
+    send_both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0
 
 
-def test_a_stop_that_comes_in_the_middle_of_a_tick_is_not_lost(driving: Bench) -> None:
-    """A command and a stop after it arrive while the tick talks to the controller."""
+def test_a_stop_during_a_tick_is_not_lost(driving: Bench) -> None:
+    """A setpoint and after it a stop arrive while the tick waits for the motor controller."""
     send = driving.wheels.send
 
     def busy(command: VelocityCommand) -> MotorStatus:
-        driving.ask()
+        driving.send_setpoint()
         driving.now_ns += 1000
         driving.stop()
         return send(command)
 
     driving.wheels.send = busy  # type: ignore[method-assign]
-    both(driving)
+    send_both(driving)
     driving.tick()
     driving.wheels.send = send  # type: ignore[method-assign]
-    driving.see()
+    driving.send_pose()
     driving.tick()
     assert driving.controller.state.reason == safety_rules.ASKED
     slower = driving.last.velocity_mps
-    driving.see()
+    driving.send_pose()
     driving.tick()
-    assert driving.last.velocity_mps < slower < 0.3, "the command before the stop is void"
+    assert driving.last.velocity_mps < slower < 0.3, "the setpoint before the stop is void"
 
 
-def test_a_command_that_arrived_before_the_stop_but_is_handed_over_after_it_is_void(driving: Bench) -> None:
+def test_a_setpoint_that_arrived_before_the_stop_but_is_passed_on_after_it_is_void(driving: Bench) -> None:
     arrival_ns = driving.now_ns
     driving.now_ns += 1
     driving.stop()
     for _ in range(10):
-        driving.see()
+        driving.send_pose()
         driving.tick()
     driving.controller.set_command(TimedSetpoint(arrival_ns, AHEAD))
     driving.tick()
     assert is_stop(driving.last)
 
 
-def test_an_overloaded_host_stops_and_commands_from_before_are_void(driving: Bench) -> None:
-    both(driving)
+def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench) -> None:
+    send_both(driving)
     driving.tick(late_s=0.26)
     assert driving.controller.state.reason == safety_rules.OVERLOADED and driving.last.velocity_mps < 0.3
     slows_down_to: list[float] = []
     for _ in range(10):
-        driving.see()
+        driving.send_pose()
         driving.tick()
         slows_down_to.append(driving.last.velocity_mps)
     assert slows_down_to[-1] == 0.0
-    assert driving.logbook.lateness.max_s == pytest.approx(0.26)
+    assert driving.statistics.lateness.max_s == pytest.approx(0.26)
 
 
-def test_a_tick_that_is_a_little_late_does_not_stop(driving: Bench) -> None:
-    both(driving)
+def test_drives_on_where_a_tick_is_a_little_late(driving: Bench) -> None:
+    send_both(driving)
     driving.tick(late_s=0.2)
     assert driving.controller.state.reason == "" and driving.last.velocity_mps == 0.3
 
 
-def test_lateness_is_measured_against_the_rhythm(bench: Bench) -> None:
-    """Ticks that are all late alike are late; after a long gap the rhythm goes on as it was."""
+def test_measures_lateness_against_the_rhythm_of_the_earliest_ticks(bench: Bench) -> None:
+    """Ticks that are all equally late are late; after a long gap the rhythm goes on as it was."""
     bench.tick()
     for late_ns in (5_000_000, 5_000_000, 120_000_000, 30_000_000):
-        bench.now_ns = 10**12 + PERIOD_NS + bench.logbook.lateness.count * PERIOD_NS + late_ns
+        bench.now_ns = 10**12 + PERIOD_NS + bench.statistics.lateness.count * PERIOD_NS + late_ns
         if late_ns == 30_000_000:
             bench.now_ns += 2 * PERIOD_NS  # that were left out
-        bench.logbook.add(bench.controller.tick())
-    assert [round(bench.logbook.lateness.p(q), 3) for q in (0.2, 1.0)] == [0.0, 0.12]
-    assert bench.logbook.lateness.p(0.6) == pytest.approx(0.005, rel=0.02)
-    assert bench.logbook.lateness.p(0.8) == pytest.approx(0.03, rel=0.02)
+        bench.statistics.add(bench.controller.tick())
+    assert [round(bench.statistics.lateness.p(q), 3) for q in (0.2, 1.0)] == [0.0, 0.12]
+    assert bench.statistics.lateness.p(0.6) == pytest.approx(0.005, rel=0.02)
+    assert bench.statistics.lateness.p(0.8) == pytest.approx(0.03, rel=0.02)
 
 
-def test_a_motor_that_fails_voids_what_was_asked(driving: Bench) -> None:
+def test_a_motor_that_fails_voids_earlier_setpoints(driving: Bench) -> None:
     driving.wheels.silent = True
     for _ in range(3):
-        both(driving)
+        send_both(driving)
         driving.tick()
     assert driving.controller.state.errors == 3 and driving.controller.state.failed
     driving.wheels.silent = False
     driving.tick()
     assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.FAILED
-    driving.see()
+    driving.send_pose()
     driving.tick()
-    assert is_stop(driving.last), "what was asked before the stop is void"
-    both(driving)
+    assert is_stop(driving.last), "the setpoint before the stop is void"
+    send_both(driving)
     driving.tick()
-    assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stand"
-    assert driving.said == ["motor on /dev/x gave no answer", f"the wheels stop: {safety_rules.FAILED}",
+    assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stop"
+    assert driving.lines == ["motor on /dev/x gave no answer", f"the wheels stop: {safety_rules.FAILED}",
                             "the motor controller is back"]
 
 
-def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
+def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
     send = driving.wheels.send
 
     def late(_: VelocityCommand) -> MotorStatus:
@@ -286,14 +286,14 @@ def test_an_answer_that_is_late_stops_nothing(driving: Bench) -> None:
 
     for wheels in (late, send):
         driving.wheels.send = wheels  # type: ignore[method-assign]
-        both(driving)
+        send_both(driving)
         driving.tick()
     assert driving.controller.state.late == 1 and driving.controller.state.errors == 0
-    assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.said == []
+    assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.lines == []
 
 
-def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) -> None:
-    """The stop that was told without an answer is a step of the ramp, and the next goes on from there."""
+def test_continues_the_ramp_after_a_late_answer(driving: Bench) -> None:
+    """A command without an answer counts as a step of the ramp to the stop."""
     def late(_: VelocityCommand) -> MotorStatus:
         raise LateReplyError("motor on /dev/x gave no answer")
 
@@ -306,66 +306,66 @@ def test_a_late_answer_does_not_hide_that_the_wheels_still_turn(driving: Bench) 
     assert driving.last.velocity_mps == pytest.approx(0.3 - 2 * LIMITS.deceleration_mps2 * PERIOD_S)
 
 
-def test_a_controller_that_stopped_by_itself_starts_from_a_stand(driving: Bench) -> None:
+def test_starts_from_a_stop_where_the_motor_controller_had_stopped_by_itself(driving: Bench) -> None:
     driving.wheels.expired = True
-    both(driving)
+    send_both(driving)
     driving.tick()
     driving.wheels.expired = False
-    both(driving)
+    send_both(driving)
     driving.tick()
     assert is_stop(driving.last) and driving.controller.state.stops == {safety_rules.STOPPED: 1}
     assert driving.controller.state.expiries == 1
-    both(driving)
+    send_both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9
 
 
-def test_the_heading_is_held_in_odom(bench: Bench) -> None:
-    bench.see(0.5)
-    bench.ask(Setpoint(0.2, 1.0))
+def test_holds_the_heading_in_odom(bench: Bench) -> None:
+    bench.send_pose(0.5)
+    bench.send_setpoint(Setpoint(0.2, 1.0))
     bench.tick()
     assert bench.last.yaw_rate_radps > 0.0
-    bench.see(1.5)
+    bench.send_pose(1.5)
     for _ in range(5):
-        bench.ask(Setpoint(0.2, 1.0))
+        bench.send_setpoint(Setpoint(0.2, 1.0))
         bench.tick()
     assert bench.last.yaw_rate_radps < 0.0
 
 
-def test_a_base_that_turns_is_where_it_turns_to(bench: Bench) -> None:
+def test_extrapolates_the_heading_of_a_base_that_turns(bench: Bench) -> None:
     """The pose is 0.4 s old, meanwhile the base has turned from 0 to 0.4 rad: past the goal."""
-    bench.see(0.0, rate_radps=1.0, age_s=0.4 - PERIOD_S)
-    bench.ask(Setpoint(0.2, 0.2))
+    bench.send_pose(0.0, rate_radps=1.0, age_s=0.4 - PERIOD_S)
+    bench.send_setpoint(Setpoint(0.2, 0.2))
     bench.tick()
     assert bench.last.yaw_rate_radps < 0.0
 
 
-def test_a_controller_that_steers_is_told_headings_in_its_own_count(bench: Bench) -> None:
+def test_sends_headings_in_the_motor_controllers_own_count(bench: Bench) -> None:
     bench.wheels.heading_rad = -2.0  # while the base stands at 0.5 rad in odom
-    bench.see(0.5)
+    bench.send_pose(0.5)
     bench.tick()
-    bench.see(0.5)
-    bench.ask(Setpoint(0.2, 0.8))
+    bench.send_pose(0.5)
+    bench.send_setpoint(Setpoint(0.2, 0.8))
     bench.tick()
     assert bench.last.heading_rad == pytest.approx(-2.0 + 0.3)
-    bench.wheels.heading_rad = -1.95  # its count drifts: odometry has the last word
+    bench.wheels.heading_rad = -1.95  # its count drifts: odometry corrects it
     for _ in range(2):
-        bench.see(0.5)
-        bench.ask(Setpoint(0.2, 0.8))
+        bench.send_pose(0.5)
+        bench.send_setpoint(Setpoint(0.2, 0.8))
         bench.tick()
     assert bench.last.heading_rad == pytest.approx(-1.95 + 0.3)
 
 
-def test_while_it_slows_down_a_controller_that_steers_keeps_its_heading(bench: Bench) -> None:
-    """It must not be sent to heading 0 of odom, nor on to a goal that is void."""
+def test_keeps_the_motor_controllers_heading_while_it_slows_down(bench: Bench) -> None:
+    """The goal must be neither heading 0 of odom nor that of a void setpoint."""
     bench.wheels.heading_rad = 1.0
     for _ in range(20):
-        bench.see(1.0)
-        bench.ask(Setpoint(0.3, 2.0))
+        bench.send_pose(1.0)
+        bench.send_setpoint(Setpoint(0.3, 2.0))
         bench.tick()
     bench.stop()
     bench.now_ns += 1
-    bench.see(1.0)
+    bench.send_pose(1.0)
     bench.tick()
     assert bench.last.velocity_mps > 0.0 and bench.last.heading_rad == pytest.approx(1.0)
 
@@ -381,10 +381,10 @@ def real_controller(twin: SimulatedMotor) -> Iterator[Controller]:
 
 
 def run_until(controller: Controller, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
-    """Ticks with the twin's own heading as the pose, in odom 0.7 rad further."""
+    """Tick with the simulated base's heading as the pose; headings in odom are 0.7 rad larger."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
-        assert time.monotonic() < deadline_s, "it did not happen"
+        assert time.monotonic() < deadline_s, "timeout"
         state = twin.base
         controller.set_pose(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
         controller.set_command(TimedSetpoint(time.monotonic_ns(), setpoint))
@@ -393,8 +393,8 @@ def run_until(controller: Controller, twin: SimulatedMotor, setpoint: Setpoint, 
 
 
 @pytest.mark.parametrize("setpoint", [Setpoint(0.1, 1.1), Setpoint(0.1, None, 0.4), Setpoint(0.0, None, 0.4)])
-def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoint) -> None:
-    """The line protocol's own heading hold gets headings in its count; odom's differ by 0.7 rad."""
+def test_a_simulated_motor_that_holds_headings_follows_headings_and_rates(setpoint: Setpoint) -> None:
+    """The line protocol's own heading controller gets headings in its count, 0.7 rad less than those in odom."""
     with contextlib.closing(SimulatedMotor()) as twin, real_controller(twin) as controller:
         if setpoint.heading_rad is not None:
             goal_rad = setpoint.heading_rad - 0.7
@@ -407,32 +407,32 @@ def test_a_twin_that_steers_by_itself_obeys_headings_and_rates(setpoint: Setpoin
         while not (is_stop(twin.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
             controller.tick()
             time.sleep(0.02)
-        assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not go on to where nobody wants it any more"
+        assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not turn on to the void goal"
 
 
-def test_at_the_end_the_wheels_slow_down_whatever_is_asked(driving: Bench) -> None:
+def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
     driving.controller.end()
     assert not driving.controller.stands
-    slows_down(driving, lambda: both(driving))
+    slows_down(driving, lambda: send_both(driving))
     assert driving.controller.stands and driving.controller.state.reason == safety_rules.ENDS
 
 
-def test_a_controller_that_fails_needs_no_ramp(driving: Bench) -> None:
+def test_needs_no_ramp_where_the_motor_controller_failed(driving: Bench) -> None:
     driving.wheels.silent = True
     driving.tick()
     assert driving.controller.stands
 
 
-def test_what_a_tick_came_to(driving: Bench) -> None:
-    """A pose counts once on its way to the wheels; what is not sent is not told."""
-    driving.see(age_s=0.01)
+def test_reports_each_tick(driving: Bench) -> None:
+    """The latency of a pose is reported once; a command that was not answered is not reported."""
+    driving.send_pose(age_s=0.01)
     driving.now_ns += PERIOD_NS
     tick = driving.controller.tick()
     assert tick.command == driving.last and tick.to_wheel_s == pytest.approx(0.06)
     driving.now_ns += PERIOD_NS
     assert math.isnan(driving.controller.tick().to_wheel_s)
     driving.wheels.silent = True
-    driving.see()
+    driving.send_pose()
     driving.now_ns += 4 * PERIOD_NS
     tick = driving.controller.tick()
     assert tick.command is None and math.isnan(tick.to_wheel_s)
@@ -440,18 +440,18 @@ def test_what_a_tick_came_to(driving: Bench) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_comes_no_limit_breaks_and_nothing_moves_unasked(seed: int) -> None:
+def test_never_exceeds_a_limit_or_moves_without_a_setpoint(seed: int) -> None:
     """1,000 ticks each of random poses, commands, stops, pauses and failures."""
     rng, bench = random.Random(seed), Bench()
-    asked = False  # a command has come since the last stop
-    spoken = last = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)
+    asked = False  # a setpoint has come since the last stop
+    previous = last = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)
     for _ in range(1000):
         bench.now_ns += rng.randrange(1, 1000)
         if rng.random() < 0.9:
-            bench.see(rng.uniform(-4, 4), state=rng.choice(["tracking"] * 20 + ["degraded", "lost"]),
+            bench.send_pose(rng.uniform(-4, 4), state=rng.choice(["tracking"] * 20 + ["degraded", "lost"]),
                       rate_radps=rng.uniform(-2, 2), age_s=rng.choice([0.0, 0.1, 0.1, rng.uniform(-1, 1)]))
         if rng.random() < 0.5:
-            bench.ask(Setpoint(rng.choice([math.nan, math.inf, *(rng.uniform(-3, 3) for _ in range(20))]),
+            bench.send_setpoint(Setpoint(rng.choice([math.nan, math.inf, *(rng.uniform(-3, 3) for _ in range(20))]),
                                rng.choice([None, None, rng.uniform(-9, 9), math.nan]), rng.uniform(-5, 5)))
             asked = True
         if rng.random() < 0.03:
@@ -459,21 +459,21 @@ def test_whatever_comes_no_limit_breaks_and_nothing_moves_unasked(seed: int) -> 
             bench.stop()
             asked = False
         bench.wheels.silent, bench.wheels.expired = rng.random() < 0.02, rng.random() < 0.02
-        count = len(bench.wheels.told)
+        count = len(bench.wheels.commands)
         bench.tick(late_s=rng.choice([0.0] * 30 + [0.1, 0.5]))
         asked = asked and not bench.controller.state.reason
-        if len(bench.wheels.told) == count or bench.wheels.expired:
-            spoken = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)  # the controller stands, or will
-            asked = asked and len(bench.wheels.told) > count
-        last, before = bench.last if len(bench.wheels.told) > count else spoken, spoken
-        if len(bench.wheels.told) > count:
-            breaks_no_limit(before if not bench.wheels.expired else None, last)
+        if len(bench.wheels.commands) == count or bench.wheels.expired:
+            previous = VelocityCommand(bench.now_ns, 0.0, 0.0, 0.0)  # the motor controller stands, or will
+            asked = asked and len(bench.wheels.commands) > count
+        last, before = bench.last if len(bench.wheels.commands) > count else previous, previous
+        if len(bench.wheels.commands) > count:
+            exceeds_no_limit(before if not bench.wheels.expired else None, last)
             assert asked or slows(before, last) or bench.wheels.expired, (before, last)
-            spoken = spoken if bench.wheels.expired else last
-    assert any(not is_stop(command) for command in bench.wheels.told), "it drove at all"
+            previous = previous if bench.wheels.expired else last
+    assert any(not is_stop(command) for command in bench.wheels.commands), "it drove"
 
 
-def breaks_no_limit(before: VelocityCommand | None, now: VelocityCommand) -> None:
+def exceeds_no_limit(before: VelocityCommand | None, now: VelocityCommand) -> None:
     assert all(map(math.isfinite, (now.velocity_mps, now.heading_rad, now.yaw_rate_radps)))
     assert abs(now.velocity_mps) <= LIMITS.velocity_mps and abs(now.yaw_rate_radps) <= LIMITS.yaw_rate_radps
     if before is None:
@@ -487,7 +487,7 @@ def breaks_no_limit(before: VelocityCommand | None, now: VelocityCommand) -> Non
 
 
 def slows(before: VelocityCommand, now: VelocityCommand) -> bool:
-    """Whether a motion is a stop or on the way to one."""
+    """True if a motion is a stop or on the way to one."""
     def nearer(a: float, b: float) -> bool:
         return abs(b) <= abs(a) and a * b >= 0
 

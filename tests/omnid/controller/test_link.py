@@ -1,4 +1,4 @@
-"""The process that steers, seen from the daemon: a real one, on a twin behind a real pty."""
+"""The controller process, seen from the daemon: a real one, with a simulated motor behind a real pty."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
 
 
 class Robot:
-    """A link, and a thread that reads what the wheels are told."""
+    """A link, and a thread that reads the commands to the wheels."""
 
     def __init__(self, base: Base) -> None:
         self.base = base
-        self.told: list[VelocityCommand] = []
-        self.said: list[str] = []
+        self.commands: list[VelocityCommand] = []
+        self.lines: list[str] = []
         self.error: OmnidError | None = None
         self.stats = StageStats("motor")
-        self.link = ControllerLink(start_message(base.port), self.stats, self.said.append)
+        self.link = ControllerLink(start_message(base.port), self.stats, self.lines.append)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
@@ -63,10 +63,10 @@ class Robot:
         return self.link._process.pid
 
     def drive(self) -> None:
-        """Until it moves; asked again and again, for on a busy machine an answer may be late, which stops it."""
-        wait_until(lambda: self._asked() and self.base.line.base.velocity_mps > 0.38, "motion")
+        """Send poses and setpoints until it moves: on a busy machine an answer may be late, which stops it."""
+        wait_until(lambda: self._sent() and self.base.line.base.velocity_mps > 0.38, "motion")
 
-    def _asked(self) -> bool:
+    def _sent(self) -> bool:
         self.link.send_pose(pose())
         self.link.send_setpoint(AHEAD, time.monotonic_ns())
         return True
@@ -77,7 +77,7 @@ class Robot:
 
     def _read(self) -> None:
         try:
-            self.told.extend(self.link.commands())
+            self.commands.extend(self.link.commands())
         except OmnidError as error:
             self.error = error
 
@@ -97,25 +97,25 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 
 def slowed_down(base: Base) -> None:
-    """The wheels were told ever lower speeds, not to stand at once."""
+    """Expect commands of ever lower speeds, not a stop at once."""
     speeds = [note.wheels_mps[0] for note in base.line.notes]
     top = max(index for index, speed in enumerate(speeds) if speed == max(speeds))
     ramp = speeds[top:]
     assert ramp[-1] == 0.0 and len(set(ramp)) > 3 and all(a >= b for a, b in pairwise(ramp)), ramp
 
 
-def test_poses_and_commands_turn_the_wheels_and_the_book_is_kept(robot: Robot) -> None:
+def test_poses_and_setpoints_turn_the_wheels_and_each_tick_is_counted(robot: Robot) -> None:
     robot.drive()
-    book = robot.link.statistics
-    wait_until(lambda: book.state.sent > 5 and book.to_wheel.count >= 1, "an entry")
+    statistics = robot.link.statistics
+    wait_until(lambda: statistics.state.sent > 5 and statistics.to_wheel.count >= 1, "a report")
     assert robot.stats.processed > 5 and robot.stats.busy_since_ns > 0
     robot.link.stop()
     wait_until(lambda: not robot.base.drives, "the stop")
-    wait_until(lambda: book.state.stops[safety_rules.ASKED] == 1, "its count")
-    assert "the wheels stop: a stop was asked for" in robot.said
+    wait_until(lambda: statistics.state.stops[safety_rules.ASKED] == 1, "its count")
+    assert "the wheels stop: a stop was asked for" in robot.lines
     robot.link.end()
     robot.joined()
-    assert robot.told[-1].velocity_mps == 0.0 and max(command.velocity_mps for command in robot.told) > 0.38
+    assert robot.commands[-1].velocity_mps == 0.0 and max(command.velocity_mps for command in robot.commands) > 0.38
     assert robot.error is None and robot.stats.busy_since_ns == 0
 
 
@@ -125,7 +125,7 @@ def test_the_running_process_has_no_perception_in_its_memory(robot: Robot) -> No
     assert "python" in maps and "numpy" not in maps and "cv2" not in maps
 
 
-def test_at_the_end_the_wheels_slow_down(robot: Robot) -> None:
+def test_slows_down_at_the_end(robot: Robot) -> None:
     robot.drive()
     robot.link.end()
     robot.joined()
@@ -135,38 +135,38 @@ def test_at_the_end_the_wheels_slow_down(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGABRT])
-def test_signals_for_the_daemon_do_not_end_it(robot: Robot, number: int) -> None:
+def test_survives_signals_that_end_the_daemon(robot: Robot, number: int) -> None:
     robot.drive()
     os.kill(robot.pid, number)
     count = robot.link.statistics.state.sent
     wait_until(lambda: robot.link.statistics.state.sent > count + 5, "more ticks")
 
 
-def test_a_process_that_is_killed_ends_the_run(robot: Robot) -> None:
+def test_raises_where_the_process_was_killed(robot: Robot) -> None:
     robot.drive()
     os.kill(robot.pid, signal.SIGKILL)
     robot.joined()
     assert robot.error is not None and "exit code -9" in str(robot.error) and "\n" not in str(robot.error)
-    robot.link.stop()  # whoever does not know it yet
+    robot.link.stop()  # from threads that do not know it yet
     robot.link.send_pose(pose())
 
 
-def test_a_stop_arrives_though_the_line_was_full(robot: Robot) -> None:
-    """The process gets no processor for a while; what is too much for the line is lost, a stop is not."""
+def test_a_stop_arrives_although_the_channel_was_full(robot: Robot) -> None:
+    """The process gets no processor for a while: messages beyond the channel's capacity are lost, a stop is not."""
     robot.drive()
     os.kill(robot.pid, signal.SIGSTOP)
     while not robot.link._channel.lost:
         robot.link.send_setpoint(AHEAD, time.monotonic_ns())
     robot.link.stop()
-    assert robot.link._channel.lost >= 2, "it went the way of the commands"
+    assert robot.link._channel.lost >= 2, "its own message was lost"
     os.kill(robot.pid, signal.SIGCONT)
-    wait_until(lambda: robot.link._channel.lost and _says_pose(robot), "the line's room")
+    wait_until(lambda: robot.link._channel.lost and _sends_pose(robot), "room in the channel")
     wait_until(lambda: not robot.base.drives, "the stop")
     assert robot.link.statistics.state.stops[safety_rules.ASKED] == 1
 
 
-def _says_pose(robot: Robot) -> bool:
-    """Whether a pose went through."""
+def _sends_pose(robot: Robot) -> bool:
+    """True if the channel took a pose."""
     lost = robot.link._channel.lost
     robot.link.send_pose(pose())
     return robot.link._channel.lost == lost
@@ -183,20 +183,20 @@ while True:
 """
 
 
-def test_when_the_daemon_is_killed_the_wheels_slow_down(tmp_path: Path) -> None:
+def test_slows_down_when_the_daemon_is_killed(tmp_path: Path) -> None:
     with contextlib.closing(Base(tmp_path)) as base:
         command = [sys.executable, "-c", OWNER, str(base.port)]
         with subprocess.Popen(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}) as owner:
             wait_until(lambda: base.line.base.velocity_mps > 0.38 or owner.poll() is not None, "motion")
             owner.kill()
-        wait_until(lambda: not base.drives and base.line.notes[-1].wheels_mps == (0.0, 0.0), "the stand")
+        wait_until(lambda: not base.drives and base.line.notes[-1].wheels_mps == (0.0, 0.0), "the stop")
         slowed_down(base)
-        assert not base.twin.watchdog_expired, "the process did it, not the controller"
+        assert not base.twin.watchdog_expired, "the process stopped it, not the watchdog"
         wait_until(lambda: not _has_open(base), "the end of the process")
 
 
 def _has_open(base: Base) -> bool:
-    """Whether some other process holds the controller's port."""
+    """True if another process has the port open."""
     port = base.port.resolve()
     for folder in Path("/proc").glob("[0-9]*/fd"):
         if folder.parent.name != str(os.getpid()):
@@ -206,7 +206,7 @@ def _has_open(base: Base) -> bool:
     return False
 
 
-def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kills_a_process_that_does_not_end(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("omnid.controller.link.END_S", 0.5)
     os.kill(robot.pid, signal.SIGSTOP)
     robot.link.end()
@@ -215,6 +215,6 @@ def test_a_process_that_is_stuck_is_killed_at_the_end(robot: Robot, monkeypatch:
     assert robot.link._process.returncode == -signal.SIGKILL and robot.error is None
 
 
-def test_a_port_that_is_not_there_gives_the_drivers_own_line() -> None:
+def test_raises_the_drivers_error_where_the_port_does_not_exist() -> None:
     with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
         ControllerLink(start_message("/dev/nothing"), StageStats("motor"), print)

@@ -1,4 +1,4 @@
-"""The motor of the configuration: its protocol's twin, and settings that cannot work."""
+"""The motor of the settings: the simulation of its protocol, and settings that cannot work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLOW_HZ = 1.0  # so that a machine under load has a second to answer
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_every_protocol_can_be_simulated(protocol: str) -> None:
+def test_simulates_every_protocol(protocol: str) -> None:
     drive = DriveSettings(track_m=0.5, reverse_right=True)
     config = MotorSettings(port="simulated", protocol=protocol, rate_hz=SLOW_HZ, watchdog_ms=5000, drive=drive)
     with ExitStack() as closing:
@@ -29,11 +29,11 @@ def test_every_protocol_can_be_simulated(protocol: str) -> None:
     assert twin.base.commanded_mps == [0.0, 0.0], "closing stops the wheels"
 
 
-def test_a_watchdog_of_fewer_than_four_ticks_is_refused() -> None:
+def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
     with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
         open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
 
 
-def test_the_drive_comes_from_its_section() -> None:
+def test_reads_the_drive_from_its_section() -> None:
     config = parse(Config, b"[motor.drive]\ntrack_m = 0.62\nreverse_left = true\ncan_id = 7", origin="test")
     assert config.motor.drive == DriveSettings(track_m=0.62, reverse_left=True, can_id=7)

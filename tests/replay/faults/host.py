@@ -52,7 +52,7 @@ def steering_killed(place: Place) -> Outcome:
         _, err = daemon.process.communicate(timeout=PATIENCE_S)
         assert daemon.process.returncode == 2 and "Traceback" not in err, err
         wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
-    said = next(line for line in err.splitlines() if "steers" in line)
+    said = next(line for line in err.splitlines() if "controller process" in line)
     return Outcome("one line, exit 2", "the controller's watchdog", said)
 
 

@@ -1,4 +1,4 @@
-"""The last-line limiter: no sequence of anything gets a command past the limits."""
+"""The velocity limits: no sequence of inputs gives a command beyond them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from omnid.errors import OmnidError
 
 LIMITS = VelocityLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
                        yaw_acceleration_radps2=3.0)  # fmt: skip
-ODD = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-9)
+EXTREMES = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-9)
 SLACK = 1 + 1e-9
 
 
-def anything(rng: random.Random) -> float:
-    return rng.choice(ODD) if rng.random() < 0.3 else rng.gauss(0.0, rng.choice([0.1, 1.0, 10.0]))
+def any_number(rng: random.Random) -> float:
+    return rng.choice(EXTREMES) if rng.random() < 0.3 else rng.gauss(0.0, rng.choice([0.1, 1.0, 10.0]))
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_no_output_ever_breaks_a_limit(seed: int) -> None:
+def test_never_exceeds_a_limit(seed: int) -> None:
     rng, sent = random.Random(seed), STOP
     for _ in range(5000):
-        wanted = Twist(anything(rng), anything(rng))
-        dt_s = abs(rng.gauss(0.05, 0.05)) if rng.random() < 0.8 else anything(rng)
+        wanted = Twist(any_number(rng), any_number(rng))
+        dt_s = abs(rng.gauss(0.05, 0.05)) if rng.random() < 0.8 else any_number(rng)
         last, sent = sent, LIMITS.step(wanted, sent, dt_s)
         assert_within(last, sent, dt_s)
 
@@ -45,14 +45,14 @@ def assert_within(last: Twist, sent: Twist, dt_s: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_whatever_came_before_the_output_is_finite_and_bounded(seed: int) -> None:
+def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
     rng = random.Random(seed)
     for _ in range(3000):
-        sent = LIMITS.step(*(Twist(anything(rng), anything(rng)) for _ in range(2)), anything(rng))
+        sent = LIMITS.step(*(Twist(any_number(rng), any_number(rng)) for _ in range(2)), any_number(rng))
         assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
 
 
-def test_gets_there_and_stays() -> None:
+def test_reaches_the_wanted_motion_and_keeps_it() -> None:
     sent = STOP
     for _ in range(100):
         sent = LIMITS.step(Twist(0.7, -1.2), sent, 0.05)
@@ -60,7 +60,7 @@ def test_gets_there_and_stays() -> None:
 
 
 @pytest.mark.parametrize("wanted", [STOP, Twist(math.nan, 1.0), Twist(1.0, math.inf), Twist(-math.inf, 0.0)])
-def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Twist) -> None:
+def test_stops_within_the_deceleration(wanted: Twist) -> None:
     sent, speeds = Twist(0.8, 1.0), [0.8]
     while sent != STOP:
         sent = LIMITS.step(wanted, sent, 0.1)
@@ -68,17 +68,17 @@ def test_a_stop_is_slowed_down_within_the_deceleration(wanted: Twist) -> None:
     assert speeds[:5] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
 
 
-def test_reversing_stops_first_and_then_gathers_speed() -> None:
+def test_brakes_to_zero_before_it_accelerates_backwards() -> None:
     assert LIMITS.step(Twist(-0.8, 0.0), Twist(0.1, 0.0), 0.1).velocity_mps == pytest.approx(-0.5 * 0.05)
     assert LIMITS.step(Twist(0.8, 0.0), Twist(-0.1, 0.0), 0.1).velocity_mps == pytest.approx(0.5 * 0.05)
 
 
-def test_no_time_means_no_change() -> None:
+def test_changes_nothing_in_no_time() -> None:
     for dt_s in (0.0, -1.0, math.nan, math.inf):
         assert LIMITS.step(Twist(0.5, 0.5), Twist(0.2, 0.1), dt_s) == Twist(0.2, 0.1)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_limits_must_make_sense(bad: float) -> None:
+def test_refuses_limits_that_are_not_finite_and_above_zero(bad: float) -> None:
     with pytest.raises(OmnidError, match="deceleration_mps2"):
         VelocityLimits(deceleration_mps2=bad)
