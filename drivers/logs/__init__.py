@@ -1,1 +1,1 @@
-"""Logs: MCAP files read, written, repaired and rotated."""
+"""Logs: reading, writing, recovery and rotation of MCAP files."""

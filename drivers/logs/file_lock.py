@@ -1,4 +1,4 @@
-"""Whether a program is writing a file at this moment: it holds an advisory lock, which its death gives back."""
+"""Advisory locks that mark a file as being written; the kernel releases them when the program ends."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import IO
 
 
 def lock(file: IO[bytes]) -> None:
-    """Marks the open file as being written until it is closed; without effect where the file system has no locks."""
+    """Mark an open file as being written until it is closed; without effect where the file system has no locks."""
     with suppress(OSError):
         fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_locked(path: str | os.PathLike[str]) -> bool:
-    """Whether somebody writes the file, this program included; false where it cannot be opened."""
+    """True if a program, this one included, is writing the file; False where it cannot be opened."""
     if not Path(path).is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""What the end and the start of an MCAP log tell without its messages: topics, message counts, attachments."""
+"""The summary at the end of an MCAP log: topics, message counts, attachments."""
 
 from __future__ import annotations
 
@@ -28,22 +28,24 @@ from drivers.logs.mcap_records import (
 MAX_ATTACHMENT_BYTES = 16 * 2**20
 MAX_ATTACHMENTS = 32
 _MAX_SUMMARY_BYTES = 64 * 2**20
-_MAX_NAME = 256
+_MAX_NAME = 256  # characters
+_MAX_ATTACHMENT_HEAD_BYTES = 1024  # times, name and media type of an attachment
+_CRC_BYTES = 4
 
 _FOOTER = struct.Struct("<QQI")  # summary start, summary offset start, CRC of the summary and of the footer before it
 
 
 @dataclass(frozen=True, slots=True)
 class LogSummary:
-    """The end of a whole log: what is in it and where."""
+    """The summary of a complete log."""
 
     catalog: Catalog
     message_counts: Mapping[int, int]  # by channel
-    attachments: tuple[int, ...] = field(repr=False)  # where their records start
+    attachments: tuple[int, ...] = field(repr=False)  # offsets of their records
 
 
 def read_summary(file: LogFile) -> LogSummary | None:
-    """The log's summary, None where the file is cut, was written without one, or the summary's CRC is wrong."""
+    """Return the summary of a log, None where the file is truncated, has no summary, or the summary's CRC is wrong."""
     section = summary_section(file)
     if section is None:
         return None
@@ -64,7 +66,7 @@ def read_summary(file: LogFile) -> LogSummary | None:
 
 
 def has_footer(file: LogFile) -> bool:
-    """Whether the file ends the way a whole log does."""
+    """True if the file ends with the footer of a complete log."""
     return _footer(file) is not None
 
 
@@ -77,7 +79,7 @@ def _footer(file: LogFile) -> bytes | None:
 
 
 def summary_section(file: LogFile) -> ByteBuffer | None:
-    """The records at the end of the log, None where read_summary would give none."""
+    """Return the records of the summary, None where read_summary returns None."""
     footer = _footer(file)
     if footer is None:
         return None
@@ -86,19 +88,19 @@ def summary_section(file: LogFile) -> ByteBuffer | None:
     if not start or not 0 < size <= _MAX_SUMMARY_BYTES:
         return None
     section = file.read(start, size)
-    if len(section) < size or (crc and zlib.crc32(section + footer[:-4]) != crc):
+    if len(section) < size or (crc and zlib.crc32(section + footer[:-_CRC_BYTES]) != crc):
         return None
     return ByteBuffer(section)
 
 
 def read_attachments(file: LogFile, summary: LogSummary | None) -> dict[str, bytes]:
-    """Name -> bytes of the attachments that are whole and within the limits; without a summary, those at the start."""
+    """Return name -> bytes of the valid attachments within the limits; without a summary, those before the messages."""
     found: dict[str, bytes] = {}
-    places = records(file, len(MAGIC), file.size) if summary is None else _records_at(file, summary.attachments)
-    for record in places:
+    indexed = None if summary is None else _records_at(file, summary.attachments)
+    for record in indexed or records(file, len(MAGIC), file.size):
         if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END) or len(found) >= MAX_ATTACHMENTS:
             break
-        if record.opcode == Opcode.ATTACHMENT and record.size <= MAX_ATTACHMENT_BYTES + 1024:
+        if record.opcode == Opcode.ATTACHMENT and record.size <= MAX_ATTACHMENT_BYTES + _MAX_ATTACHMENT_HEAD_BYTES:
             found.update(_attachment(file, record))
     return found
 
@@ -111,12 +113,13 @@ def _records_at(file: LogFile, offsets: tuple[int, ...]) -> Iterator[Record]:
 
 
 def _attachment(file: LogFile, record: Record) -> dict[str, bytes]:
+    """Return name -> bytes of one attachment, empty where it is malformed, too large or its CRC is wrong."""
     try:
         body = read_content(file, record)
         attachment = Attachment.read(parser(body))
     except (RecordError, *PARSE_ERRORS):
         return {}
-    crc = int.from_bytes(body[-4:], "little")
-    if (crc and zlib.crc32(body[:-4]) != crc) or len(attachment.data) > MAX_ATTACHMENT_BYTES:
+    crc = int.from_bytes(body[-_CRC_BYTES:], "little")
+    if (crc and zlib.crc32(body[:-_CRC_BYTES]) != crc) or len(attachment.data) > MAX_ATTACHMENT_BYTES:
         return {}
     return {attachment.name[:_MAX_NAME]: attachment.data}

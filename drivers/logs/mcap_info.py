@@ -1,4 +1,4 @@
-"""What is in an MCAP log, of whatever make and in whatever state: topics, times, sizes, and whether it is whole."""
+"""Contents of an MCAP log from any writer, complete or damaged: topics, times, sizes, state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivers.logs.mcap_records import MAGIC, PARSE_ERRORS, LogFile, RecordError,
 
 
 class LogState(Enum):
-    """How a log is."""
+    """State of a log file; the values are shown to the user."""
 
     WHOLE = "whole"
     WRITTEN = "being written"
@@ -30,35 +30,36 @@ class LogState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """What a log holds."""
+    """Contents of a log."""
 
     path: Path
-    size: int  # bytes
+    size_bytes: int
     state: LogState
-    read: int  # bytes, up to where it is whole
-    broken: int  # chunks and records within that are corrupt; of a whole log only its outline is looked at
-    topics: Mapping[str, tuple[str, int]]  # topic -> type, '' where it is not CDR, and number of messages
-    span_ns: tuple[int, int] | None  # of the times of logging; None without messages
-    attachments: Mapping[str, int]  # name -> bytes; those that can be read, up to 32
+    readable_bytes: int  # length up to which the file could be read
+    broken: int  # corrupt chunks and records in that length; of a log with an index the chunks are not checked
+    topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it is not CDR), number of messages
+    span_ns: tuple[int, int] | None  # first and last log time; None without messages
+    attachments: Mapping[str, int]  # name -> bytes of the readable ones, up to 32
 
     @property
     def messages(self) -> int:
-        """How many there are."""
+        """Number of messages of all topics."""
         return sum(count for _, count in self.topics.values())
 
 
 def read_log_info(path: str | os.PathLike[str]) -> LogInfo:
-    """What a log holds; one without an index is read through. DriverError where there is none."""
-    written = is_locked(path)  # before it is looked at: it may end meanwhile
+    """Return the contents of a log; a log without an index is read to its end. Raise DriverError where there is no log.
+    """
+    locked = is_locked(path)  # before it is read: the writer may end in the meantime
     file = LogFile(path)
     try:
-        return _of_index(file, written) or _of_messages(file, written)
+        return _from_index(file, locked) or _from_messages(file, locked)
     finally:
         file.close()
 
 
-def _of_index(file: LogFile, written: bool) -> LogInfo | None:
-    """From the summary of a log that holds together to its end; None where there is no such summary."""
+def _from_index(file: LogFile, locked: bool) -> LogInfo | None:
+    """Return the contents by the summary; None without a summary, or where the data section has no end."""
     summary, statistics = read_summary(file), _statistics(file)
     if summary is None or statistics is None:
         return None
@@ -67,11 +68,12 @@ def _of_index(file: LogFile, written: bool) -> LogInfo | None:
     span_ns = (statistics.message_start_time, statistics.message_end_time) if statistics.message_count else None
     topics = _by_topic(summary.catalog, Counter(summary.message_counts))
     attachments = {name: len(data) for name, data in read_attachments(file, summary).items()}
-    state = LogState.WRITTEN if written else LogState.WHOLE
+    state = LogState.WRITTEN if locked else LogState.WHOLE
     return LogInfo(file.path, file.size, state, file.size, 0, topics, span_ns, attachments)
 
 
 def _statistics(file: LogFile) -> Statistics | None:
+    """Return the statistics record of the summary, None without one."""
     section = summary_section(file)
     if section is not None:
         for record in records(section, 0, section.size):
@@ -84,21 +86,23 @@ def _statistics(file: LogFile) -> Statistics | None:
     return None
 
 
-def _of_messages(file: LogFile, written: bool) -> LogInfo:
+def _from_messages(file: LogFile, locked: bool) -> LogInfo:
+    """Return the contents by reading all messages."""
     section, counts = DataSection(file, Catalog()), Counter[int]()
     first_ns, last_ns = 2**64, -1
     for message in section.messages():
         counts[message.channel_id] += 1
         first_ns, last_ns = min(first_ns, message.log_time_ns), max(last_ns, message.log_time_ns)
-    whole = section.ended and has_footer(file) and not section.broken
-    state = LogState.WRITTEN if written else LogState.UNINDEXED if whole else LogState.BROKEN
+    complete = section.ended and has_footer(file) and not section.broken
+    unlocked = LogState.UNINDEXED if complete else LogState.BROKEN
+    state = LogState.WRITTEN if locked else unlocked
     span_ns = (first_ns, last_ns) if last_ns >= 0 else None
     attachments = {name: len(data) for name, data in read_attachments(file, None).items()}
     topics = _by_topic(section.catalog, counts)
-    return LogInfo(file.path, file.size, state, section.at, section.broken, topics, span_ns, attachments)
+    return LogInfo(file.path, file.size, state, section.position, section.broken, topics, span_ns, attachments)
 
 
 def _by_topic(catalog: Catalog, counts: Counter[int]) -> dict[str, tuple[str, int]]:
-    """Messages of channels that nobody defined are left out: nothing can be made of them."""
+    """Return topic -> type and number of messages; messages of undefined channels are left out."""
     return {name: (kind, sum(counts[channel] for channel in catalog.ids(name)))
             for name, kind in sorted(catalog.topics().items())}

@@ -24,38 +24,39 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 class LogMessage(NamedTuple):
-    """A message not yet read: where its bytes are."""
+    """A message whose data is not yet read."""
 
     channel_id: int
     log_time_ns: int
     source: ByteSource
-    record: Record
+    record: Record  # position of the data in the source
 
     def data(self) -> memoryview:
+        """Read the data; raise RecordError where it is not complete."""
         return read_content(self.source, self.record)
 
 
 class DataSection:
-    """The messages of a log in file order, whose definitions it adds to the catalog on the way.
+    """The messages of a log in file order; their channels and schemas are added to the catalog.
 
-    What cannot be read is skipped and counted in broken; at is the byte of the file reached, and ended tells, once the
-    messages are through, whether that was the section's proper end.
+    limit_bytes: offset at which reading stops, by default the end of the file.
     """
 
-    def __init__(self, file: LogFile, catalog: Catalog, stop: int | None = None) -> None:
+    def __init__(self, file: LogFile, catalog: Catalog, limit_bytes: int | None = None) -> None:
         self._file = file
-        self._stop = file.size if stop is None else stop
+        self._limit_bytes = file.size if limit_bytes is None else limit_bytes
         self.catalog = catalog
-        self.ended = False
-        self.broken = 0
-        self.at = len(MAGIC)
+        self.ended = False  # True after the section's proper end was read
+        self.broken = 0  # chunks and records that were skipped, as they cannot be read
+        self.position = len(MAGIC)  # offset up to which the file was read
 
     def messages(self) -> Iterator[LogMessage]:
+        """Yield all readable messages."""
         for record in records(self._file, len(MAGIC), self._file.size):
-            if record.opcode == Opcode.DATA_END or record.at > self._stop:
+            if record.opcode == Opcode.DATA_END or record.offset > self._limit_bytes:
                 self.ended = record.opcode == Opcode.DATA_END
                 return
-            self.at = record.at + record.size
+            self.position = record.offset + record.size
             if record.opcode == Opcode.CHUNK:
                 yield from self._chunk(record)
             else:
@@ -69,7 +70,7 @@ class DataSection:
             return
         end = 0
         for inner in records(chunk, 0, chunk.size):
-            end = inner.at + inner.size
+            end = inner.offset + inner.size
             yield from self._single(chunk, inner)
         self.broken += end != chunk.size
 
@@ -85,16 +86,16 @@ class DataSection:
 
 def _message(source: ByteSource, record: Record) -> LogMessage:
     try:
-        channel_id, _, log_time_ns, _ = _MESSAGE.unpack(source.read(record.at, min(record.size, _MESSAGE.size)))
+        channel_id, _, log_time_ns, _ = _MESSAGE.unpack(source.read(record.offset, min(record.size, _MESSAGE.size)))
     except struct.error as error:
         raise RecordError(f"a message record of {record.size} bytes is too short") from error
-    rest = Record(record.opcode, record.at + _MESSAGE.size, record.size - _MESSAGE.size)
+    rest = Record(record.opcode, record.offset + _MESSAGE.size, record.size - _MESSAGE.size)
     return LogMessage(channel_id, log_time_ns, source, rest)
 
 
 def scan_channels(file: LogFile, limit_bytes: int, limit_messages: int) -> Catalog:
-    """The channels that the start of a log mentions, for logs without a summary."""
-    section = DataSection(file, Catalog(), stop=limit_bytes)
+    """Return the channels that are defined at the start of a log, for logs without a summary."""
+    section = DataSection(file, Catalog(), limit_bytes)
     for count, _ in enumerate(section.messages()):
         if count >= limit_messages:
             break

@@ -1,4 +1,4 @@
-"""The frames of two cameras out of an MCAP log as `ros2 bag record -s mcap` writes it, however damaged."""
+"""Reads the frames of two cameras from an MCAP log as `ros2 bag record -s mcap` writes it, complete or damaged."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from drivers.logs.topic_choice import choose_topics
 _SCAN_BYTES = 64 * 2**20
 _SCAN_MESSAGES = 2000
 _WARNINGS = {
-    "late": "dropped {} frames older than others given before: record with less delay or widen the window",
-    "duplicate": "dropped {} frames whose camera had given one with the same stamp",
-    "broken": "skipped {} messages of the cameras' topics that hold no image; the first: {fault}",
+    "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
+    "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
+    "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
@@ -30,15 +30,15 @@ _COUNTERS = ("lower", "upper", *_WARNINGS)
 
 
 class LogReader:
-    """A FrameSource that streams a log once per call of frames(); it never needs the log's index.
+    """A FrameSource that streams a log once per call of frames(), without the log's index.
 
-    path: the .mcap file, or the folder that `ros2 bag record` made. lower, upper: topics,
-    where their names do not tell. window: how many frames may wait for one that was written late.
-    Raises DriverError where the path is no such log or the topics of the two cameras are not clear.
+    path: the .mcap file, or the folder that `ros2 bag record` made. lower, upper: topics, where their names do not
+    identify the cameras. window: number of frames that are held back to sort them by stamp. Raises DriverError where
+    the path is no such log, or the topics of the two cameras are ambiguous.
 
-    During and after frames(): counts holds 'lower' and 'upper' (frames given), 'late', 'duplicate', 'unstamped' (used
-    the log's time), 'broken' (image messages that were none) and 'broken_records' (chunks or records of the file);
-    after its end `truncated` tells whether the file was cut, and `warnings` says in one line each what was amiss.
+    During and after frames(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate', 'unstamped'
+    (log time used), 'broken' (messages without a valid image) and 'broken_records' (chunks or records of the file).
+    After its end `truncated` is True for an incomplete file, and `warnings` has one line per kind of fault.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class LogReader:
     ) -> None:
         self._window = window
         self._file = LogFile(path)
-        self._forget()
+        self._reset()
         try:
             self._summary = read_summary(self._file)
             self._catalog = self._known_channels()
@@ -62,48 +62,52 @@ class LogReader:
         return {camera: topic for topic, camera in self._cameras.items()}
 
     def frames(self) -> Iterator[Frame]:
-        """Gives the frames of both cameras in the order of their stamps, each camera's seq from 0; data is bytes."""
-        self._forget()
+        """Yield the frames of both cameras in the order of their stamps; seq counts each camera's from 0."""
+        self._reset()
         section = DataSection(self._file, self._catalog)
-        order = ReorderBuffer(self._window, self.counts)
+        buffer = ReorderBuffer(self._window, self.counts)
         for message in section.messages():
-            taken = self._image(message)
-            if taken is not None:
-                yield from order.push(*taken)
+            found = self._image(message)
+            if found is not None:
+                camera, image = found
+                yield from buffer.push(camera, image)
             if self._file.closed:
                 return
-        yield from order.drain()
+        yield from buffer.drain()
         self._report(section)
 
     def close(self) -> None:
-        """Ends frames() and closes the file."""
+        """End frames() and close the file."""
         self._file.close()
 
     def pair_estimate(self) -> int | None:
-        """How many pairs the log can give at most, for a progress bar; None where the file does not say."""
+        """Return the largest possible number of pairs, for a progress bar; None without statistics in the file."""
         if self._summary is None or not self._summary.message_counts:
             return None
         catalog, counts = self._summary.catalog, self._summary.message_counts
         return min(sum(counts.get(channel, 0) for channel in catalog.ids(topic)) for topic in self._cameras)
 
     def attachments(self) -> dict[str, bytes]:
-        """Name -> bytes of the files within the log, such as a rig; at most 32 of up to 16 MiB each."""
+        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each."""
         return read_attachments(self._file, self._summary)
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = []
         self.truncated = False
-        self._fault = ""  # of the first message that held no image
+        self._fault = ""  # of the first message without a valid image
 
     def _known_channels(self) -> Catalog:
-        """From the summary; a cut log has none, so there the start of the file is looked through."""
+        """Return the channels from the summary; of a truncated log, which has none, from the start of the file."""
         if self._summary is not None and self._summary.catalog.topics():
             return self._summary.catalog
         return scan_channels(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
 
     def _image(self, message: LogMessage) -> tuple[Camera, RosImage] | None:
-        """The message's image, copied out of its chunk so that a waiting frame holds no more than itself."""
+        """Return camera and image of a message, None of other topics and broken images.
+
+        The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
+        """
         topic = self._catalog.topic(message.channel_id)
         if topic is None or topic.name not in self._cameras or topic.type not in (IMAGE, COMPRESSED_IMAGE):
             return None
@@ -122,8 +126,8 @@ class LogReader:
         self.truncated = not (section.ended and has_footer(self._file))
         if self.truncated:
             self.warnings.append(
-                f"the log {str(self._file.path)!r} is cut or corrupt after byte {section.at} of {self._file.size}: "
-                "used what is whole before that"
+                f"the log {str(self._file.path)!r} is cut or corrupt after byte {section.position} of "
+                f"{self._file.size}: used the data before"
             )
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
         self.warnings += [text.format(self.counts[name], fault=self._fault) for name, text in found.items()]

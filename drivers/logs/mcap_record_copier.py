@@ -1,4 +1,4 @@
-"""Records of one MCAP log put into another, with channels and schemas under numbers of its own."""
+"""Copies records of one MCAP log into another, with new numbers for channels and schemas."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MAX_DEFINITION_BYTES: Final = 64 * 2**20  # of all together
 
 
 class RecordCopier:
-    """Puts records into a writer, with channels and schemas under new numbers; counts what cannot be read as broken."""
+    """Copies records into a writer, with new numbers for channels and schemas; counts unreadable ones as broken."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -38,7 +38,7 @@ class RecordCopier:
         self._definitions: dict[tuple[int, int], bytes] = {}
         self._definition_bytes = 0
         self.messages = self.attachments = self.broken = 0
-        self._takers: dict[int, Callable[[memoryview], None]] = {
+        self._copiers: dict[int, Callable[[memoryview], None]] = {
             Opcode.SCHEMA: self._schema,
             Opcode.CHANNEL: self._channel,
             Opcode.MESSAGE: self._message,
@@ -47,7 +47,7 @@ class RecordCopier:
         }
 
     def copy_definitions(self, file: LogFile) -> None:
-        """Takes channels and schemas from the summary, for the chunk that defines them may be lost."""
+        """Copy channels and schemas from the summary, since the chunk that defines them may be lost."""
         section = summary_section(file)
         if section is not None:
             for record in records(section, 0, section.size):
@@ -55,7 +55,7 @@ class RecordCopier:
                     self.copy_record(section, record)
 
     def copy_chunk(self, file: LogFile, record: Record) -> None:
-        """Takes what is in a chunk."""
+        """Copy the records of a chunk."""
         try:
             chunk = unpack_chunk(read_content(file, record))
         except RecordError:
@@ -63,17 +63,17 @@ class RecordCopier:
             return
         end = 0
         for inner in records(chunk, 0, chunk.size):
-            end = inner.at + inner.size
+            end = inner.offset + inner.size
             self.copy_record(chunk, inner)
         self.broken += end != chunk.size
 
     def copy_record(self, source: ByteSource, record: Record) -> None:
-        """Takes one record; what belongs to an index is made anew."""
-        take = self._takers.get(record.opcode)
-        if take is None:
+        """Copy one record; those of an index are skipped, since the writer makes its own."""
+        copy = self._copiers.get(record.opcode)
+        if copy is None:
             return
         try:
-            take(read_content(source, record))
+            copy(read_content(source, record))
         except (RecordError, *PARSE_ERRORS):
             self.broken += 1
 
@@ -89,17 +89,17 @@ class RecordCopier:
         if schema is None:
             raise RecordError("a channel of an unknown schema")
         if self._is_new(Opcode.CHANNEL, channel.id, body):
-            arguments = channel.topic, channel.message_encoding, schema, channel.metadata
-            self._ids[Opcode.CHANNEL, channel.id] = self._writer.register_channel(*arguments)
+            number = self._writer.register_channel(channel.topic, channel.message_encoding, schema, channel.metadata)
+            self._ids[Opcode.CHANNEL, channel.id] = number
 
     def _is_new(self, opcode: int, number: int, body: memoryview) -> bool:
-        """Whether a definition is not yet there; RecordError where there are too many."""
+        """True if a definition is not yet copied; raise RecordError where there are too many."""
         definition = bytes(body)
         if self._definitions.get((opcode, number)) == definition:
             return False
         self._definition_bytes += len(body)
         if len(self._ids) >= _MAX_DEFINITIONS or self._definition_bytes > _MAX_DEFINITION_BYTES:
-            raise RecordError("more channels and schemas than any robot has")
+            raise RecordError(f"more than {_MAX_DEFINITIONS} channels and schemas, or {_MAX_DEFINITION_BYTES} bytes")
         self._definitions[opcode, number] = definition
         return True
 

@@ -1,8 +1,8 @@
-"""The records of an MCAP file, read one at a time from a file or chunk that may be cut, corrupt or hostile.
+"""The records of an MCAP file, read one at a time from a file or chunk that may be truncated, corrupt or malicious.
 
-The `mcap` package's own stream reader believes every length field: a short read passes for a message, and one bad byte
-can ask for gigabytes. So records are framed here, each checked against what is really there, and mcap parses the small
-ones. Format: mcap.dev/spec, version 0.
+The `mcap` package's own stream reader trusts every length field: it accepts a short read as a message, and one wrong
+byte can make it allocate gigabytes. So records are framed here, each length is checked against the size of the source,
+and mcap parses the small ones. Format: mcap.dev/spec, version 0.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from drivers.errors import DriverError
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 256 * 2**20
 
-RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
+RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of the content
 _CHUNK = struct.Struct("<QQQII")  # first log time, last log time, unpacked size, CRC, length of the compression's name
 _SIZE = struct.Struct("<Q")
+_MAX_COMPRESSION_NAME = 16  # bytes
+_MAX_LISTED = 8  # files in an error message
 
 PARSE_ERRORS = (McapError, struct.error, ValueError, OverflowError)
 
-_FOREIGN = {
+_OTHER_FORMATS = {  # first bytes -> advice
     b"SQLite f": "an SQLite bag: convert it with `ros2 bag convert` to storage mcap",
     b"#ROSBAG ": "a ROS 1 bag: convert it with `rosbags-convert --dst-storage mcap`",
     b"\x28\xb5\x2f\xfd": "a zstd-compressed file: unpack it with `zstd -d`",
@@ -39,41 +41,42 @@ _FOREIGN = {
 
 
 class RecordError(Exception):
-    """A record's content contradicts itself; the records after it may be whole."""
+    """A record with invalid content; the records after it may be valid."""
 
 
 class ByteSource(Protocol):
-    """Bytes with a known end: a file or an unpacked chunk."""
+    """Bytes of known size: a file or a decompressed chunk."""
 
     size: int
 
-    def read(self, at: int, size: int) -> bytes | memoryview:
-        """Gives up to size bytes from at."""
+    def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return up to size bytes from offset."""
 
 
 class Record(NamedTuple):
-    """Where a record's content lies in its source."""
+    """Position of a record's content in its source."""
 
     opcode: int
-    at: int
-    size: int
+    offset: int  # bytes
+    size: int  # bytes
 
 
 class ByteBuffer:
-    """A Source of bytes in memory; what it gives are views."""
+    """A ByteSource in memory; it returns views."""
 
     def __init__(self, data: bytes | memoryview) -> None:
         self._view = memoryview(data)
         self.size = len(self._view)
 
-    def read(self, at: int, size: int) -> memoryview:
-        return self._view[at : at + size]
+    def read(self, offset: int, size: int) -> memoryview:
+        """Return up to size bytes from offset."""
+        return self._view[offset : offset + size]
 
 
 class LogFile:
-    """An opened MCAP file as a Source; raises DriverError where there is none.
+    """An open MCAP file as a ByteSource; raises DriverError where the path is no MCAP file.
 
-    A folder stands for the one .mcap file in it, since that is what `ros2 bag record` makes.
+    path: the file, or a folder with one .mcap file in it, as `ros2 bag record` makes it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -84,93 +87,100 @@ class LogFile:
             raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
         self.size = os.fstat(self._file.fileno()).st_size
         try:
-            self._refuse_foreign()
+            self._require_magic()
         except DriverError:
             self.close()
             raise
 
-    def read(self, at: int, size: int) -> bytes:
-        """Up to size bytes from at; nothing after close, nor where the disk fails to deliver."""
+    def read(self, offset: int, size: int) -> bytes:
+        """Return up to size bytes from offset; none after close, or where the disk fails."""
         try:
-            return os.pread(self._file.fileno(), min(size, MAX_RECORD_BYTES), at)
+            return os.pread(self._file.fileno(), min(size, MAX_RECORD_BYTES), offset)
         except (OSError, ValueError):
             return b""
 
     @property
     def closed(self) -> bool:
+        """True after close."""
         return self._file.closed
 
     def close(self) -> None:
+        """Close the file; may be called twice."""
         self._file.close()
 
-    def _refuse_foreign(self) -> None:
+    def _require_magic(self) -> None:
+        """Raise DriverError, with advice for known formats, where the file does not start as an MCAP file."""
         start = self.read(0, len(MAGIC))
         if start == MAGIC:
             return
-        found = next((text for magic, text in _FOREIGN.items() if start.startswith(magic)), None)
-        found = found or (f"it starts with {start!r}: give a .mcap file" if start else "it is empty: record it again")
-        raise DriverError(f"{str(self.path)!r} is not an MCAP log: {found}")
+        reason = f"it starts with {start!r}: give a .mcap file" if start else "it is empty: record it again"
+        for magic, advice in _OTHER_FORMATS.items():
+            if start.startswith(magic):
+                reason = advice
+        raise DriverError(f"{str(self.path)!r} is not an MCAP log: {reason}")
 
 
 def _file_in(path: Path) -> Path:
+    """Return the file, or the only .mcap file of a folder; raise DriverError otherwise."""
     if not path.is_dir():
         if path.exists() and not path.is_file():
             raise DriverError(f"cannot read the log {str(path)!r}: it is no regular file; give a .mcap file")
         return path
     logs = sorted(path.glob("*.mcap"))
     if len(logs) != 1:
-        names = ", ".join(log.name for log in logs[:8]) or "none"
-        raise DriverError(f"{str(path)!r} is a folder with not one but these .mcap files: {names}; give one file")
+        names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
+        raise DriverError(f"{str(path)!r} must contain exactly one .mcap file; found: {names}; give one file")
     return logs[0]
 
 
 def records(source: ByteSource, start: int, end: int) -> Iterator[Record]:
-    """The records from start on, up to the first one that is cut or does not fit before end."""
-    at = start
-    while at + RECORD_HEADER.size <= end:
-        head = source.read(at, RECORD_HEADER.size)
+    """Yield the records from offset start on, up to the first one that is truncated or does not end before end."""
+    offset = start
+    while offset + RECORD_HEADER.size <= end:
+        head = source.read(offset, RECORD_HEADER.size)
         if len(head) < RECORD_HEADER.size:
             return
         opcode, size = RECORD_HEADER.unpack(head)
-        at += RECORD_HEADER.size
-        if opcode == 0 or size > end - at:
+        offset += RECORD_HEADER.size
+        if opcode == 0 or size > end - offset:
             return
-        yield Record(opcode, at, size)
-        at += size
+        yield Record(opcode, offset, size)
+        offset += size
 
 
 def read_content(source: ByteSource, record: Record) -> memoryview:
-    """What the record holds; raises RecordError where that is too much, or not all there."""
+    """Read the content of a record; raise RecordError where it is too large or incomplete."""
     if record.size > MAX_RECORD_BYTES:
         raise RecordError(f"{record.size} bytes are more than {MAX_RECORD_BYTES}")
-    data = source.read(record.at, record.size)
+    data = source.read(record.offset, record.size)
     if len(data) < record.size:
         raise RecordError(f"{len(data)} of {record.size} bytes could be read")
     return memoryview(data)
 
 
 def parser(body: memoryview) -> ReadDataStream:
-    """The stream mcap's record classes parse from; they then raise one of PARSE_ERRORS or give what is there."""
+    """Return the stream that mcap's record classes parse; these raise one of PARSE_ERRORS for invalid content."""
     return ReadDataStream(BytesIO(body))
 
 
 def unpack_chunk(body: memoryview) -> ByteBuffer:
-    """The records inside a chunk record; raises RecordError where size or CRC contradict them."""
+    """Decompress the records of a chunk; raise RecordError where its size or CRC is wrong."""
     try:
         _, _, size, crc, name_size = _CHUNK.unpack_from(body)
-        at = _CHUNK.size + name_size
-        (packed_size,) = _SIZE.unpack_from(body, at)
+        name_end = _CHUNK.size + name_size
+        (packed_size,) = _SIZE.unpack_from(body, name_end)
     except struct.error as error:
-        raise RecordError("the chunk's head is cut") from error
-    packed = body[at + _SIZE.size : at + _SIZE.size + packed_size]
-    data = _decompress(bytes(body[_CHUNK.size : at][:16]), packed, size)
+        raise RecordError("the chunk's header is truncated") from error
+    start = name_end + _SIZE.size
+    packed = body[start : start + packed_size]
+    data = _decompress(bytes(body[_CHUNK.size : name_end][:_MAX_COMPRESSION_NAME]), packed, size)
     if len(packed) != packed_size or len(data) != size or (crc and zlib.crc32(data) != crc):
         raise RecordError("the chunk's content does not match its size and CRC")
     return ByteBuffer(data)
 
 
 def _decompress(kind: bytes, packed: memoryview, size: int) -> bytes | memoryview:
-    """At most size bytes out of packed: the announced size is a limit, not a promise."""
+    """Decompress at most size bytes, the size that the chunk states, whatever the data contains."""
     if size > MAX_RECORD_BYTES:
         raise RecordError(f"the chunk unpacks to {size} bytes, more than {MAX_RECORD_BYTES}")
     try:

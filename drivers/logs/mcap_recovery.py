@@ -1,4 +1,4 @@
-"""A whole log out of a cut or corrupt one: what can be read is written anew, with an index and a summary."""
+"""Recovery of truncated or corrupt logs: readable records are copied to a new log with an index and a summary."""
 
 from __future__ import annotations
 
@@ -31,30 +31,32 @@ from drivers.logs.mcap_records import (
 
 _COMPRESSIONS = {b"lz4": CompressionType.LZ4, b"zstd": CompressionType.ZSTD}
 _CHUNK_BYTES: Final = 2**20
-_LOOKED_AT: Final = 10_000  # records at the start, for the first chunk
+_MAX_SEARCHED: Final = 10_000  # records at the start that are searched for the first chunk
+_COMPRESSION_OFFSET: Final = 28  # in a chunk record: after three numbers of 8 bytes and one of 4
+_MAX_COMPRESSION_NAME: Final = 4  # bytes, of the names known here
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What became of a log."""
+    """Result of a recovery."""
 
-    messages: int  # saved
-    attachments: int  # saved
-    lost: int | None  # messages; None where the log does not say how many there were
+    messages: int  # copied
+    attachments: int  # copied
+    lost: int | None  # messages; None where the log has no statistics
     broken: int  # chunks and records that were skipped
-    end: int  # byte of the log up to which it could be read
-    whole: bool  # there was nothing to mend
+    end: int  # offset up to which the log could be read [bytes]
+    whole: bool  # the log was complete and valid
 
 
 def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recovery:
-    """Writes what can be read of any MCAP log to a new file, in the same order and with the same compression.
+    """Copy all readable records of an MCAP log to a new file, in the same order and with the same compression.
 
-    Streams, so that neither the size of the log nor what is wrong with it costs memory: at most a few of its chunks.
-    Raises DriverError, and leaves no file, where `path` is no log, is still being written or holds nothing that can
-    be read, and where `out` exists or cannot be written.
+    Streams: the memory holds at most a few chunks, whatever the size and the damage of the log. Raises DriverError,
+    and leaves no file, where `path` is no log, is being written or contains nothing readable, and where `out` exists
+    or cannot be written.
     """
     if is_locked(path):
-        raise DriverError(f"cannot mend {str(path)!r}: it is being written; stop the recording first")
+        raise DriverError(f"cannot recover {str(path)!r}: it is being written; stop the recording first")
     file = LogFile(path)
     try:
         with _created(Path(out)) as target:
@@ -75,11 +77,11 @@ def _created(out: Path) -> IO[bytes]:
 
 
 def _written(file: LogFile, target: IO[bytes], out: Path) -> Recovery:
-    """As recover; a target that cannot be made whole is deleted."""
+    """Copy to an open target; delete it where it cannot be completed."""
     try:
         found = _copied(file, target)
         if not (found.messages or found.attachments):
-            raise DriverError(f"nothing in {str(file.path)!r} can be saved: no message and no attachment is whole")
+            raise DriverError(f"nothing in {str(file.path)!r} can be recovered: no message and no attachment is valid")
         return found
     except OSError as error:
         out.unlink(missing_ok=True)
@@ -90,6 +92,7 @@ def _written(file: LogFile, target: IO[bytes], out: Path) -> Recovery:
 
 
 def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
+    """Copy the readable records, and compare their number with the log's own statistics."""
     header = _header(file)
     writer = Writer(target, _CHUNK_BYTES, _compression(file))
     writer.start(header.profile, header.library)
@@ -112,7 +115,7 @@ def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
 
 
 def _header(file: LogFile) -> Header:
-    """The log's own; an empty one where it is unreadable."""
+    """Return the header of the log, an empty one where it is unreadable."""
     first = next(records(file, len(MAGIC), file.size), None)
     if first is not None and first.opcode == Opcode.HEADER and first.size < _CHUNK_BYTES:
         try:
@@ -124,43 +127,41 @@ def _header(file: LogFile) -> Header:
 
 
 def _compression(file: LogFile) -> CompressionType:
-    """That of the first chunk."""
+    """Return the compression of the first chunk."""
     for count, record in enumerate(records(file, len(MAGIC), file.size)):
         if record.opcode == Opcode.CHUNK:
-            head = bytes(file.read(record.at + 28, 8))  # after three numbers of 8 bytes and one of 4
-            return _COMPRESSIONS.get(head[4 : 4 + min(head[0], 4)] if head else b"", CompressionType.NONE)
-        if count >= _LOOKED_AT:
+            size = int.from_bytes(file.read(record.offset + _COMPRESSION_OFFSET, 4), "little")
+            start = record.offset + _COMPRESSION_OFFSET + 4
+            return _COMPRESSIONS.get(file.read(start, min(size, _MAX_COMPRESSION_NAME)), CompressionType.NONE)
+        if count >= _MAX_SEARCHED:
             break
     return CompressionType.NONE
 
 
 class _RecoverableRecords:
-    """The records of a log's data section; where one is longer than it can be, on from the next chunk that is indexed.
-
-    After its end: end is the byte reached, ended whether that was the proper end, jumps how often something was
-    skipped.
-    """
+    """The records of a log's data section; after a record with a wrong length, from the next indexed chunk on."""
 
     def __init__(self, file: LogFile) -> None:
         self._file = file
         self._chunks = _indexed_chunks(file)
-        self.ended = False
-        self.skips = 0
-        self.end = len(MAGIC)
+        self.ended = False  # True after the section's proper end
+        self.skips = 0  # times that bytes were skipped
+        self.end = len(MAGIC)  # offset up to which the log was read
 
     def records(self) -> Iterator[Record]:
-        """All that can be found; RecordErrors are for whoever reads what they hold."""
+        """Yield all records that can be found; their content may still be invalid."""
         start: int | None = len(MAGIC)
         while start is not None:
-            yield from self._run(start)
+            yield from self._contiguous(start)
             start = None if self.ended else self._next_chunk(max(start, self.end))
             self.skips += start is not None
 
-    def _run(self, start: int) -> Iterator[Record]:
+    def _contiguous(self, start: int) -> Iterator[Record]:
+        """Yield records up to the first one with a wrong length."""
         for record in records(self._file, start, self._file.size):
-            end = record.at + record.size
-            if (self._next_chunk(record.at) or end) < end:
-                return  # its length is wrong: nothing reaches into a chunk
+            end = record.offset + record.size
+            if (self._next_chunk(record.offset) or end) < end:
+                return  # its length is wrong: no record overlaps a chunk
             self.ended = record.opcode == Opcode.DATA_END
             if self.ended:
                 return
@@ -173,11 +174,11 @@ class _RecoverableRecords:
 
 
 def _indexed_chunks(file: LogFile) -> list[int]:
-    """Where the chunks start, as the summary says; nothing without one."""
-    section, places = summary_section(file), []
+    """Return the offsets of the chunks by the summary, none without a summary."""
+    section, offsets = summary_section(file), []
     if section is not None:
         for record in records(section, 0, section.size):
             if record.opcode == Opcode.CHUNK_INDEX:
                 with suppress(RecordError, *PARSE_ERRORS):
-                    places.append(int(ChunkIndex.read(parser(read_content(section, record))).chunk_start_offset))
-    return sorted(places)
+                    offsets.append(int(ChunkIndex.read(parser(read_content(section, record))).chunk_start_offset))
+    return sorted(offsets)

@@ -1,4 +1,4 @@
-"""A log as ROS 2, Foxglove, Rerun and evo read it: MCAP, profile ros2, CDR messages."""
+"""Writes logs that ROS 2, Foxglove, Rerun and evo can read: MCAP, profile ros2, CDR messages."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from drivers.logs.file_lock import lock
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
 _MAX_CHANNELS = 4096
-_FLUSH_NS = 5 * 10**8
+_FLUSH_NS = 5 * 10**8  # of stamps, after which a chunk is ended
+_END_NS = 2**63  # of valid stamps
 
 
 class LogWriter:
-    """Writes a log that loses at most the last chunk, or half a second of stamps, when the program dies.
+    """Writes a log; a crash loses at most the last chunk, or half a second of stamps.
 
-    attachments (name -> bytes) come first in the file, so they survive a crash. compression: lz4 or none; images that
-    are JPEG already gain nothing by it. An existing file is replaced, unless exclusive. Until its end the file is
-    locked. Raises DriverError where the file cannot be made or written (a full disk), and for a message type that
-    ROS 2 does not know.
+    attachments (name -> bytes) are written first, so that they survive a crash. compression: lz4 or none; JPEG images
+    are not made smaller by it. An existing file is replaced, unless exclusive. The file is locked until it is closed.
+    Raises DriverError where the file cannot be created or written (a full disk), and for a message type that ROS 2
+    does not have.
 
-    messages: how many the file was given; kept: how many of them would survive the program now.
+    messages: number of messages written; persisted: number of those that would survive a crash now.
     """
 
     def __init__(
@@ -60,8 +61,12 @@ class LogWriter:
             self._flushed_bytes = self._file.tell()
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
-        """Adds a message, CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry, at its stamp."""
-        if not 0 <= stamp_ns < 2**63:
+        """Write a message: CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry.
+
+        stamp_ns: log time [ns of Unix time]. Raises DriverError for an unknown type, an invalid stamp, or where the
+        file cannot be written.
+        """
+        if not 0 <= stamp_ns < _END_NS:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
         with self._guarded():
             channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
@@ -71,24 +76,24 @@ class LogWriter:
 
     @property
     def usable(self) -> bool:
-        """Whether it can be written to: neither closed nor failed."""
+        """True until it is closed or fails."""
         return self._usable
 
     @property
     def size_bytes(self) -> int:
-        """How long the file is without the chunk at hand."""
+        """Size of the file without the current chunk."""
         return self._flushed_bytes
 
     def sync(self) -> None:
-        """Ends the chunk and brings all to the disk; DriverError where the file has been deleted meanwhile as well."""
+        """End the chunk and write all data to the disk; raise DriverError where that fails or the file was deleted."""
         with self._guarded():
             self._flush()
             self._reach_disk()
 
     def close(self) -> None:
-        """Writes the index, which makes the file whole, and brings it to the disk; may be called twice.
+        """Write the index, which completes the file, and all data to the disk; may be called twice.
 
-        DriverError where that fails, or where the file has been deleted meanwhile.
+        Raises DriverError where that fails or the file was deleted.
         """
         if self._file.closed:
             return
@@ -117,7 +122,7 @@ class LogWriter:
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Turns a failure to write into DriverError; the file then stays as it is, for what it holds can be read."""
+        """Turn a failure to write into DriverError and close the file, whose content can be recovered."""
         if not self._usable:
             raise DriverError(f"cannot write the log {str(self._path)!r}: it is closed or failed before")
         try:
@@ -131,7 +136,7 @@ class LogWriter:
             ) from error
 
     def _abandon(self) -> None:
-        """Closes the file; what cannot be flushed has been reported already."""
+        """Close the file; a failure to flush has been reported before."""
         self._usable = False
         with suppress(OSError):
             self._file.close()
@@ -144,7 +149,7 @@ class LogWriter:
 
     def _register(self, topic: str, schema_name: str) -> int:
         if len(self._channels) >= _MAX_CHANNELS:
-            raise DriverError(f"cannot log {topic!r}: there are {_MAX_CHANNELS} topics already")
+            raise DriverError(f"cannot log {topic!r}: the log has {_MAX_CHANNELS} topics already")
         if schema_name not in self._schemas:
             text = schema_text(schema_name)
             self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
@@ -154,7 +159,7 @@ class LogWriter:
         return channel
 
     def _flush_when_due(self, stamp_ns: int) -> None:
-        """Ends the chunk after half a second of stamps, and hands ended chunks to the kernel at once."""
+        """End the chunk after half a second of stamps; pass ended chunks to the kernel at once."""
         if self._flushed_ns is None:
             self._flushed_ns = stamp_ns
         if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
@@ -190,8 +195,8 @@ _typestore = cache(get_typestore)
 
 @cache
 def schema_text(schema_name: str) -> str:
-    """The message definition of a ROS 2 type with all it is made of; raises DriverError for an unknown type."""
+    """Return the definition of a ROS 2 type and of all its parts; raise DriverError for an unknown type."""
     store = _typestore(Stores.ROS2_HUMBLE)
     if schema_name not in store.fielddefs:
-        raise DriverError(f"unknown message type {schema_name!r}: give one of ROS 2's own, as nav_msgs/msg/Odometry")
+        raise DriverError(f"unknown message type {schema_name!r}: give a type of ROS 2, such as nav_msgs/msg/Odometry")
     return store.generate_msgdef(schema_name, ros_version=2)[0]

@@ -1,4 +1,4 @@
-"""Frames of two cameras put into the order of their stamps, within a bounded window."""
+"""Sorts the frames of two cameras by their stamps within a bounded window."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from drivers.logs.ros_image import RosImage
 MAX_HELD_BYTES = 256 * 2**20
 
 
-class _Held(NamedTuple):
-    """Sorts by stamp, then lower before upper, then by arrival, so that nothing depends on chance."""
+class _WaitingImage(NamedTuple):
+    """An image in the window; sorts by stamp, then lower before upper, then by arrival, so the order is unique."""
 
     stamp_ns: int
     camera: Camera
@@ -23,52 +23,52 @@ class _Held(NamedTuple):
 
 
 class ReorderBuffer:
-    """Holds up to `window` frames and 256 MiB, and gives the oldest when there are more.
+    """Holds up to `window` frames and 256 MiB, and yields the oldest when there are more.
 
-    A frame older than one already given is dropped and counted as 'late', a second one with the stamp of its camera's
-    last as 'duplicate'; 'lower' and 'upper' count what was given.
+    A frame older than one already delivered is dropped and counted as 'late'; one with the same stamp as the frame
+    before of its camera as 'duplicate'; 'lower' and 'upper' count the delivered frames.
     """
 
     def __init__(self, window: int, counts: Counter[str]) -> None:
         self._window = window
         self._counts = counts
-        self._heap: list[_Held] = []
+        self._heap: list[_WaitingImage] = []
         self._held_bytes = 0
         self._arrivals = 0
         self._newest_ns = 0
         self._last_ns: dict[Camera, int] = {}
 
     def push(self, camera: Camera, image: RosImage) -> Iterator[Frame]:
-        """Takes a frame, whose data must not change any more; gives those that are due."""
-        heapq.heappush(self._heap, _Held(image.stamp_ns, camera, self._arrivals, image))
+        """Add an image, whose data must not change afterwards; yield the frames that are due."""
+        heapq.heappush(self._heap, _WaitingImage(image.stamp_ns, camera, self._arrivals, image))
         self._arrivals += 1
         self._held_bytes += len(image.data)
         while self._heap and (len(self._heap) > self._window or self._held_bytes > MAX_HELD_BYTES):
             yield from self._pop()
 
     def drain(self) -> Iterator[Frame]:
-        """Gives all that is left."""
+        """Yield all remaining frames."""
         while self._heap:
             yield from self._pop()
 
     def _pop(self) -> Iterator[Frame]:
-        held = heapq.heappop(self._heap)
-        self._held_bytes -= len(held.image.data)
-        if self._last_ns.get(held.camera) == held.stamp_ns:
+        oldest = heapq.heappop(self._heap)
+        self._held_bytes -= len(oldest.image.data)
+        if self._last_ns.get(oldest.camera) == oldest.stamp_ns:
             self._counts["duplicate"] += 1
-        elif held.stamp_ns < self._newest_ns:
+        elif oldest.stamp_ns < self._newest_ns:
             self._counts["late"] += 1
         else:
-            self._newest_ns = self._last_ns[held.camera] = held.stamp_ns
-            yield self._frame(held)
+            self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
+            yield self._frame(oldest)
 
-    def _frame(self, held: _Held) -> Frame:
-        seq, image = self._counts[held.camera], held.image
-        self._counts[held.camera] += 1
+    def _frame(self, waiting: _WaitingImage) -> Frame:
+        seq, image = self._counts[waiting.camera], waiting.image
+        self._counts[waiting.camera] += 1
         return Frame(
             seq,
-            held.stamp_ns,
-            held.camera,
+            waiting.stamp_ns,
+            waiting.camera,
             image.encoding,
             image.data,
             image.width,

@@ -1,4 +1,4 @@
-"""A recording that goes on for as long as there is room, file after file, and never stops what is recorded."""
+"""A recording in several files, which continues while the disk has space and never stops the program."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, 
 from drivers.logs.mcap_writer import LogWriter
 
 _FIRST_RETRY_S: Final = 1.0
-_LAST_STAMP_NS: Final = 2**63
+_END_NS: Final = 2**63  # of valid stamps
 
 
 @dataclass(slots=True)
 class RotatingLogState:
-    """How a recording is; its writing thread alone writes, any thread may read one entry at a time."""
+    """Status and counters; only the writing thread writes them, any thread may read one field at a time."""
 
     status: Literal["waiting", "recording", "stopped", "closed"] = "waiting"
     file: str = ""  # being written
-    problem: str = ""  # why it is stopped
-    messages: int = 0  # handed over
-    lost: int = 0  # of these, not in any file, for want of a disk
-    refused: int = 0  # of these, that are no messages: of an unknown type, or without a time
-    files: int = 0  # begun
-    deleted: int = 0  # the oldest ones
-    stops: int = 0
+    problem: str = ""  # reason for the status "stopped"
+    messages: int = 0  # received
+    lost: int = 0  # of these, in no file, since the disk failed or was full
+    refused: int = 0  # of these, invalid: of an unknown type, or without a valid stamp
+    files: int = 0  # created
+    deleted: int = 0  # oldest files
+    stops: int = 0  # transitions to the status "stopped"
 
 
 class RotatingLog:
     """Writes messages to MCAP files of limited size and age, each with the attachments; see log_folder for their names.
 
-    It never raises: on a full or failing disk, or without its folder, it stops, says so once by `report`, counts what
-    is lost, tries again with growing waits, and says when it goes on. For one thread; `state` may be read from any.
+    It never raises: on a full or failing disk, or without its folder, it stops, reports that once by `on_event`,
+    counts lost messages, tries again with growing waits, and reports when it continues. For one thread; `state` may
+    be read from any.
     """
 
     def __init__(
@@ -53,12 +54,12 @@ class RotatingLog:
         self._start_ns = 0
         self._synced_s = self._retry_at_s = 0.0
         self._retry_s = _FIRST_RETRY_S
-        self._lost_before = 0  # when it stopped
+        self._lost_before = 0  # lost messages when it stopped
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
-        """Adds a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
+        """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
         self.state.messages += 1
-        if not 0 <= stamp_ns < _LAST_STAMP_NS:
+        if not 0 <= stamp_ns < _END_NS:
             self._refuse(f"{topic!r}: its stamp {stamp_ns} ns is not a time")
             return
         writer = self._current(stamp_ns)
@@ -67,17 +68,20 @@ class RotatingLog:
             return
         try:
             writer.write(topic, schema_name, data, stamp_ns)
-            self._tend(writer)
+            self._maintain(writer)
         except DriverError as error:
-            self._stop(error) if not writer.usable else self._refuse(str(error))
+            if writer.usable:
+                self._refuse(str(error))
+            else:
+                self._stop(error)
 
     def close(self) -> None:
-        """Makes the file whole; nothing is recorded any more."""
+        """Complete the file and end the recording."""
         self._end()
         self.state.status, self._retry_at_s = "closed", float("inf")
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
-        """The file for a message of the stamp, if there can be one."""
+        """Return the file for a message with this stamp, None where none can be created."""
         if self._writer is not None and self._is_full(self._writer, stamp_ns):
             self._end()
         if self._writer is None and time.monotonic() >= self._retry_at_s:
@@ -104,7 +108,7 @@ class RotatingLog:
             self.state.status = "recording"
 
     def _created(self, stamp_ns: int) -> LogWriter:
-        """A new file under a name of its own, which nobody else can take in the meantime."""
+        """Create a file with an unused name, which no other program uses."""
         while True:
             path, number = self._folder.unused_path(stamp_ns, self._number)
             self._number, self._path = number + 1, path
@@ -117,16 +121,16 @@ class RotatingLog:
                 raise
             if not os.path.lexists(complete_path(path)):
                 return writer
-            delete_file(path)  # another program has made and ended its own between our look and the creation
+            delete_file(path)  # another program has completed a file of this name since the check
             _drop(writer)
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
         if self.state.refused == 1:
-            self._on_event(logging.WARNING, f"recording: refused a message, and counts others: {reason}")
+            self._on_event(logging.WARNING, f"recording: refused a message; further ones are counted: {reason}")
 
     def _stop(self, error: DriverError) -> None:
-        """Lets go of the file at hand; what of it has reached the disk stays for `omnid log recover`."""
+        """Close the file; its data on the disk is kept for `omnid log recover`."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
             self.state.stops += 1
@@ -141,16 +145,16 @@ class RotatingLog:
         self._retry_at_s = time.monotonic() + self._retry_s
         self._retry_s = min(2 * self._retry_s, self._rotation.retry_s)
 
-    def _go_on(self) -> None:
-        """There is a file again, and it takes what is written."""
+    def _resume(self) -> None:
+        """Report that a new file is being written."""
         lost = self.state.lost - self._lost_before
         self.state.status, self.state.problem, self._retry_s = "recording", "", _FIRST_RETRY_S
-        self._on_event(logging.INFO, f"recording: goes on in {str(self._path)!r}; {lost} messages were lost")
+        self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
 
-    def _tend(self, writer: LogWriter) -> None:
-        """Brings the file to the disk now and then, and looks whether there is still room."""
+    def _maintain(self, writer: LogWriter) -> None:
+        """Write the file to the disk once per sync_s, and check the free space."""
         if self.state.status == "stopped" and writer.persisted:
-            self._go_on()
+            self._resume()
         if time.monotonic() - self._synced_s < self._rotation.sync_s:
             return
         writer.sync()
@@ -162,18 +166,18 @@ class RotatingLog:
             self._stop(error)
 
     def _end(self) -> None:
-        """Makes the file whole and gives it the name of one."""
+        """Complete the file and rename it."""
         writer = self._writer
         if writer is None:
             return
         try:
             writer.close()
-            self._name_whole()
+            self._rename()
         except DriverError as error:
             self._stop(error)
         self._writer, self.state.file = None, ""
 
-    def _name_whole(self) -> None:
+    def _rename(self) -> None:
         try:
             self._path.rename(complete_path(self._path))
         except OSError as error:
@@ -182,6 +186,6 @@ class RotatingLog:
 
 
 def _drop(writer: LogWriter) -> None:
-    """Closes a file that is given up."""
+    """Close a file without reporting failures."""
     with suppress(DriverError):
         writer.close()

@@ -1,4 +1,4 @@
-"""Which topics of a log are the lower and the upper camera."""
+"""Choice of the topics of a log that are the lower and the upper camera."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ Wanted = Mapping[Camera, str | None]
 
 
 def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[str, Camera]:
-    """Topic -> camera of the two cameras, out of topics (name -> type) of the log so named in errors.
+    """Return topic -> camera of the two cameras.
 
-    A topic given in wanted must be there; the other cameras are known by a word of their topic's name. Raises
-    DriverError that lists what there is where that leaves a doubt.
+    log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
+    without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
+    choice is ambiguous.
     """
     images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
     if not images:
@@ -55,7 +56,10 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
 
 
 def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
-    """The topic named after the camera, compressed rather than raw; None without one, DriverError with several."""
+    """Return the topic named after the camera, preferably the compressed one, None without one.
+
+    Raises DriverError where several cameras have such a name.
+    """
     mine = [name for name in names if _camera_named(name) == camera]
     if len(_images(mine)) > 1:
         raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
@@ -63,7 +67,7 @@ def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
 
 
 def _camera_named(topic: str) -> Camera | None:
-    """The first word of the name that names a camera: /upper/down_sampled is the upper one."""
+    """Return the camera of the first word that names one: /upper/down_sampled is the upper camera."""
     words = re.split(r"[^a-z0-9]+", topic.lower())
     return next((_WORDS[word] for word in words if word in _WORDS), None)
 
@@ -85,7 +89,7 @@ def _images(names: Iterable[str]) -> set[str]:
 
 
 def _listed(names: Iterable[str]) -> str:
-    """The names on one line, with what a terminal should not print made visible."""
+    """Return the names on one line, with unprintable characters escaped."""
     every = sorted(names)
     shown = [name if name.isprintable() else ascii(name) for name in every[:_MAX_LISTED]]
     more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""

@@ -78,7 +78,7 @@ def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
 
 def _described(found: LogInfo) -> Iterator[str]:
     yield f"log          {found.path}"
-    yield f"size         {_bytes(found.size)}"
+    yield f"size         {_bytes(found.size_bytes)}"
     yield f"state        {_state(found)}"
     duration_s = 0.0
     if found.span_ns is not None:
@@ -98,7 +98,8 @@ def _state(found: LogInfo) -> str:
     advice = f"`omnid log recover {found.path}`"
     if found.state is LogState.BROKEN:
         corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
-        return f"cut or corrupt after byte {found.read} of {found.size}{corrupt}: {advice} saves what is whole"
+        position = f"byte {found.readable_bytes} of {found.size_bytes}"
+        return f"cut or corrupt after {position}{corrupt}: {advice} saves what is whole"
     if found.state is LogState.UNINDEXED:
         return f"{found.state.value}, so some readers refuse it: {advice} gives it one"
     return str(found.state.value)

@@ -171,7 +171,7 @@ def _warnings(found: LogInfo, wanted: Mapping[str, _Reading]) -> list[str]:
     """What makes a recording less than whole, one line each."""
     parts = []
     if found.state in (LogState.BROKEN, LogState.WRITTEN):
-        parts.append(f"{found.path}: {found.state.value}: what is whole up to byte {found.read} is compared")
+        parts.append(f"{found.path}: {found.state.value}: what is whole up to byte {found.readable_bytes} is compared")
     for topic, reading in wanted.items():
         if reading.broken:
             parts.append(f"{found.path}: {reading.broken} messages on {topic!r} are no {reading.schema}: left out")

@@ -71,7 +71,7 @@ def report_html(path: Path, recording: ReportData, true: Trajectory | None = Non
 
 def _head(path: Path, recording: ReportData) -> list[str]:
     found, frames = recording.survey, recording.frames
-    told = (f"{path}, {found.size / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
+    told = (f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
             f"{recording.topic}, from {_utc(recording.poses.start_ns)}.")
     return [f"<h1>Run of {escape(recording.robot)}</h1><p class='sub'>{escape(told)}</p>"]
 
@@ -89,7 +89,8 @@ def _warnings(recording: ReportData, true: Trajectory | None) -> list[str]:
     found, poses = recording.survey, recording.poses
     lines = []
     if found.state is LogState.BROKEN:
-        lines.append(f"The log is cut or corrupt after byte {found.read} of {found.size}; this is what could be read.")
+        lines.append(f"The log is cut or corrupt after byte {found.readable_bytes} of {found.size_bytes}; "
+                     "this is what could be read.")
     if found.broken:
         lines.append(f"{found.broken} corrupt chunks or records were skipped.")
     if recording.unread or poses.absurd:

@@ -210,7 +210,7 @@ def test_how_it_goes_is_told(tmp_path: Path) -> None:
     recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
     recorder.process(frame(0, "lower"))
     told = recorder.status()
-    assert told.level == ERROR and told.values["lost"] == "1" and "1000001 wanted" in told.message
+    assert told.level == ERROR and told.values["lost"] == "1" and "1000001 needed" in told.message
 
 
 class Late:
