@@ -1,4 +1,4 @@
-"""One camera as text: `camera.toml`, whose [camera] table is that of a rig.toml without its place on the rig."""
+"""One camera as text: `camera.toml`, whose [camera] table is that of a rig.toml without the pose on the rig."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 
 from calib.camera_table import camera_text, intrinsics_text, mask_text, read_camera_table, string_text
 from calib.models.camera import Mask, OmniCamera
-from calib.strict import read_bytes, require_schema, toml_table
+from calib.validation import read_bytes, require_schema, toml_table
 
 SCHEMA = 1
-Parameter = tuple[str, float, float]  # name, value, standard deviation
+# Name, value, standard deviation.
+Parameter = tuple[str, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFile:
-    """A camera and what it shows of the world; mask None where nobody has measured it."""
+    """A camera and the mask of its image; mask None if it was not measured."""
 
     camera: OmniCamera
     mask: Mask | None = None
@@ -24,7 +25,7 @@ class CameraFile:
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """How well a camera is known: mean reprojection error [px], number of views, the parameters' deviations."""
+    """Quality of a calibration: mean reprojection error [px], number of views, parameters with sigmas."""
 
     mean_error_px: float
     views: int
@@ -32,20 +33,20 @@ class Quality:
 
 
 def read_camera(path: Path) -> CameraFile:
-    """The camera in a `camera.toml`; its mask's image is looked for beside it."""
+    """Read the camera of a `camera.toml`; its mask's image is read from the same folder."""
     return parse_camera(read_bytes(path), path.parent, str(path))
 
 
 def parse_camera(text: str | bytes, folder: Path | None = None, name: str = "camera.toml") -> CameraFile:
-    """The camera in the text of a `camera.toml`; folder holds its mask's image."""
+    """Parse the camera of a `camera.toml`'s text; folder contains its mask's image."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    table.only(("schema", "camera", "quality"))
+    table.allow_only(("schema", "camera", "quality"))
     return CameraFile(*read_camera_table(table.table("camera"), folder))
 
 
 def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: str = "") -> str:
-    """The text of a `camera.toml`; mask_image names the mask's image, "" embeds it."""
+    """Return the text of a `camera.toml`; mask_image is the file name of the mask's image, "" embeds it."""
     parts = [f"schema = {SCHEMA}\n", camera_text("camera", file.camera, ""),
              intrinsics_text("camera", file.camera)]
     if file.mask is not None:
@@ -58,5 +59,5 @@ def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: st
 def _quality_text(quality: Quality) -> str:
     lines = ["", "[quality]", f"mean_error_px = {round(quality.mean_error_px, 6)}", f"views = {quality.views}", "",
              "[quality.deviations]"]
-    lines += [f"{string_text(name)} = {deviation:.6g}" for name, _, deviation in quality.parameters]
+    lines += [f"{string_text(name)} = {sigma:.6g}" for name, _, sigma in quality.parameters]
     return "\n".join(lines) + "\n"

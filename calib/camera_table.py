@@ -15,25 +15,25 @@ from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
 from calib.models.ocam import VIEWS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
-from calib.strict import Table, read_bytes
+from calib.validation import ValidatedTable, read_bytes
 
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
 
 
-def read_camera_table(table: Table, folder: Path | None, others: Collection[str] = ()
+def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
                       ) -> tuple[OmniCamera, Mask | None]:
-    """The camera and the mask of a table, which may have other keys; folder holds the mask's image if it has one."""
+    """Read camera and mask of a table; others: further keys that it may have; folder contains the mask's image."""
     model = table.choice("model", ("omni", "ocam"))
-    table.only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
+    table.allow_only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
     camera = _omni(table) if model == "omni" else _ocam(table)
     return camera, _mask(table, folder) if table.has("mask") else None
 
 
-def _omni(table: Table) -> UnifiedCamera:
+def _omni(table: ValidatedTable) -> UnifiedCamera:
     values = table.table("intrinsics")
-    values.only(OMNI_KEYS)
+    values.allow_only(OMNI_KEYS)
     xi, fu, fv, pu, pv = (values.number(key) for key in OMNI_KEYS[:5])
     k1, k2, p1, p2 = (values.number(key) for key in OMNI_KEYS[5:])
     size = table.size("size")
@@ -43,9 +43,9 @@ def _omni(table: Table) -> UnifiedCamera:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
 
-def _ocam(table: Table) -> OcamCamera:
+def _ocam(table: ValidatedTable) -> OcamCamera:
     values = table.table("intrinsics")
-    values.only(OCAM_KEYS)
+    values.allow_only(OCAM_KEYS)
     row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
     view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
     polynomial, size = values.numbers("polynomial"), table.size("size")
@@ -55,9 +55,9 @@ def _ocam(table: Table) -> OcamCamera:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
 
-def _mask(table: Table, folder: Path | None) -> Mask:
+def _mask(table: ValidatedTable, folder: Path | None) -> Mask:
     values = table.table("mask")
-    values.only(("center", "inner_px", "outer_px", "image"))
+    values.allow_only(("center", "inner_px", "outer_px", "image"))
     u, v = values.numbers("center", 2)
     inner = values.number("inner_px") if values.has("inner_px") else 0.0
     outer = values.number("outer_px") if values.has("outer_px") else float("inf")
@@ -70,36 +70,36 @@ def _mask(table: Table, folder: Path | None) -> Mask:
     return Mask((u, v), inner, outer, image)
 
 
-def _mask_image(values: Table, folder: Path | None) -> NDArray[np.uint8]:
+def _mask_image(values: ValidatedTable, folder: Path | None) -> NDArray[np.uint8]:
     source = values.text("image")
     data = _embedded(values, source) if source.startswith(EMBEDDED) else _beside(values, source, folder)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:
         image = None
-    return values.fail("image", "a image") if image is None else image.astype(np.uint8, copy=False)
+    return values.fail("image", "an image") if image is None else image.astype(np.uint8, copy=False)
 
 
-def _embedded(values: Table, source: str) -> bytes:
+def _embedded(values: ValidatedTable, source: str) -> bytes:
     try:
         return base64.b64decode(source[len(EMBEDDED):], validate=True)
     except (binascii.Error, ValueError):
         values.fail("image", "base64 after its prefix")
 
 
-def _beside(values: Table, source: str, folder: Path | None) -> bytes:
+def _beside(values: ValidatedTable, source: str, folder: Path | None) -> bytes:
     if folder is None or "\0" in source:
-        values.fail("image", "an embedded image, as there is no folder to look for a file in")
+        values.fail("image", "an embedded image, because there is no folder to read a file from")
     return read_bytes(folder / source)
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """A image (H, W) uint8 as the bytes of a PNG."""
+    """Return an image (H, W) uint8 as the bytes of a PNG."""
     return cv2.imencode(".png", image)[1].tobytes()
 
 
 def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
-    """The head of the table of that name; topic "" where unknown."""
+    """Return the head of a camera's table; topic "" if unknown."""
     lines = ["", f"[{name}]", f'model = "{"ocam" if isinstance(camera, OcamCamera) else "omni"}"',
              f"size = {[int(pixels) for pixels in camera.size]}"]
     if isinstance(camera, OcamCamera):
@@ -110,7 +110,7 @@ def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
 
 
 def intrinsics_text(name: str, camera: OmniCamera) -> str:
-    """The table of the intrinsics under the table of that name."""
+    """Return the table of the intrinsics within a camera's table."""
     if isinstance(camera, UnifiedCamera):
         values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
         named = [f"{key} = {number_text(value)}" for key, value in zip(OMNI_KEYS, values, strict=True)]
@@ -124,7 +124,7 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
 
 
 def mask_text(name: str, mask: Mask, image: str) -> str:
-    """The table of the mask likewise; image names its image, "" embeds it."""
+    """Return the table of the mask within a camera's table; image is the file name of its image, "" embeds it."""
     lines = ["", f"[{name}.mask]", f"center = [{number_text(mask.center[0])}, {number_text(mask.center[1])}]",
              f"inner_px = {number_text(mask.inner_px)}"]
     if np.isfinite(mask.outer_px):
@@ -136,11 +136,11 @@ def mask_text(name: str, mask: Mask, image: str) -> str:
 
 
 def number_text(value: float) -> str:
-    """A number as TOML, bit for bit; no minus before zero."""
+    """Return a number as TOML text that parses to the same bits; -0 is written as 0."""
     return repr(float(value) + 0.0)
 
 
 def string_text(text: str) -> str:
-    """A string as TOML."""
+    """Return a string as TOML text."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'

@@ -1,5 +1,5 @@
-"""What goes wrong with a calibration."""
+"""Errors of calibration files and calibrations."""
 
 
 class CalibError(Exception):
-    """A calibration file or value that cannot be used; one line: asked, found, what to do."""
+    """A calibration file or value that cannot be used; one line: what was expected, what was found, what to do."""

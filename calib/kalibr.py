@@ -1,4 +1,4 @@
-"""Kalibr's `camchain.yaml` in and out: camera model omni, T_cam_imu read as T_cam_rig.
+"""Kalibr's `camchain.yaml`, read and written: camera model omni, T_cam_imu taken for T_cam_rig.
 
 Kalibr: p_cam = T_cam_imu @ p_imu and p_cam1 = T_cn_cnm1 @ p_cam0; omni intrinsics are [xi, fu, fv, pu, pv].
 """
@@ -21,38 +21,38 @@ from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_frame import rig_between
-from calib.strict import Table, decode, read_bytes
+from calib.validation import ValidatedTable, decode, read_bytes
 
-# How far T_cam_imu and T_cn_cnm1 may disagree: more than rounding, less than any real difference of two rigs.
+# Tolerance between T_cam_imu and T_cn_cnm1: more than rounding, less than any real difference of two rigs.
 MAX_DISAGREEMENT_M = 1e-3
 MAX_DISAGREEMENT_RAD = np.deg2rad(0.1)
-# Closer in height than this, height does not tell which camera is the lower one.
+# Least difference in height by which the lower camera is identified.
 MIN_HEIGHT_M = 1e-3
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 
 
 def import_kalibr(path: Path, lower: str = "", upper: str = "") -> Rig:
-    """The rig in a Kalibr file; lower and upper name cameras (cam0) where topic and height must not decide."""
+    """Read the rig of a Kalibr file; lower and upper: names of cameras (cam0), instead of topic or height."""
     return parse_kalibr(read_bytes(path), str(path), lower, upper)
 
 
 def parse_kalibr(text: str | bytes, name: str = "camchain.yaml", lower: str = "", upper: str = "") -> Rig:
-    """The rig in the text of a Kalibr file."""
-    file = Table(load_yaml(text, name), name)
+    """Parse the rig of a Kalibr file's text."""
+    file = ValidatedTable(load_yaml(text, name), name)
     cameras = {key: file.table(key) for key in _camera_names(file)}
-    poses, tied = _chain(cameras)
-    low, up = _which(file, (lower, upper), poses if tied else {})
+    poses, has_rig_frame = _chain(cameras)
+    low, up = _lower_and_upper(file, (lower, upper), poses if has_rig_frame else {})
     models = [_camera(cameras[key]) for key in (low, up)]
     topics = (_topic(cameras[low]), _topic(cameras[up]))
     if not {low, up} <= poses.keys():
-        raise CalibError(f"{name}: no transform ties {low} to {up}; T_cam_imu of both, or T_cn_cnm1, is needed")
-    if not tied:
+        raise CalibError(f"{name}: no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
+    if not has_rig_frame:
         return rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
     return Rig(MountedCamera(models[0], poses[low]), MountedCamera(models[1], poses[up]), topics=topics)
 
 
 def load_yaml(text: str | bytes, name: str) -> Mapping[object, object]:
-    """The mapping in a YAML text, plain data only."""
+    """Parse a YAML text (plain data only) and return its mapping."""
     try:
         values = YAML(typ="safe", pure=True).load(decode(text, name))
     except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError) as error:
@@ -62,35 +62,35 @@ def load_yaml(text: str | bytes, name: str) -> Mapping[object, object]:
     return values
 
 
-def _camera_names(file: Table) -> list[str]:
-    """cam0, cam1, ... in their order."""
+def _camera_names(file: ValidatedTable) -> list[str]:
+    """Return cam0, cam1, ... in ascending order."""
     names = [key for key in file.values if isinstance(key, str) and re.fullmatch(r"cam\d{1,3}", key)]
     if len(names) < 2:
         raise CalibError(f"{file.file}: expected two cameras (cam0, cam1), found {', '.join(names) or 'none'}")
     return sorted(names, key=lambda key: int(key[3:]))
 
 
-def _chain(cameras: dict[str, Table]) -> tuple[dict[str, Array], bool]:
-    """Transforms from one common frame into each camera; whether that frame is the rig's (T_cam_imu) or cam0's."""
+def _chain(cameras: dict[str, ValidatedTable]) -> tuple[dict[str, Array], bool]:
+    """Return transforms from one common frame into each camera; True if that frame is the rig's, False if cam0's."""
     poses = {key: table.transform("T_cam_imu") for key, table in cameras.items() if table.has("T_cam_imu")}
-    tied = bool(poses)
+    has_rig_frame = bool(poses)
     links = [(before, key, cameras[key].transform("T_cn_cnm1"))
              for before, key in pairwise(cameras)
              if int(key[3:]) == int(before[3:]) + 1 and cameras[key].has("T_cn_cnm1")]
-    if not tied:
+    if not has_rig_frame:
         poses[next(iter(cameras))] = np.eye(4)
     for before, key, T_key_before in links:
         if before in poses and key in poses:
-            _must_agree(cameras[key], poses[key] @ se3.inverse(poses[before]), T_key_before)
+            _require_consistency(cameras[key], poses[key] @ se3.inverse(poses[before]), T_key_before)
         elif before in poses:
             poses[key] = T_key_before @ poses[before]
     for before, key, T_key_before in reversed(links):
         if key in poses and before not in poses:
             poses[before] = se3.inverse(T_key_before) @ poses[key]
-    return poses, tied
+    return poses, has_rig_frame
 
 
-def _must_agree(table: Table, by_imu: Array, by_chain: Array) -> None:
+def _require_consistency(table: ValidatedTable, by_imu: Array, by_chain: Array) -> None:
     gap = se3.inverse(by_imu) @ by_chain
     distance, angle = np.linalg.norm(by_imu[:3, 3] - by_chain[:3, 3]), np.linalg.norm(se3.rotation_log(gap[:3, :3]))
     if distance > MAX_DISAGREEMENT_M or angle > MAX_DISAGREEMENT_RAD:
@@ -98,14 +98,14 @@ def _must_agree(table: Table, by_imu: Array, by_chain: Array) -> None:
                          f"{distance * 1e3:.1f} mm and {np.rad2deg(angle):.2f} deg; remove the one that is wrong")
 
 
-def _which(file: Table, named: tuple[str, str], poses: dict[str, Array]) -> tuple[str, str]:
-    """The names of the lower and the upper camera: as asked for, else by topic, else by height in the rig frame."""
+def _lower_and_upper(file: ValidatedTable, named: tuple[str, str], poses: dict[str, Array]) -> tuple[str, str]:
+    """Return the names of the lower and the upper camera: as named, else by topic, else by height in the rig frame."""
     names = _camera_names(file)
     for name in filter(None, named):
         if name not in names:
             raise CalibError(f"{file.file}: there is no camera {name}, found {', '.join(names)}")
     if len(names) > 2 and not all(named):
-        raise CalibError(f"{file.file}: expected two cameras, found {', '.join(names)}; name --lower and --upper")
+        raise CalibError(f"{file.file}: expected two cameras, found {', '.join(names)}; give --lower and --upper")
     if any(named):
         other = [name for name in names if name not in named]
         pair = named[0] or other[0], named[1] or other[0]
@@ -116,7 +116,7 @@ def _which(file: Table, named: tuple[str, str], poses: dict[str, Array]) -> tupl
     return pair
 
 
-def _by_topic(file: Table, names: list[str]) -> tuple[str, str] | None:
+def _by_topic(file: ValidatedTable, names: list[str]) -> tuple[str, str] | None:
     words = [set(re.split(r"[^a-z]+", _topic(file.table(name)).lower())) for name in names]
     low = [bool(found & LOWER_WORDS) - bool(found & UPPER_WORDS) for found in words]
     if low[0] == low[1]:
@@ -124,21 +124,21 @@ def _by_topic(file: Table, names: list[str]) -> tuple[str, str] | None:
     return (names[0], names[1]) if low[0] > low[1] else (names[1], names[0])
 
 
-def _by_height(file: Table, names: list[str], poses: dict[str, Array]) -> tuple[str, str]:
+def _by_height(file: ValidatedTable, names: list[str], poses: dict[str, Array]) -> tuple[str, str]:
     heights = [float(se3.inverse(poses[name])[2, 3]) for name in names if name in poses]
     if len(heights) < 2 or abs(heights[0] - heights[1]) < MIN_HEIGHT_M:
-        raise CalibError(f"{file.file}: neither topics nor heights tell which camera is the lower one; name it, "
+        raise CalibError(f"{file.file}: neither topics nor heights identify the lower camera; name it, "
                          f"--lower {names[0]} or --lower {names[1]}")
     return (names[0], names[1]) if heights[0] < heights[1] else (names[1], names[0])
 
 
-def _topic(table: Table) -> str:
+def _topic(table: ValidatedTable) -> str:
     return table.text("rostopic") if table.has("rostopic") else ""
 
 
-def _camera(table: Table) -> UnifiedCamera:
+def _camera(table: ValidatedTable) -> UnifiedCamera:
     if table.text("camera_model") != "omni":
-        table.fail("camera_model", "omni (the only model of Kalibr's that a mirror camera can have here)")
+        table.fail("camera_model", "omni (the only model of Kalibr that is supported)")
     xi, fu, fv, pu, pv = table.numbers("intrinsics", 5)
     model = table.choice("distortion_model", ("radtan", "none"))
     k1, k2, p1, p2 = table.numbers("distortion_coeffs", 4) if model == "radtan" else (0.0, 0.0, 0.0, 0.0)
@@ -150,7 +150,7 @@ def _camera(table: Table) -> UnifiedCamera:
 
 
 def export_kalibr(rig: Rig) -> str:
-    """The rig as a `camchain.yaml`, the lower camera as cam0; Kalibr has no masks and no T_base_rig."""
+    """Return the rig as the text of a `camchain.yaml`, the lower camera as cam0; without masks and T_base_rig."""
     topics = [rig.topics[0] or "/lower/image_raw", rig.topics[1] or "/upper/image_raw"]
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     lower = _camera_text(rig.lower, topics[0])
@@ -162,10 +162,10 @@ def _camera_text(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     if not isinstance(camera, UnifiedCamera):
         raise CalibError("export: Kalibr's camchain.yaml holds omni cameras, found an ocam camera; use --format ocam")
-    bent = any(camera.distortion)
+    has_distortion = any(camera.distortion)
     return (f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
-            f"  distortion_model: {'radtan' if bent else 'none'}\n"
-            f"  distortion_coeffs: {_row(camera.distortion) if bent else '[]'}\n"
+            f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"
+            f"  distortion_coeffs: {_row(camera.distortion) if has_distortion else '[]'}\n"
             f"  resolution: [{int(camera.size[0])}, {int(camera.size[1])}]\n"
             f"  rostopic: {json.dumps(topic)}\n  T_cam_imu:\n{_matrix(mounted.T_cam_rig)}")
 
@@ -179,6 +179,6 @@ def _row(values: Array | tuple[float, ...]) -> str:
 
 
 def _float(value: float) -> str:
-    """The number, with the point that YAML 1.1 asks for: 1e-07 would be read as a string."""
+    """Return the number with a decimal point, which YAML 1.1 requires: 1e-07 would be read as a string."""
     text = repr(float(value) + 0.0)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text

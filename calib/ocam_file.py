@@ -1,4 +1,4 @@
-"""OCamCalib's `calib_results.txt` in and out: one file per camera, so the transform between them comes extra."""
+"""OCamCalib's `calib_results.txt`, read and written: one file per camera, without the transform between them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_frame import rig_between
-from calib.strict import decode, read_bytes, shown
+from calib.validation import decode, read_bytes, shown
 
-# The toolbox's own C reader has room for so many coefficients.
+# The limit of the toolbox's own C reader.
 MAX_COEFFICIENTS = 64
-# The inverse polynomial grows until it is this good, or no better: the toolbox's own goal and bound.
+MAX_SIDE_PX = 32767
+# The degree of the inverse polynomial is raised until it reaches this error: the toolbox's own goal and bound.
 INVERSE_GOAL_PX = 0.01
 INVERSE_DEGREES = range(4, 26)
 
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One line of numbers and where it stands."""
+    """One line of numbers and its position in the file."""
 
     number: int
     words: list[str]
@@ -43,22 +44,22 @@ class _Line:
         return values
 
     def counted(self, what: str) -> tuple[float, ...]:
-        """Numbers led by their count."""
+        """Return the numbers of a line that starts with their count."""
         lead = self.words[0]
         count = int(lead) if lead.isascii() and lead.isdigit() and len(lead) < 4 else 0
         if not 1 <= count <= MAX_COEFFICIENTS:
-            self.fail(f"a count of 1 to {MAX_COEFFICIENTS}, then so many {what}")
+            self.fail(f"a count of 1 to {MAX_COEFFICIENTS}, then that number of {what}")
         return self.numbers(f"a count and {what}", count + 1)[1:]
 
 
 def import_ocam(lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror") -> Rig:
-    """The rig of two calib_results.txt; its frame is the lower viewpoint's, see rig_between."""
+    """Read the rig of two calib_results.txt; its frame is the lower viewpoint's, see rig_between."""
     lower, upper = (parse_ocam(read_bytes(path), view, str(path)) for path in (lower_path, upper_path))
     return rig_between(lower, upper, T_lower_upper)
 
 
 def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
-    """The camera in the text of a calib_results.txt; the inverse polynomial is checked and left: ours is exact."""
+    """Parse the camera of a calib_results.txt's text; the inverse polynomial is checked and not used."""
     lines = [_Line(number, line.split(), name) for number, line in enumerate(decode(text, name).splitlines(), 1)
              if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) != 5:
@@ -76,13 +77,13 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
 
 def _size(line: _Line) -> tuple[int, int]:
     height, width = line.numbers("height and width of the image", 2)
-    if not all(1 <= side <= 32767 and side == int(side) for side in (height, width)):
-        line.fail("the image's height and width in whole pixels, 1 to 32767")
+    if not all(1 <= side <= MAX_SIDE_PX and side == int(side) for side in (height, width)):
+        line.fail(f"the image's height and width in whole pixels, 1 to {MAX_SIDE_PX}")
     return int(width), int(height)
 
 
 def export_ocam(camera: OmniCamera) -> str:
-    """The camera as the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
+    """Return the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
     if not isinstance(camera, OcamCamera):
         raise CalibError("export: calib_results.txt holds ocam cameras, found an omni camera; use --format kalibr")
     width, height = camera.size
@@ -98,7 +99,7 @@ def export_ocam(camera: OmniCamera) -> str:
 
 
 def inverse_polynomial(camera: OcamCamera) -> tuple[float, ...]:
-    """Coefficients of rho [px] in atan(f(rho)/rho) [rad], over the radii of the image, as the toolbox's files carry."""
+    """Fit rho [px] as a polynomial of atan(f(rho)/rho) [rad] over the radii of the image, as in the toolbox's files."""
     corners = np.hypot(*(np.maximum(camera.center, np.subtract(camera.size, camera.center))))
     radii = np.linspace(0, min(float(corners), camera.radius_limit_px), 1000)
     angles = np.arctan2(camera.height(radii), radii)

@@ -1,4 +1,4 @@
-"""Panoramas on a cylinder about the line through both viewpoints: every epipolar line is a column.
+"""Panoramas on a cylinder about the line through both viewpoints, in which every epipolar line is a column.
 
 column: azimuth falls from left to right, as seen from inside; azimuth 0 (the rig's x) is in the middle.
 row = row0 - focal * z / r, r the distance from the axis, so row_upper - row_lower = focal * baseline / r.
@@ -18,11 +18,17 @@ from calib.models.camera import Array, inside_image
 from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+# Grid on which the common field of view is measured, and the least share of azimuths at which a slope is visible.
+SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
+# Least length of the horizon of a camera that sees it.
+MIN_HORIZON_PX = 64
+# Guards against division by zero on the cylinder's axis.
+MIN_RADIUS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """Size and scale of a panorama [px]; pixels are (column, row), columns wrap around at width."""
+    """Size and scale of a panorama [px]; pixels are (column, row), columns are periodic in width."""
 
     width: int
     height: int
@@ -30,70 +36,70 @@ class Cylinder:
 
     @property
     def focal_px(self) -> float:
-        """Pixels per radian of azimuth, and per unit of z/r: square pixels on the horizon."""
+        """Return the pixels per radian of azimuth, and per unit of z/r: square pixels on the horizon."""
         return self.width / (2 * math.pi)
 
     def rays(self, pixels: Array) -> Array:
-        """Rays (N, 3) with r = 1 in the rectified frame of pixels (N, 2)."""
+        """Return rays (N, 3) with r = 1 in the rectified frame of pixels (N, 2)."""
         azimuth = math.pi - (pixels[:, 0] + 0.5) / self.focal_px
         return np.column_stack([np.cos(azimuth), np.sin(azimuth), (self.row0 - pixels[:, 1]) / self.focal_px])
 
     def pixels(self, points: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3) relative to the viewpoint, in the rectified frame."""
+        """Return pixels (N, 2) of points (N, 3) relative to the viewpoint, in the rectified frame."""
         r = np.hypot(points[:, 0], points[:, 1])
         column = (math.pi - np.arctan2(points[:, 1], points[:, 0])) * self.focal_px - 0.5
-        return np.column_stack([column, self.row0 - self.focal_px * points[:, 2] / np.maximum(r, 1e-9)])
+        return np.column_stack([column, self.row0 - self.focal_px * points[:, 2] / np.maximum(r, MIN_RADIUS)])
 
     def wrap(self, columns: Array) -> Array:
-        """Column differences brought into [-width/2, width/2)."""
+        """Return column differences, mapped to [-width/2, width/2)."""
         return np.asarray((columns + self.width / 2) % self.width - self.width / 2)
 
 
 def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0)) -> Cylinder:
-    """The panorama that shows what both cameras see between two elevations; width 0: the image's own resolution."""
+    """Return the panorama of the elevations that both cameras see; width 0: the resolution of the images."""
     width = width_px or 8 * round(_horizon_px(rig) / 8)
     focal = width / (2 * math.pi)
     low, high = (np.tan(np.deg2rad(elevation_deg)))
-    seen = [_seen_slopes(rig, mounted, np.linspace(low, high, 400)) for mounted in (rig.lower, rig.upper)]
+    seen = [_seen_slopes(rig, mounted, np.linspace(low, high, SLOPES)) for mounted in (rig.lower, rig.upper)]
     both = seen[0] & seen[1]
     if not both.any():
         raise CalibError(f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
                          "of elevation; check the transforms and the masks")
-    slopes = np.linspace(low, high, 400)[both]
+    slopes = np.linspace(low, high, SLOPES)[both]
     row0 = float(focal * slopes.max())
     return Cylinder(width, math.ceil(row0 - focal * slopes.min()) + 1, row0)
 
 
 def _seen_slopes(rig: Rig, mounted: MountedCamera, slopes: Array) -> NDArray[np.bool_]:
-    """Which slopes z/r a camera sees at one azimuth in two at least."""
-    azimuth = np.deg2rad(np.arange(0, 360, 15))
+    """Return the mask of slopes z/r that a camera sees at half of all azimuths at least."""
+    azimuth = np.deg2rad(np.arange(0, 360, AZIMUTH_STEP_DEG))
     grid = np.column_stack([np.tile(np.cos(azimuth), len(slopes)), np.tile(np.sin(azimuth), len(slopes)),
                             np.repeat(slopes, len(azimuth))])
     pixels = _project(rig, mounted, grid)
     seen = inside_image(mounted.camera, pixels) & mounted.visible.contains(pixels)
-    return np.asarray(seen.reshape(len(slopes), -1).mean(axis=1) >= 0.5)
+    return np.asarray(seen.reshape(len(slopes), -1).mean(axis=1) >= MIN_VISIBLE)
 
 
 def _horizon_px(rig: Rig) -> float:
-    """Pixels around the horizon in the coarser camera."""
+    """Return the length of the horizon [px] in the camera with the lower resolution."""
     azimuth = np.linspace(0, 2 * math.pi, 361)
     ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)])
     around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1).sum() for m in (rig.lower, rig.upper)]
-    if not np.isfinite(around).all() or min(around) < 64:
+    if not np.isfinite(around).all() or min(around) < MIN_HORIZON_PX:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     return float(min(around))
 
 
 def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:
-    """Pixels of rays (N, 3) in the rectified frame, cast from the camera's own viewpoint."""
+    """Return the pixels of rays (N, 3) in the rectified frame that start at the camera's own viewpoint."""
     R_cam_rect = mounted.T_cam_rig[:3, :3] @ se3.inverse(rig.T_rect_rig)[:3, :3]
     return mounted.camera.project(rays @ R_cam_rect.T)
 
 
 def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: int = 0) -> Maps:
-    """Image coordinates (H, W + 2 pad) float32 of every panorama pixel, for cv2.remap; -1 where nothing is seen.
+    """Return image coordinates (H, W + 2 pad) float32 of every panorama pixel, for cv2.remap; -1 outside the image.
 
-    pad_px columns are repeated on either side, so that a window or a pyramid runs across the seam.
+    pad_px columns are repeated on either side, so that windows and pyramids are continuous across the seam.
     """
     columns, rows = np.meshgrid(np.arange(-pad_px, cylinder.width + pad_px), np.arange(cylinder.height))
     pixels = _project(rig, mounted, cylinder.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)))
@@ -103,7 +109,7 @@ def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: i
 
 
 def visible(mounted: MountedCamera, maps: Maps, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Which panorama pixels (of remap tables) show the world: on the image and inside the camera's mask."""
+    """Return the mask (H, W) of panorama pixels (of remap tables) on the image and inside the camera's mask."""
     pixels = np.stack(maps, axis=-1).reshape(-1, 2).astype(float)
     seen = (pixels[:, 0] >= 0) & mounted.visible.contains(pixels, margin_px)
     return seen.reshape(maps[0].shape)

@@ -1,4 +1,4 @@
-"""Two mirror cameras on one rigid body, and the frame in which their epipolar lines are columns."""
+"""Two omnidirectional cameras on one rigid body, and the frame in which their epipolar lines are columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MIN_BASELINE_M = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class MountedCamera:
-    """A camera on the rig: p_cam = T_cam_rig @ p_rig; mask None where nobody has measured it."""
+    """A camera on the rig: p_cam = T_cam_rig @ p_rig; mask None if it was not measured."""
 
     camera: OmniCamera
     T_cam_rig: Array  # (4, 4)
@@ -23,23 +23,23 @@ class MountedCamera:
 
     @property
     def viewpoint(self) -> Array:
-        """The camera's single viewpoint (3,) [m] in the rig frame."""
+        """Return the camera's viewpoint (3,) [m] in the rig frame."""
         return se3.inverse(self.T_cam_rig)[:3, 3]
 
     @property
     def visible(self) -> Mask:
-        """The mask, or the largest ring in the image where none is known."""
+        """Return the mask, or the largest disc in the image if none is known."""
         return self.mask or inscribed_mask(self.camera)
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lower and the upper camera; T_base_rig places the rig on the robot."""
+    """The lower and the upper camera; T_base_rig is the rig's pose on the robot."""
 
     lower: MountedCamera
     upper: MountedCamera
     T_base_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4)
-    topics: tuple[str, str] = ("", "")  # of the lower and the upper camera's images; "" where unknown
+    topics: tuple[str, str] = ("", "")  # of the lower and the upper camera's images; "" if unknown
 
     def __post_init__(self) -> None:
         for name, T in (("lower T_cam_rig", self.lower.T_cam_rig), ("upper T_cam_rig", self.upper.T_cam_rig),
@@ -52,15 +52,14 @@ class Rig:
 
     @property
     def baseline_m(self) -> float:
-        """Distance of the two viewpoints [m]."""
+        """Return the distance of the two viewpoints [m]."""
         return float(np.linalg.norm(self.upper.viewpoint - self.lower.viewpoint))
 
     @property
     def T_rect_rig(self) -> Array:
-        """The rectified frame (4, 4): origin in the lower viewpoint, z towards the upper one, x nearest the rig's x.
+        """Return T_rect_rig (4, 4): origin in the lower viewpoint, z towards the upper one, x nearest the rig's x.
 
-        In it the upper viewpoint is (0, 0, baseline) and the paper's T = (0, 0, t), R = I holds exactly
-        (Dang et al. 2012, section III.A).
+        In the rectified frame the upper viewpoint is (0, 0, baseline): T = (0, 0, t), R = I (Dang et al. 2012, III.A).
         """
         z = (self.upper.viewpoint - self.lower.viewpoint) / self.baseline_m
         forward = np.array([1.0, 0, 0]) if abs(z[0]) < 0.9 else np.array([0, 1.0, 0])

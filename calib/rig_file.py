@@ -1,6 +1,6 @@
-"""The rig as text: `rig.toml`, schema 1, strict. Rotations come back bit for bit, translations to a picometre.
+"""The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
 
-Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): where the cameras are.
+Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from calib.camera_table import camera_text, intrinsics_text, mask_text, number_t
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
-from calib.strict import Table, read_bytes, require_schema, toml_table
+from calib.validation import ValidatedTable, read_bytes, require_schema, toml_table
 
 SCHEMA = 1
 SIDES = ("lower", "upper")
-# Translations are written to 1e-12 m: inverting twice rounds differently, a grid makes the text its own fixed point.
+# Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
 TRANSLATION_DECIMALS = 12
 
 
 def read_rig(path: Path) -> Rig:
-    """The rig in a `rig.toml`; a mask's image is looked for beside it."""
+    """Read the rig of a `rig.toml`; a mask's image is read from the same folder."""
     return parse_rig(read_bytes(path), path.parent, str(path))
 
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
-    """The rig in the text of a `rig.toml`; folder holds its mask images, None where only embedded ones can be had."""
+    """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    table.only(("schema", "T_base_rig", *SIDES))
+    table.allow_only(("schema", "T_base_rig", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)
     topics = [side.text("topic") if side.has("topic") else "" for side in (lower, upper)]
@@ -42,13 +42,13 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]))
 
 
-def _mounted(table: Table, folder: Path | None, transform: str) -> MountedCamera:
+def _mounted(table: ValidatedTable, folder: Path | None, transform: str) -> MountedCamera:
     camera, mask = read_camera_table(table, folder, [transform])
     return MountedCamera(camera, se3.inverse(table.transform(transform)), mask)
 
 
 def write_rig(path: Path, rig: Rig) -> None:
-    """Write `rig.toml`, and a mask's image beside it as `<stem>.lower.png` or `<stem>.upper.png`."""
+    """Write `rig.toml`, and mask images in the same folder as `<stem>.lower.png` and `<stem>.upper.png`."""
     images: dict[str, str] = {}
     for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True):
         if mounted.mask is not None and mounted.mask.image is not None:
@@ -58,7 +58,7 @@ def write_rig(path: Path, rig: Rig) -> None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all; a pipe or a device is written as it is."""
+    """Write a file atomically; a pipe or a device is written directly."""
     target = Path(os.path.realpath(path))
     try:
         _write_whole(target, data)
@@ -80,7 +80,7 @@ def _write_whole(target: Path, data: bytes) -> None:
 
 
 def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
-    """The text of `rig.toml`; images names mask images by side, one that is not named is embedded."""
+    """Return the text of a `rig.toml`; images: file names of mask images by side, others are embedded."""
     parts = [f"schema = {SCHEMA}\nT_base_rig = {_matrix(rig.T_base_rig)}\n"]
     for side, mounted, topic in zip(SIDES, (rig.lower, rig.upper), rig.topics, strict=True):
         parts.append(camera_text(side, mounted.camera, topic))

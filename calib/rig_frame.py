@@ -1,4 +1,4 @@
-"""A rig out of two cameras of which only the transform between them is known."""
+"""Construction of a rig from two cameras and the transform between them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
 
-# Half the span, in pixels, over which the image's axis is measured: well inside any mirror or lens.
+# Half the distance in pixels over which the image's axis is measured: inside any mirror or lens.
 STEP_PX = 1.0
 
 
 def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
-    """The rig whose frame is the lower viewpoint: z towards the upper one, x along the lower image's u axis."""
+    """Return the rig with its frame at the lower viewpoint: z to the upper one, x along the lower image's u axis."""
     baseline = float(np.linalg.norm(T_lower_upper[:3, 3]))
     if not baseline >= MIN_BASELINE_M:
         raise CalibError(f"rig: the viewpoints must lie apart, found {baseline * 1e3:.3f} mm between them")
@@ -29,9 +29,9 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
 
 
 def image_axis(camera: OmniCamera, step_px: tuple[float, float]) -> Array:
-    """Unit vector (3,) in the camera frame along which the image runs at its centre, for a step in pixels."""
+    """Return the unit vector (3,) in the camera frame that corresponds to a step in pixels at the image's centre."""
     ends = camera.lift(np.array([np.subtract(camera.center, step_px), np.add(camera.center, step_px)]))
     axis = ends[1] - ends[0]
     if not np.isfinite(axis).all():
-        raise CalibError("rig: the lower camera's model has no ray next to its own centre; check its intrinsics")
+        raise CalibError("rig: the lower camera's model has no ray next to its centre; check its intrinsics")
     return np.asarray(axis / np.linalg.norm(axis))

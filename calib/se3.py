@@ -1,4 +1,4 @@
-"""Rigid transforms as 4x4 matrices, `p_a = T_a_b @ p_b`; all functions accept stacks (..., 4, 4)."""
+"""Rigid transforms as 4x4 matrices, `p_a = T_a_b @ p_b`; functions accept stacks (..., 4, 4)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# Below these the series, or the limit, is as exact as the formula.
+SMALL_ANGLE_RAD = 1e-4
+SMALL_NORM = 1e-9
 
 
 def transform(R: ArrayLike, t: ArrayLike) -> Array:
-    """The 4x4 transform of rotation R (..., 3, 3) and translation t (..., 3)."""
+    """Return the transform (..., 4, 4) of rotation R (..., 3, 3) and translation t (..., 3)."""
     R, t = np.asarray(R, float), np.asarray(t, float)
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
@@ -17,20 +20,20 @@ def transform(R: ArrayLike, t: ArrayLike) -> Array:
 
 
 def inverse(T: ArrayLike) -> Array:
-    """T_b_a of T_a_b, exactly rigid: (R^T, -R^T t)."""
+    """Return T_b_a of T_a_b: (R^T, -R^T t)."""
     T = np.asarray(T, float)
     R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
 
 def apply(T: ArrayLike, points: ArrayLike) -> Array:
-    """Points (..., N, 3) moved by T (..., 4, 4)."""
+    """Transform points (..., N, 3) by T (..., 4, 4)."""
     T = np.asarray(T, float)
     return np.asarray(np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
 def hat(w: ArrayLike) -> Array:
-    """The cross-product matrix (..., 3, 3) of w (..., 3): hat(w) @ v = w x v."""
+    """Return the cross-product matrix (..., 3, 3) of w (..., 3): hat(w) @ v = w x v."""
     w = np.asarray(w, float)
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
@@ -38,8 +41,8 @@ def hat(w: ArrayLike) -> Array:
 
 
 def _series(angle: Array) -> tuple[Array, Array, Array]:
-    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, by their series where a is tiny."""
-    small = angle < 1e-4
+    """Return sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3; by their series for small a."""
+    small = angle < SMALL_ANGLE_RAD
     a = np.where(small, 1.0, angle)
     first = np.where(small, 1 - angle**2 / 6, np.sin(a) / a)
     second = np.where(small, 0.5 - angle**2 / 24, 2 * (np.sin(a / 2) / a) ** 2)
@@ -48,7 +51,7 @@ def _series(angle: Array) -> tuple[Array, Array, Array]:
 
 
 def rotation_exp(w: ArrayLike) -> Array:
-    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
+    """Return the rotation matrix (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
     w = np.asarray(w, float)
     a, b, _ = _series(np.linalg.norm(w, axis=-1))
     W = hat(w)
@@ -56,16 +59,17 @@ def rotation_exp(w: ArrayLike) -> Array:
 
 
 def rotation_log(R: ArrayLike) -> Array:
-    """Rotation vector (..., 3) [rad] of a rotation matrix, good up to and including half a turn."""
+    """Return the rotation vector (..., 3) [rad] of a rotation matrix, for angles from 0 to pi inclusive."""
     q = quaternion(R)
     norm = np.linalg.norm(q[..., :3], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 3])
-    scale = np.where(norm < 1e-9, 2.0, angle / np.where(norm < 1e-9, 1.0, norm))
+    small = norm < SMALL_NORM
+    scale = np.where(small, 2.0, angle / np.where(small, 1.0, norm))
     return np.asarray(q[..., :3] * scale[..., None])
 
 
 def exp(xi: ArrayLike) -> Array:
-    """The transform of a twist xi (..., 6) = [translation; rotation vector]."""
+    """Return the transform (..., 4, 4) of a twist xi (..., 6) = [translation; rotation vector]."""
     xi = np.asarray(xi, float)
     _, b, c = _series(np.linalg.norm(xi[..., 3:], axis=-1))
     W = hat(xi[..., 3:])
@@ -74,7 +78,7 @@ def exp(xi: ArrayLike) -> Array:
 
 
 def log(T: ArrayLike) -> Array:
-    """The twist (..., 6) = [translation; rotation vector] whose exp is T."""
+    """Return the twist (..., 6) = [translation; rotation vector] whose exp is T."""
     T = np.asarray(T, float)
     w = rotation_log(T[..., :3, :3])
     _, b, c = _series(np.linalg.norm(w, axis=-1))
@@ -84,7 +88,7 @@ def log(T: ArrayLike) -> Array:
 
 
 def adjoint(T: ArrayLike) -> Array:
-    """Matrix (..., 6, 6) that carries a small motion [translation; rotation] in frame b into frame a, for T_a_b."""
+    """Return the matrix (..., 6, 6) of T_a_b that maps twists [translation; rotation] from frame b to frame a."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
     A = np.zeros((*T.shape[:-2], 6, 6))
@@ -94,13 +98,13 @@ def adjoint(T: ArrayLike) -> Array:
 
 
 def interpolate(T_a: ArrayLike, T_b: ArrayLike, s: float) -> Array:
-    """The pose at fraction s of the screw motion from T_a (s = 0) to T_b (s = 1)."""
+    """Return the pose at fraction s of the screw motion from T_a (s = 0) to T_b (s = 1)."""
     T_a = np.asarray(T_a, float)
     return np.asarray(T_a @ exp(s * log(inverse(T_a) @ np.asarray(T_b, float))))
 
 
 def quaternion(R: ArrayLike) -> Array:
-    """Unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
+    """Return the unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
     R = np.asarray(R, float)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product q q^T: its longest column is the best conditioned estimate of q.
@@ -120,7 +124,7 @@ def quaternion(R: ArrayLike) -> Array:
 
 
 def rotation(q: ArrayLike) -> Array:
-    """Rotation matrix (..., 3, 3) of a quaternion (..., 4) = (x, y, z, w), normalised here."""
+    """Return the rotation matrix (..., 3, 3) of a quaternion (..., 4) = (x, y, z, w), which is normalised first."""
     given = np.asarray(q, float)
     unit = given / np.linalg.norm(given, axis=-1, keepdims=True)
     W = hat(unit[..., :3])
@@ -128,13 +132,13 @@ def rotation(q: ArrayLike) -> Array:
 
 
 def yaw(T: ArrayLike) -> Array:
-    """Heading (...,) [rad] of the x axis of T about z."""
+    """Return the heading (...,) [rad] of the x axis of T about z."""
     T = np.asarray(T, float)
     return np.asarray(np.arctan2(T[..., 1, 0], T[..., 0, 0]))
 
 
 def is_rigid(T: ArrayLike, tolerance: float = 1e-4) -> bool:
-    """Whether T is a finite (4, 4) rotation and translation (no scale, no reflection)."""
+    """True if T is a finite (4, 4) rotation and translation (no scale, no reflection)."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], (0, 0, 0, 1), atol=tolerance):
         return False

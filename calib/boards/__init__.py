@@ -1,1 +1,1 @@
-"""Checkerboards, and finding them in mirror images."""
+"""Checkerboards and their detection in mirror images."""

@@ -1,4 +1,4 @@
-"""A checkerboard and how one image shows it."""
+"""A checkerboard and its view in one image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 from calib.errors import CalibError
 from calib.models.camera import Array
 
+# Inner corners along one side: fewer do not determine a pose well, more are a misread option.
 MIN_SIDE, MAX_SIDE = 3, 60
+MIN_SQUARE_M, MAX_SQUARE_M = 1e-4, 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,23 +25,23 @@ class Board:
     def __post_init__(self) -> None:
         if not all(MIN_SIDE <= side <= MAX_SIDE for side in (self.columns, self.rows)):
             raise CalibError(f"board: expected {MIN_SIDE} to {MAX_SIDE} inner corners a side, found "
-                             f"{self.columns}x{self.rows}; count where four squares meet, not the squares")
-        if not 1e-4 <= self.square_m <= 10:
+                             f"{self.columns}x{self.rows}; count the points where four squares meet, not the squares")
+        if not MIN_SQUARE_M <= self.square_m <= MAX_SQUARE_M:
             raise CalibError(f"board: expected squares of 0.1 mm to 10 m, found {self.square_m * 1e3:g} mm")
 
     @property
     def points(self) -> Array:
-        """The corners (N, 3) [m] in the board's frame: column by column along x, then row by row along y, z = 0."""
+        """Return the corners (N, 3) [m] in the board's frame, row by row: x along the columns, y down the rows, z 0."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_m, float)
 
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The corners of a board in one image: pixels (N, 2) in the order of Board.points.
+    """The corners of a board in one image: pixels (N, 2) in the order of Board.points, NaN for unknown corners.
 
-    confidence 0 to 1: how much the worst corners look like ones. x, y of the board turn clockwise in the image, and
-    the first square is dark where the board's sides (one even, one odd) can tell.
+    confidence 0 to 1: share of accepted corners times the regularity of the grid. The board's x and y axes turn
+    clockwise in the image. The first square is dark where the board's sides (one even, one odd) determine it.
     """
 
     name: str

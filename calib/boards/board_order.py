@@ -1,4 +1,4 @@
-"""The board in a grid of corners: the part of the right count, and which way round it is."""
+"""Selection of the board's window in a grid of corners, and the orientation of its corners."""
 
 from __future__ import annotations
 
@@ -11,20 +11,23 @@ from calib.boards.corner_candidates import Grey, sample
 from calib.boards.corner_grid import Grid
 from calib.models.camera import Array
 
-# A board may lack this part of its corners, if every one of its four borders shows so many of its own.
+# Least share of known corners in the whole board and in each of its four borders.
 MIN_FILLED = 0.9
 MIN_BORDER = 0.6
-# A row beyond the board with so many of its corners there belongs to a larger board.
+# A row just outside with at least this share of corners belongs to a larger board.
 BEYOND = 0.7
 
 
-def place(grid: Grid, board: Board) -> Array | None:
-    """Corners (rows, columns, 2), NaN where hidden: what of the grid has the board's count and nothing beyond it."""
-    return max(_windows(grid, board), key=lambda window: float(np.isfinite(window).mean()), default=None)
+def select_board_window(grid: Grid, board: Board) -> Array | None:
+    """Return the corners (rows, columns, 2), NaN if hidden, of the grid's fullest isolated window of the board's size.
+
+    None if there is no such window.
+    """
+    return max(_board_windows(grid, board), key=lambda window: float(np.isfinite(window).mean()), default=None)
 
 
-def as_array(grid: Grid) -> Array:
-    """The grid as (rows, columns, 2) with a border of two NaN all around."""
+def grid_to_array(grid: Grid) -> Array:
+    """Return the grid as an array (rows, columns, 2) with a border of two NaN on all sides."""
     cells = np.array(list(grid))
     low, high = cells.min(axis=0) - 2, cells.max(axis=0) + 2
     corners = np.full((high[1] - low[1] + 1, high[0] - low[0] + 1, 2), np.nan)
@@ -33,23 +36,23 @@ def as_array(grid: Grid) -> Array:
     return corners
 
 
-def as_grid(corners: Array) -> Grid:
-    """The known corners (rows, columns, 2) by (column, row)."""
+def array_to_grid(corners: Array) -> Grid:
+    """Return the known corners of an array (rows, columns, 2) by (column, row)."""
     return {(int(i), int(j)): corners[j, i] for j, i in np.argwhere(np.isfinite(corners[..., 0]))}
 
 
-def _windows(grid: Grid, board: Board) -> Iterator[Array]:
-    """Every placing of the board, either way up, that is filled well and has no row beyond it."""
-    for upright in (as_array(grid), _quarter(as_array(grid))):
+def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
+    """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it."""
+    for upright in (grid_to_array(grid), _rotated_quarter(grid_to_array(grid))):
         known = np.isfinite(upright[..., 0])
         for j in range(1, known.shape[0] - board.rows):
             for i in range(1, known.shape[1] - board.columns):
                 around = known[j - 1:j + board.rows + 1, i - 1:i + board.columns + 1]
-                if _stands_alone(around):
+                if _is_isolated(around):
                     yield upright[j:j + board.rows, i:i + board.columns]
 
 
-def _stands_alone(around: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> bool:
+def _is_isolated(around: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> bool:
     inside = around[1:-1, 1:-1]
     borders = (inside[0], inside[-1], inside[:, 0], inside[:, -1])
     beyond = (around[0, 1:-1], around[-1, 1:-1], around[1:-1, 0], around[1:-1, -1])
@@ -57,14 +60,14 @@ def _stands_alone(around: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> bo
                 and max(row.mean() for row in beyond) < BEYOND)
 
 
-def _quarter(corners: Array) -> Array:
-    """The corners turned by a quarter, so that columns and rows change places and the turning sense is kept."""
+def _rotated_quarter(corners: Array) -> Array:
+    """Return the corners rotated by 90 degrees: columns and rows are exchanged, the orientation is kept."""
     return np.rot90(corners, axes=(0, 1))
 
 
-def largest_board(grid: Grid) -> tuple[int, int]:
-    """Columns and rows of the largest full rectangle in a grid: what board there seems to be."""
-    known = np.isfinite(as_array(grid)[..., 0])
+def largest_rectangle(grid: Grid) -> tuple[int, int]:
+    """Return columns and rows of the largest full rectangle in a grid: the size of a board that may be present."""
+    known = np.isfinite(grid_to_array(grid)[..., 0])
     heights, best = np.zeros(known.shape[1], int), (0, 0)
     for row in known:
         heights = np.where(row, heights + 1, 0)
@@ -75,15 +78,18 @@ def largest_board(grid: Grid) -> tuple[int, int]:
     return best
 
 
-def in_order(image: Grey, corners: Array, board: Board) -> Array:
-    """Corners (rows, columns, 2) turned so that the first square is dark where that can be, else to the upper left."""
+def orient_corners(image: Grey, corners: Array, board: Board) -> Array:
+    """Return the corners (rows, columns, 2) rotated so that the first square is dark.
+
+    If several orders satisfy that, or none does, the first corner is the one nearest the image's upper left.
+    """
     turned = [np.rot90(corners, turns, axes=(0, 1)) for turns in range(4)]
     fitting = [way for way in turned if way.shape[:2] == (board.rows, board.columns)]
-    dark = [way for way in fitting if _first_is_dark(image, way)] or fitting
+    dark = [way for way in fitting if _first_square_is_dark(image, way)] or fitting
     return min(dark, key=lambda way: float(np.nansum(way[0, 0])) if np.isfinite(way[0, 0, 0]) else np.inf)
 
 
-def _first_is_dark(image: Grey, corners: Array) -> bool:
+def _first_square_is_dark(image: Grey, corners: Array) -> bool:
     middles = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
     grey = np.where(np.isfinite(middles[..., 0]), sample(image, np.nan_to_num(middles)), np.nan)
     odd = np.indices(grey.shape).sum(axis=0) % 2 == 1

@@ -1,4 +1,4 @@
-"""Where a board is before a camera that is known, and how a board may be turned that its image does not tell."""
+"""Pose of a board in front of a known camera, and the corner orders that one image cannot distinguish."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ MIN_CORNERS = 6
 
 
 def board_pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
-    """T_cam_board (4, 4) of corners (N, 2), NaN where unknown, by a linear solution; None where too few have a ray.
+    """Estimate T_cam_board (4, 4) from corners (N, 2), NaN for unknown ones; None if too few have a ray.
 
-    The rays' homography [r1 r2 t] (Zhang 2000, section 2.1, with rays for pixels).
+    Linear solution by the rays' homography [r1 r2 t] (Zhang 2000, section 2.1, with rays in place of pixels).
     """
     rays, xy1 = camera.lift(pixels), np.column_stack([board.points[:, :2] / board.square_m, np.ones(len(pixels))])
     known = np.isfinite(rays).all(axis=1)
@@ -32,16 +32,17 @@ def board_pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
 
 
 def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board: Board) -> float:
-    """Mean angle between the rays of corners (N, 2) and the board's points."""
+    """Return the mean angle between the rays of corners (N, 2) and the board's points."""
     rays, points = camera.lift(pixels), se3.apply(T_cam_board, board.points)
     across = np.linalg.norm(np.cross(rays, points), axis=1)
     return float(np.nanmean(np.arctan2(across, (rays * points).sum(axis=1))))
 
 
-def turns(board: Board) -> list[NDArray[np.intp]]:
-    """The orders (N,) of its corners that one image of a board cannot tell apart; the first is the one it has.
+def ambiguous_orders(board: Board) -> list[NDArray[np.intp]]:
+    """Return the orders (N,) of the corners that one image of a board cannot distinguish; the first is the identity.
 
-    One side odd and one even: the colours tell. Else half a turn looks the same; an even square so does at any quarter.
+    If one side is odd and one even, the colours determine the order. Otherwise a rotation by 180 degrees is ambiguous,
+    and for a square board with even sides every rotation by 90 degrees.
     """
     grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)
     if (board.columns + board.rows) % 2:

@@ -1,4 +1,4 @@
-"""Points of a image where four squares of a checkerboard may meet: saddles of brightness with two crossing edges."""
+"""Corner candidates: points where four squares may meet, found as saddle points of grey with two crossing edges."""
 
 from __future__ import annotations
 
@@ -11,68 +11,79 @@ from numpy.typing import NDArray
 from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
+# Samples on the ring about a corner.
 RING = 32
-# A corner's ring: light and dark must differ by so many grey levels, and opposite sides be alike: the odd part of the
-# ring may have this part of the even one's size.
+# Least contrast of a ring [grey levels].
 MIN_CONTRAST = 6.0
+# Opposite sides of a corner are alike: largest ratio of the ring's odd part to its even part (standard deviations).
 MAX_ODD = 0.6
-# The two edges of a corner cross at no less than this.
+# Least angle between the two edges of a corner.
 MIN_CROSSING_RAD = np.deg2rad(18)
+# Least second derivative at a saddle point [grey levels / px^2].
+MIN_SADDLE = 0.6
+# Quality falls from 1 to this over the accepted range of the odd part.
+MIN_RING_QUALITY = 0.1
+# Contrast [grey levels] above which candidates are ranked by quality alone.
+FULL_CONTRAST = 40
+# Smallest side [px] of a shrunk image that is searched.
+MIN_LEVEL_SIDE_PX = 100
 MAX_PER_LEVEL = 4000
+# Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner.
 SAME_PX = 2.0
-REMAP_COLUMNS = 1024  # cv2.remap takes images, not lists
+SAME_RING_PART = 0.35
+# cv2.remap expects images, not lists: samples are folded into rows of this length.
+REMAP_COLUMNS = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
-    """How large a corner is looked for: the image shrunk by scale, blurred, a ring of that radius [shrunk px]."""
+class ScaleLevel:
+    """A scale of the search: the image resized by scale and blurred; radius of the ring [resized px]."""
 
     scale: float
     blur_px: float
     ring_px: float
 
 
-LEVELS = (Level(1.0, 0.8, 2.6), Level(1.0, 1.4, 4.6), Level(0.5, 1.2, 4.2), Level(0.25, 1.2, 4.2))
+LEVELS = (ScaleLevel(1.0, 0.8, 2.6), ScaleLevel(1.0, 1.4, 4.6), ScaleLevel(0.5, 1.2, 4.2), ScaleLevel(0.25, 1.2, 4.2))
 
 
 @dataclass(frozen=True, slots=True)
-class Corners:
-    """Candidates: pixels (N, 2), edge angles (N, 2) [rad] rising in [0, pi), whether the image is light between the
-    first and the second (N,), ring contrast (N,) in grey levels, quality (N,) 0 to 1, ring radius (N,) [px].
-    """
+class CornerCandidates:
+    """Candidates for corners and the description of their rings."""
 
-    pixels: Array
-    angles: Array
-    light: NDArray[np.bool_]
-    contrast: Array
-    quality: Array
-    ring_px: Array
+    pixels: Array  # (N, 2)
+    angles: Array  # (N, 2) [rad] of the two edges, rising, in [0, pi)
+    light: NDArray[np.bool_]  # (N,) True if the image is light between the first and the second edge
+    contrast: Array  # (N,) [grey levels]
+    quality: Array  # (N,) 0 to 1; 0: not a corner
+    ring_px: Array  # (N,) radius of the ring
 
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def only(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Corners:
-        """The candidates of that selection."""
-        return Corners(self.pixels[chosen], self.angles[chosen], self.light[chosen], self.contrast[chosen],
+    def select(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> CornerCandidates:
+        """Return the candidates of an index or mask."""
+        return CornerCandidates(self.pixels[chosen], self.angles[chosen], self.light[chosen], self.contrast[chosen],
                        self.quality[chosen], self.ring_px[chosen])
 
 
-def find_corners(image: NDArray[np.uint8]) -> Corners:
-    """All candidates of a image (H, W), from fine to coarse; of several at one place the best is kept."""
-    levels = [level for level in LEVELS if min(image.shape) * level.scale >= 100 or level.scale == 1.0]
-    return _merged([_at_level(image, level) for level in levels])
+def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
+    """Find all candidates in an image (H, W) at all scales; of several at one place the best is kept."""
+    levels = [level for level in LEVELS
+              if min(image.shape) * level.scale >= MIN_LEVEL_SIDE_PX or level.scale == 1.0]
+    return _merge_levels([_at_level(image, level) for level in levels])
 
 
-def look_at(image: Grey, pixels: Array, ring_px: float | Array) -> Corners:
-    """What the rings about pixels (N, 2) look like, whatever they are; quality 0 where it is no corner."""
+def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> CornerCandidates:
+    """Describe the rings about pixels (N, 2); quality 0 for a pixel that is not a corner."""
     radius = np.broadcast_to(np.asarray(ring_px, float), (len(pixels),))
     angle = 2 * np.pi * np.arange(RING) / RING
     ring = sample(image, pixels[:, None] + radius[:, None, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
-    return _judged(ring, pixels, radius)
+    return _classify_rings(ring, pixels, radius)
 
 
 def sample(image: Grey, pixels: Array) -> Array:
-    """Grey values (...) of pixels (..., 2), bilinear, the border repeated."""
+    """Return grey values (...) at pixels (..., 2), bilinear, with the border repeated."""
     flat = pixels.reshape(-1, 2).astype(np.float32)
     padded = np.zeros((max(1, -(-len(flat) // REMAP_COLUMNS)) * REMAP_COLUMNS, 2), np.float32)
     padded[:len(flat)] = flat
@@ -82,25 +93,25 @@ def sample(image: Grey, pixels: Array) -> Array:
 
 
 def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
-    """The image (H, W) as float32, blurred."""
+    """Return the image (H, W) as float32 after a Gaussian blur."""
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), np.float32)
 
 
-def _at_level(image: NDArray[np.uint8], level: Level) -> Corners:
+def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
     shrunk = image if level.scale == 1 else cv2.resize(image, None, fx=level.scale, fy=level.scale,
                                                        interpolation=cv2.INTER_AREA)
     blurred = smoothed(shrunk, level.blur_px)
     places = _saddles(blurred, int(np.ceil(level.ring_px)))
-    found = look_at(blurred, places, level.ring_px)
-    found = found.only(found.quality > 0)
-    return Corners((found.pixels + 0.5) / level.scale - 0.5, found.angles, found.light, found.contrast, found.quality,
-                   found.ring_px / level.scale)
+    found = describe_corners(blurred, places, level.ring_px)
+    found = found.select(found.quality > 0)
+    return CornerCandidates((found.pixels + 0.5) / level.scale - 0.5, found.angles, found.light, found.contrast,
+                            found.quality, found.ring_px / level.scale)
 
 
 def _saddles(blurred: Grey, border: int) -> Array:
-    """Pixels (N, 2) of the strongest saddles, to a fraction of a pixel by the second-order surface."""
+    """Return pixels (N, 2) of the strongest saddle points, refined by the second-order surface."""
     strength, derivatives = _saddle_strength(blurred)
-    peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > (MIN_CONTRAST / 10) ** 2)
+    peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > MIN_SADDLE**2)
     peak[:border], peak[-border:], peak[:, :border], peak[:, -border:] = False, False, False, False
     row, column = np.nonzero(peak)
     best = np.argsort(-strength[row, column], kind="stable")[:MAX_PER_LEVEL]
@@ -112,7 +123,7 @@ def _saddles(blurred: Grey, border: int) -> Array:
 
 
 def _saddle_strength(blurred: Grey) -> tuple[Grey, list[Grey]]:
-    """Minus the Hessian's determinant, and the derivatives x, y, xx, yy, xy."""
+    """Return the negative determinant of the Hessian, and the derivatives x, y, xx, yy, xy."""
     orders = ((1, 0, 1 / 8), (0, 1, 1 / 8), (2, 0, 1 / 4), (0, 2, 1 / 4), (1, 1, 1 / 4))
     derivatives = [np.asarray(cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale), np.float32)
                    for dx, dy, scale in orders]
@@ -120,7 +131,8 @@ def _saddle_strength(blurred: Grey) -> tuple[Grey, list[Grey]]:
     return np.asarray(xy * xy - xx * yy, np.float32), derivatives
 
 
-def _judged(ring: Array, pixels: Array, radius: Array) -> Corners:
+def _classify_rings(ring: Array, pixels: Array, radius: Array) -> CornerCandidates:
+    """Describe corners by their rings (N, RING) of grey levels: even part, odd part, crossing edges."""
     half = RING // 2
     even, odd = (ring[:, :half] + ring[:, half:]) / 2, (ring[:, :half] - ring[:, half:]) / 2
     middle = (even.max(axis=1) + even.min(axis=1)) / 2
@@ -130,12 +142,12 @@ def _judged(ring: Array, pixels: Array, radius: Array) -> Corners:
     angles, light, crossings = _edges(wave)
     between = np.minimum(angles[:, 1] - angles[:, 0], np.pi - (angles[:, 1] - angles[:, 0]))
     good = (crossings == 2) & (contrast >= MIN_CONTRAST) & (ratio < MAX_ODD) & (between > MIN_CROSSING_RAD)
-    quality = np.where(good, 1 - ratio / MAX_ODD * 0.9, 0.0)
-    return Corners(pixels, angles, light, contrast, quality, radius)
+    quality = np.where(good, 1 - ratio / MAX_ODD * (1 - MIN_RING_QUALITY), 0.0)
+    return CornerCandidates(pixels, angles, light, contrast, quality, radius)
 
 
 def _edges(wave: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
-    """Edge angles (N, 2) [rad], light between them, and the number of edges (N,), of half rings (N, RING / 2)."""
+    """Return edge angles (N, 2) [rad], light between them (N,), and edge counts (N,) of half rings (N, RING / 2)."""
     after = np.roll(wave, -1, axis=1)
     crossing = (wave > 0) != (after > 0)
     count = crossing.sum(axis=1)
@@ -144,22 +156,23 @@ def _edges(wave: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
     part = before / np.where(before == behind, 1.0, before - behind)
     angles = (order + part) * np.pi / wave.shape[1]
     light = np.take_along_axis(after, order[:, :1], axis=1)[:, 0] > 0
-    wrapped = angles[:, 1] >= np.pi  # the second edge falls past the half ring's end and comes first
+    # An edge beyond the end of the half ring comes first.
+    wrapped = angles[:, 1] >= np.pi
     angles[wrapped] = np.column_stack([angles[wrapped, 1] - np.pi, angles[wrapped, 0]])
     return angles, np.where(wrapped, ~light, light), count
 
 
-def _merged(levels: list[Corners]) -> Corners:
-    """Everything found, each place once: the best of those that lie within one another's rings' inner half."""
-    both = Corners(*(np.concatenate([getattr(level, name) for level in levels])
-                     for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")))
-    worth = both.quality * np.minimum(1, both.contrast / 40)
-    both = both.only(np.argsort(-worth, kind="stable"))
-    return both.only(_first_of_each_place(both.pixels, np.maximum(SAME_PX, 0.35 * both.ring_px)))
+def _merge_levels(levels: list[CornerCandidates]) -> CornerCandidates:
+    """Merge the candidates of all scales; of several within a part of their ring's radius the best is kept."""
+    both = CornerCandidates(*(np.concatenate([getattr(level, name) for level in levels])
+                              for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")))
+    worth = both.quality * np.minimum(1, both.contrast / FULL_CONTRAST)
+    both = both.select(np.argsort(-worth, kind="stable"))
+    return both.select(_suppress_duplicates(both.pixels, np.maximum(SAME_PX, SAME_RING_PART * both.ring_px)))
 
 
-def _first_of_each_place(pixels: Array, reach: Array) -> NDArray[np.intp]:
-    """Indices of the points that have no earlier one within their reach [px]."""
+def _suppress_duplicates(pixels: Array, reach: Array) -> NDArray[np.intp]:
+    """Return indices of the points without an earlier point within their reach [px]."""
     cells: dict[tuple[int, int], list[int]] = {}
     side, kept = float(reach.max(initial=SAME_PX)), []
     for index, (u, v) in enumerate(pixels):

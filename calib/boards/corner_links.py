@@ -1,4 +1,4 @@
-"""Which corner candidates are neighbours on a checkerboard: joined by one straight enough edge between light and dark.
+"""Links between corner candidates that are neighbours on a checkerboard: joined by an edge between light and dark.
 
 Every corner has four arms, numbered 0 to 3 by rising angle in the image: both edges, each in both directions.
 """
@@ -8,28 +8,30 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.corner_candidates import Corners, Grey, sample
+from calib.boards.corner_candidates import CornerCandidates, Grey, sample
 from calib.models.camera import Array
 
-# Of so many nearest candidates an arm's neighbour is chosen.
+# Number of nearest candidates among which an arm's neighbour is chosen.
 NEAREST = 28
-# How far a neighbour may lie off the arm's direction: edges in a mirror are bent.
+# Rows of the distance matrix computed at once, which bounds memory.
+BLOCK = 512
+# Largest angle between an arm and the line to its neighbour: edges in a mirror image are curved.
 MAX_TURN_RAD = np.deg2rad(22)
-# The edge between two neighbours is looked at on both sides, this part of its length away, at these fractions of it,
-# and its two sides must differ by this part of the corners' contrast.
+# The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it. Its
+# two sides must differ by MIN_EDGE of the corners' contrast.
 ASIDE = 0.17
 ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
 MIN_EDGE = 0.3
-NOBODY = -1
+NO_NEIGHBOUR = -1
 
 
-def link(image: Grey, corners: Corners) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The neighbour of every corner's arm (N, 4), NOBODY where there is none, and the neighbour's arm that points back.
+def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the neighbour (N, 4) of every corner's arm, and the arm of that neighbour that points back (N, 4).
 
-    Only links that both ends choose are kept.
+    Only links that both ends choose are kept; all others are NO_NEIGHBOUR.
     """
     N = len(corners)
-    neighbour, back = (np.full((N, 4), NOBODY, np.int64) for _ in range(2))
+    neighbour, back = (np.full((N, 4), NO_NEIGHBOUR, np.int64) for _ in range(2))
     if N < 2:
         return neighbour, back
     a, b, length = _pairs(corners.pixels)
@@ -40,19 +42,20 @@ def link(image: Grey, corners: Corners) -> tuple[NDArray[np.int64], NDArray[np.i
     length = length[fits]
     seen = _edge_seen(image, corners, (a, b), arm_a)
     order = np.flatnonzero(seen)[np.argsort(-length[seen], kind="stable")]
-    neighbour[a[order], arm_a[order]] = b[order]  # of several the nearest is written last
+    # Of several neighbours the nearest is written last.
+    neighbour[a[order], arm_a[order]] = b[order]
     back[a[order], arm_a[order]] = arm_b[order]
-    return _mutual(neighbour, back)
+    return _mutual_links(neighbour, back)
 
 
 def _pairs(pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Indices a, b (M,) of near candidates and their distances [px]."""
+    """Return indices a, b (M,) of near candidates and their distances [px]."""
     near = min(NEAREST, len(pixels) - 1)
     firsts, seconds, lengths = [], [], []
     norm = (pixels**2).sum(axis=1)
-    for start in range(0, len(pixels), 512):
-        block = pixels[start:start + 512]
-        squared = np.maximum(norm[start:start + 512, None] + norm - 2 * block @ pixels.T, 0.0)
+    for start in range(0, len(pixels), BLOCK):
+        block = pixels[start:start + BLOCK]
+        squared = np.maximum(norm[start:start + BLOCK, None] + norm - 2 * block @ pixels.T, 0.0)
         squared[np.arange(len(block)), start + np.arange(len(block))] = np.inf
         chosen = np.argpartition(squared, near - 1, axis=1)[:, :near]
         firsts.append(np.repeat(start + np.arange(len(block)), near))
@@ -61,8 +64,9 @@ def _pairs(pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     return np.concatenate(firsts), np.concatenate(seconds), np.concatenate(lengths)
 
 
-def _arms(corners: Corners, a: NDArray[np.int64], b: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The arm of a that points to b and the one of b that points to a (M,); NOBODY where none does."""
+def _arms(corners: CornerCandidates, a: NDArray[np.int64], b: NDArray[np.int64]
+          ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the arm of a that points to b and the arm of b that points to a (M,); NO_NEIGHBOUR if there is none."""
     step = corners.pixels[b] - corners.pixels[a]
     angle = np.arctan2(step[:, 1], step[:, 0])
     return _arm_along(corners.angles[a], angle), _arm_along(corners.angles[b], angle + np.pi)
@@ -72,19 +76,20 @@ def _arm_along(edges: Array, angle: Array) -> NDArray[np.int64]:
     arms = np.concatenate([edges, edges + np.pi], axis=1)
     off = np.abs((arms - angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
     best = off.argmin(axis=1)
-    return np.where(np.take_along_axis(off, best[:, None], axis=1)[:, 0] < MAX_TURN_RAD, best, NOBODY)
+    return np.where(np.take_along_axis(off, best[:, None], axis=1)[:, 0] < MAX_TURN_RAD, best, NO_NEIGHBOUR)
 
 
-def _left_is_light(corners: Corners, index: NDArray[np.int64], arm: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether it is light just beyond an arm, at a larger angle."""
+def _left_is_light(corners: CornerCandidates, index: NDArray[np.int64], arm: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """True (M,) if the image is light next to an arm, at a larger angle."""
     return np.asarray(corners.light[index] ^ (arm % 2 == 1))
 
 
-def _edge_seen(image: Grey, corners: Corners, pair: tuple[NDArray[np.int64], NDArray[np.int64]],
+def _edge_seen(image: Grey, corners: CornerCandidates, pair: tuple[NDArray[np.int64], NDArray[np.int64]],
                arm: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether light and dark lie on the sides of the line from a to b where a's arm has them."""
+    """True (M,) if light and dark along the line from a to b lie on the same sides as at a's arm."""
     start, step = corners.pixels[pair[0]], corners.pixels[pair[1]] - corners.pixels[pair[0]]
-    aside = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])  # towards larger angles
+    # Perpendicular to the line, towards larger angles.
+    aside = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])
     middle = start[:, None] + ALONG[:, None] * step[:, None]
     difference = sample(image, middle + aside[:, None]) - sample(image, middle - aside[:, None])
     signed = np.where(_left_is_light(corners, pair[0], arm), 1, -1)[:, None] * difference
@@ -92,8 +97,8 @@ def _edge_seen(image: Grey, corners: Corners, pair: tuple[NDArray[np.int64], NDA
     return np.asarray(signed.min(axis=1) > MIN_EDGE * contrast)
 
 
-def _mutual(neighbour: NDArray[np.int64], back: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _mutual_links(neighbour: NDArray[np.int64], back: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     own = np.arange(len(neighbour))[:, None]
     returned = neighbour[neighbour, back] == own
-    kept = (neighbour != NOBODY) & returned & (back[neighbour, back] == np.arange(4))
-    return np.where(kept, neighbour, NOBODY), np.where(kept, back, NOBODY)
+    kept = (neighbour != NO_NEIGHBOUR) & returned & (back[neighbour, back] == np.arange(4))
+    return np.where(kept, neighbour, NO_NEIGHBOUR), np.where(kept, back, NO_NEIGHBOUR)

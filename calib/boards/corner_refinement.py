@@ -1,8 +1,8 @@
-"""Corners to a hundredth of a pixel: each is looked at in its own square-on view of the board.
+"""Refinement of corners to about a hundredth of a pixel, in a window that is aligned with the board.
 
-Edges in a mirror are bent and squares sheared; a window that is straight in the image then pulls the corner aside.
-How board and image map, so that a window can be cut out along the board, the neighbours tell to second order, and a
-first calibration exactly: without that second pass cameras come out some 0.04 % too large.
+Edges in a mirror image are curved and squares sheared, so a window that is straight in the image biases the corner.
+The mapping from board to image comes from the neighbours, to second order, or exactly from a first calibration.
+Without that second pass calibrated cameras are about 0.04 % too large.
 """
 
 from __future__ import annotations
@@ -14,64 +14,71 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import Board
-from calib.boards.board_shape import local_mapping, terms
+from calib.boards.board_shape import local_mapping, quadratic_terms
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array, OmniCamera
 
-ToImage = Callable[[Array], Array]  # (..., 2) squares from a corner, along the board, to pixels
+# Mapping of board offsets (..., 2) from a corner [squares] to pixels (..., 2).
+ToImage = Callable[[Array], Array]
 
-# The window reaches so far into the four squares, near to whose far ends other edges begin, and no further than what
-# the image's blur still bends.
+# Half side of the window in squares, short of the next edges, and its largest value in pixels: farther grey levels do
+# not depend on the corner's position.
 REACH, REACH_PX = 0.42, 8
-ROUNDS = 4
-STILL_PX = 2e-3
-# Further than this part of a square from where it started, a corner has run away and is put back.
-MAX_MOVE = 0.3
+# Least samples along a side of the window, and width of its Gaussian weight in parts of its half side.
+MIN_WINDOW_SAMPLES = 5
+WEIGHT_PART = 0.6
+MAX_ITERATIONS = 4
+CONVERGED_PX = 2e-3
+# A corner that moves farther than this part of a square, plus some pixels, is reset: it has reached another edge.
+MAX_MOVE, MAX_MOVE_PX = 0.3, 0.3
+# Step of the difference quotient by which the size of a square is measured [squares].
+SIZE_STEP = 0.01
 
 
-def refine(image: NDArray[np.uint8], corners: Array) -> Array:
-    """Corners (rows, columns, 2) [px] moved onto the image's; those that cannot be told stay where they are."""
+def refine_corners(image: NDArray[np.uint8], corners: Array) -> Array:
+    """Move corners (rows, columns, 2) [px] onto the image's corners; those without enough neighbours stay."""
     grey, refined = image.astype(np.float32), corners.copy()
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         moved = refined.copy()
         for j, i in np.argwhere(np.isfinite(corners[..., 0])):
             mapping = local_mapping(refined, int(j), int(i))
             if mapping is not None:
-                moved[j, i] = _recentred(grey, mapping, corners[j, i])
+                moved[j, i] = _refined_corner(grey, mapping, corners[j, i])
         step = np.nanmax(np.linalg.norm(moved - refined, axis=2))
         refined = moved
-        if step < STILL_PX:
+        if step < CONVERGED_PX:
             break
     return refined
 
 
-def refine_with(image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array, view: tuple[Board, Array]) -> Array:
-    """The pixels (N, 2) of a view (board, pixels) moved onto the corners as a camera that nearly fits shows them."""
+def refine_with_camera(image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array, view: tuple[Board, Array]
+                       ) -> Array:
+    """Move the pixels (N, 2) of a view (board, pixels) onto the image's corners, with a camera as the mapping."""
     (board, pixels), grey = view, image.astype(np.float32)
     refined = pixels.copy()
     for index in np.flatnonzero(np.isfinite(pixels[:, 0])):
-        to_image = _through(camera, T_cam_board, (board, board.points[index]))
-        moved = to_image(_settled(grey, to_image)[None])[0]
-        if np.linalg.norm(moved - pixels[index]) < MAX_MOVE * _size(to_image) + 0.3:
+        to_image = _camera_mapping(camera, T_cam_board, (board, board.points[index]))
+        moved = to_image(_converged_shift(grey, to_image)[None])[0]
+        if np.linalg.norm(moved - pixels[index]) < MAX_MOVE * _square_px(to_image) + MAX_MOVE_PX:
             refined[index] = moved
     return refined
 
 
-def _settled(grey: Grey, to_image: ToImage) -> Array:
-    """Where (2,) [squares] the corner is, the window moved onto it step by step."""
+def _converged_shift(grey: Grey, to_image: ToImage) -> Array:
+    """Return the corner's offset (2,) [squares] after the window was moved onto it iteratively."""
     shift = np.zeros(2)
 
     def shifted(xy: Array) -> Array:
         return to_image(xy + shift)
 
-    for _ in range(ROUNDS):
-        shift = shift + _offset(grey, shifted)
+    for _ in range(MAX_ITERATIONS):
+        shift = shift + _corner_offset(grey, shifted)
     return shift
 
 
-def _through(camera: OmniCamera, T_cam_board: Array, place: tuple[Board, Array]) -> ToImage:
-    """The mapping about a point of the board (board, point (3,)) to the image, by a camera."""
-    board, point = place
+def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[Board, Array]) -> ToImage:
+    """Return the camera's mapping from the board about an origin (board, point (3,)) to the image."""
+    board, point = origin
 
     def to_image(xy: Array) -> Array:
         offset = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1) * board.square_m
@@ -80,40 +87,42 @@ def _through(camera: OmniCamera, T_cam_board: Array, place: tuple[Board, Array])
     return to_image
 
 
-def _recentred(grey: Grey, mapping: Array, start: Array) -> Array:
-    """The corner's pixel (2,) as the window shows it, by a local mapping."""
+def _refined_corner(grey: Grey, mapping: Array, start: Array) -> Array:
+    """Return the corner's pixel (2,) in the window of a local mapping; start (2,) if it moves too far."""
     def to_image(xy: Array) -> Array:
-        return np.asarray(terms(xy[..., 0], xy[..., 1]) @ mapping)
+        return np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ mapping)
 
-    moved = to_image(_offset(grey, to_image))
-    return moved if np.linalg.norm(moved - start) < MAX_MOVE * _size(to_image) + 0.3 else start
+    moved = to_image(_corner_offset(grey, to_image))
+    limit_px = MAX_MOVE * _square_px(to_image) + MAX_MOVE_PX
+    return moved if np.linalg.norm(moved - start) < limit_px else start
 
 
-def _size(to_image: ToImage) -> float:
-    """Pixels per square at the corner."""
-    ends = to_image(np.array([[0.0, 0], [0.01, 0], [0, 0.01]])) * 100
+def _square_px(to_image: ToImage) -> float:
+    """Return the side of a square at the corner [px]."""
+    ends = to_image(np.array([[0.0, 0], [SIZE_STEP, 0], [0, SIZE_STEP]])) * (1 / SIZE_STEP)
     return float(np.sqrt(abs(np.linalg.det(ends[1:] - ends[0]))))
 
 
-def _offset(grey: Grey, to_image: ToImage) -> Array:
-    """Where (2,) [squares] the window about the origin of a mapping shows its corner."""
-    size = _size(to_image)
+def _corner_offset(grey: Grey, to_image: ToImage) -> Array:
+    """Return the offset (2,) [squares] of the corner in the window about the origin of a mapping."""
+    size = _square_px(to_image)
     reach = min(REACH, REACH_PX / max(size, 1e-6))
-    side = int(np.clip(np.ceil(2 * reach * size), 5, 2 * REACH_PX)) // 2 * 2 + 1
+    # An odd number of samples, about one a pixel.
+    side = int(np.clip(np.ceil(2 * reach * size), MIN_WINDOW_SAMPLES, 2 * REACH_PX)) // 2 * 2 + 1
     x, y = np.meshgrid(*2 * [np.linspace(-reach, reach, side)])
     pixels = to_image(np.stack([x, y], axis=-1))
-    return _saddle(sample(grey, pixels), x, y) if np.isfinite(pixels).all() else np.zeros(2)
+    return _saddle_point(sample(grey, pixels), x, y) if np.isfinite(pixels).all() else np.zeros(2)
 
 
-def _saddle(window: Array, x: Array, y: Array) -> Array:
-    """Where (2,) the second-order surface through a window at x, y is level, 0 where it has no saddle.
+def _saddle_point(window: Array, x: Array, y: Array) -> Array:
+    """Return the stationary point (2,) of the second-order surface through a window at x, y; 0 if it is not a saddle.
 
-    Lucchese and Mitra 2002. Halos and blooming, which push all four edges about, leave that point where it is: on real
-    images it fits cameras better than where the edges' gradients cross.
+    Lucchese and Mitra 2002. Halos and blooming move all four edges but not this point: on real images it fits cameras
+    better than the intersection of the edges' gradients.
     """
     reach = float(x.max())
-    weight = np.exp(-(x * x + y * y) / (2 * (0.6 * reach) ** 2)).ravel()
-    A = terms(x.ravel(), y.ravel()) * weight[:, None]
+    weight = np.exp(-(x * x + y * y) / (2 * (WEIGHT_PART * reach) ** 2)).ravel()
+    A = quadratic_terms(x.ravel(), y.ravel()) * weight[:, None]
     _, gx, gy, xx, xy, yy = np.linalg.lstsq(A, window.ravel() * weight, rcond=None)[0]
     determinant = 4 * xx * yy - xy * xy
     if determinant >= 0:

@@ -1,1 +1,1 @@
-"""Calibration from board views: intrinsics, rig, bundle adjustment."""
+"""Calibration from board views: intrinsics, rig, bundle adjustment, drift of a rig."""

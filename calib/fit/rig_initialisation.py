@@ -1,4 +1,7 @@
-"""A first transform between two cameras from boards that both saw, each board's turn decided by all together."""
+"""Relative pose initialisation: the transform between two cameras from boards that both see, by consensus of pairs.
+
+The order of a board's corners may be ambiguous in one image; the consensus decides it for every pair.
+"""
 
 from __future__ import annotations
 
@@ -10,81 +13,94 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import Board, BoardView
-from calib.boards.board_pose import board_pose, pose_error_rad, turns
+from calib.boards.board_pose import ambiguous_orders, board_pose, pose_error_rad
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 
-# A camera that is given must see every board as one to this; else the corners, or the camera, are wrong.
+# Largest mean ray error of a board's pose in a given camera; beyond it the corners or the camera are wrong.
 MAX_POSE_ERROR_RAD = np.deg2rad(1.0)
-# Pairs agree when their transforms are this near, a turn and a shift in parts of the distance taken together.
-AGREE, AGREE_AT_MOST, AGREE_RATIO = 0.06, 0.3, 5.0
-# Another transform that is this different, and that fits not much worse, leaves the turns open.
-OTHER, CLEARLY_WORSE = 0.3, 3.0
-Seen = tuple[BoardView | None, BoardView | None]
+# Distance of two transforms: angle [rad] plus shift relative to the baseline. A pair is an inlier below INLIER_RATIO
+# times the median distance, within these limits.
+MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
+# The order of corners is ambiguous if a transform farther away than DISTINCT_DISTANCE costs less than this ratio.
+DISTINCT_DISTANCE, MIN_COST_RATIO = 0.3, 3.0
+# Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap.
+MEAN_WEIGHT, MEAN_CAP = 0.1, 1.0
+MIN_LENGTH_M = 1e-9
+ViewPair = tuple[BoardView | None, BoardView | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Agreed:
-    """T_upper_lower, the boards' poses by view, the orders of the upper corners by pair, and what does not agree."""
+class RelativePoseInitialisation:
+    """The relative pose of two cameras, and the views consistent with it."""
 
     T_upper_lower: Array  # (4, 4)
-    T_lower_board: dict[int, Array]
-    orders: dict[int, NDArray[np.intp]]
-    rejected: tuple[tuple[int, str], ...]
+    T_lower_board: dict[int, Array]  # (4, 4) by view
+    orders: dict[int, NDArray[np.intp]]  # (N,) of the upper corners, by pair
+    rejected: tuple[tuple[int, str], ...]  # view and reason
 
 
-def agree(views: Sequence[Seen], board: Board, cameras: tuple[OmniCamera, OmniCamera]) -> Agreed:
-    """The transform on which most pairs agree, and what it makes of every view. CalibError where it is not clear."""
-    orders = turns(board)
+def initialise_relative_pose(views: Sequence[ViewPair], board: Board, cameras: tuple[OmniCamera, OmniCamera]
+                             ) -> RelativePoseInitialisation:
+    """Find the transform with the most consistent pairs, and the board's pose in every view.
+
+    Raises CalibError if no board fits both cameras or the order of the corners is ambiguous.
+    """
+    # 1. The board's pose in every view, for the upper camera with every possible order of the corners.
+    orders = ambiguous_orders(board)
     lower = {k: T for k, (seen, _) in enumerate(views)
-             if seen and (T := _pose(cameras[0], seen.pixels, board)) is not None}
+             if seen and (T := _checked_pose(cameras[0], seen.pixels, board)) is not None}
     upper = {k: poses for k, (_, seen) in enumerate(views)
-             if seen and (poses := _poses(cameras[1], seen, board, orders)) is not None}
+             if seen and (poses := _pose_hypotheses(cameras[1], seen, board, orders)) is not None}
     both = sorted(lower.keys() & upper.keys())
     if not both:
         raise CalibError("calibrate rig: no board fits both cameras; check --corners, and that the camera files are "
                          "those of these cameras, lower and upper")
+    # 2. Consensus of the transforms of all pairs.
     best, apart = _consensus(np.array([upper[k] @ se3.inverse(lower[k]) for k in both]))
     gap = apart.min(axis=1)
-    limit = float(np.clip(AGREE_RATIO * np.median(gap), AGREE, AGREE_AT_MOST))
-    odd = {k: float(gap[i]) for i, k in enumerate(both) if gap[i] > limit}
-    placed = {k: T for k, T in lower.items() if k not in odd and (k in upper or views[k][1] is None)}
+    limit = float(np.clip(INLIER_RATIO * np.median(gap), MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE))
+    # 3. Outlier pairs and views without a pose are rejected.
+    outliers = {k: float(gap[i]) for i, k in enumerate(both) if gap[i] > limit}
+    placed = {k: T for k, T in lower.items() if k not in outliers and (k in upper or views[k][1] is None)}
     placed |= {k: se3.inverse(best) @ T[0] for k, T in upper.items() if views[k][0] is None}
-    rejected = [(k, "no board fits its corners") for k in range(len(views)) if k not in placed and k not in odd]
-    rejected += [(k, f"it has the cameras {np.rad2deg(by):.1f} deg or more from where the others have them: was the "
-                  "board moving?") for k, by in odd.items()]
-    orders_of = {k: orders[int(apart[i].argmin())] for i, k in enumerate(both) if k not in odd}
-    return Agreed(best, dict(sorted(placed.items())), orders_of, tuple(rejected))
+    rejected = [(k, "no board fits its corners") for k in range(len(views)) if k not in placed and k not in outliers]
+    rejected += [(k, f"its relative pose of the cameras is {np.rad2deg(distance):.1f} deg or more off that of the "
+                  "others: was the board moving?") for k, distance in outliers.items()]
+    orders_of = {k: orders[int(apart[i].argmin())] for i, k in enumerate(both) if k not in outliers}
+    return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, tuple(rejected))
 
 
-def _pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
+def _checked_pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
     T = board_pose(camera, pixels, board)
     return T if T is not None and pose_error_rad(camera, T, pixels, board) < MAX_POSE_ERROR_RAD else None
 
 
-def _poses(camera: OmniCamera, seen: BoardView, board: Board, orders: Sequence[NDArray[np.intp]]) -> Array | None:
-    """The board's poses (S, 4, 4), one for every order of its corners."""
-    poses = [_pose(camera, seen.pixels[order], board) for order in orders]
+def _pose_hypotheses(camera: OmniCamera, seen: BoardView, board: Board, orders: Sequence[NDArray[np.intp]]
+                     ) -> Array | None:
+    """Return the board's poses (S, 4, 4), one for every order of its corners; None if one does not fit."""
+    poses = [_checked_pose(camera, seen.pixels[order], board) for order in orders]
     fitting = [T for T in poses if T is not None]
     return np.array(fitting) if len(fitting) == len(poses) else None
 
 
 def _consensus(candidates: Array) -> tuple[Array, Array]:
-    """The one of the candidates (K, S, 4, 4) with most support, and how far (K, S) all are from it."""
+    """Return the candidate (4, 4) of (K, S, 4, 4) with the most support, and the distances (K, S) of all from it."""
     flat = candidates.reshape(-1, 4, 4)
-    apart = np.array([_apart(candidates, T) for T in flat])  # (K S, K, S)
-    cost = np.median(apart.min(axis=2), axis=1) + 0.1 * np.minimum(apart.min(axis=2), 1.0).mean(axis=1)
+    apart = np.array([_pose_distance(candidates, T) for T in flat])  # (K S, K, S)
+    nearest = apart.min(axis=2)
+    cost = np.median(nearest, axis=1) + MEAN_WEIGHT * np.minimum(nearest, MEAN_CAP).mean(axis=1)
     best = int(cost.argmin())
-    others = cost[apart[best].ravel() > OTHER]
-    if candidates.shape[1] > 1 and others.size and others.min() < max(CLEARLY_WORSE * cost[best], AGREE):
-        raise CalibError("calibrate rig: a board with two even or two odd sides looks the same upside down, and these "
-                         "pairs leave open which way up it was; hold it in more places, or take a board with one side "
-                         "odd and one even")
+    others = cost[apart[best].ravel() > DISTINCT_DISTANCE]
+    if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
+        raise CalibError("calibrate rig: a board with two even or two odd sides looks the same upside down, and its "
+                         "orientation is ambiguous in these pairs; hold it at more places, or use a board with one odd "
+                         "and one even side")
     return flat[best], apart[best]
 
 
-def _apart(T: Array, other: Array) -> Array:
-    """How far transforms (..., 4, 4) are from another: angle [rad] plus shift in parts of its length."""
+def _pose_distance(T: Array, other: Array) -> Array:
+    """Return the distances of transforms (..., 4, 4) from another: angle [rad] plus shift relative to its length."""
     gap = se3.rotation_log(np.swapaxes(T[..., :3, :3], -1, -2) @ other[:3, :3])
     shift = np.linalg.norm(T[..., :3, 3] - other[:3, 3], axis=-1)
-    return np.asarray(np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(other[:3, 3])), 1e-9))
+    return np.asarray(np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(other[:3, 3])), MIN_LENGTH_M))

@@ -1,1 +1,1 @@
-"""Which pixels show the world: the mirror's rim, hub and struts."""
+"""Masks of the pixels that show the world: within the mirror's rim, outside hub and struts."""

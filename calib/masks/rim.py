@@ -1,4 +1,4 @@
-"""The mirror's rim in a image, the circle beyond which it is dark, and a dark hub in its middle if there is one."""
+"""Detection of the mirror's rim, the circle beyond which the image is dark, and of a dark hub in its middle."""
 
 from __future__ import annotations
 
@@ -10,33 +10,39 @@ from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720
 MIN_SIDE_PX = 64
-# The world must stand out from the dark by so many grey levels; at an azimuth's edge, within a few pixels, by MIN_STEP.
+# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
+CORNER_PART, MIN_CORNER_PX = 1 / 32, 4
+# Least difference of grey levels between the middle and the corners, and across the edge at one azimuth.
 MIN_CONTRAST = 25.0
 MIN_STEP = 12.0
-# The edge lies between the dark and the light level, nearer the dark: the world at the rim is often dark too.
+# Threshold between the dark (0) and the light level (1), nearer the dark one: the world at the rim is often dark too.
 EDGE_FRACTION = 0.25
-# Pixels on either side over which the edge is judged, and how far beyond it the dark has to last.
+# Number of pixels on either side over which the edge is measured, and beyond it that must be dark.
 EDGE_PX = 4
-# Azimuths agree when their edge is this near the circle; this part of those the circle has in the image must.
-AGREE_PX = 2.0
+# RANSAC: an azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
+INLIER_PX = 2.0
 MIN_SUPPORT = 0.6
-# Part of the circle that has to lie in the image: less leaves the centre loose.
+# Least part of the circle that lies in the image: less does not determine the centre.
 MIN_ARC = 0.4
-FIT_ROUNDS = 200
-# What is cut off inside the rim and outside the hub: blur and the last reflections at the edge.
+RANSAC_ROUNDS = 200
+# Least squares repetitions on the inliers after RANSAC.
+REFINEMENTS = 3
+# Largest distance of the circle's centre from the guess, in parts of the radius.
+MAX_CENTER_SHIFT = 0.25
+# Margin inside the rim and outside the hub: blur and the last reflections at the edge.
 SAFETY_PX = 1.5
-# A hub ends within this part of the rim's radius, at a ring dark all around after rings mostly dark (a lens glints),
-# and the world begins within a few pixels: the dark part of the ring drops.
+# A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
+# dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
 MAX_HUB = 0.4
 HUB_RING_PX = 5
 HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2
 
 
 def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
-    """The ring that shows the world in a image (H, W) uint8, or None where no rim can be told for sure.
+    """Find the ring that shows the world in an image (H, W) uint8; None if no rim is found with certainty.
 
-    center_guess (u, v) [px] may be off by a tenth of the radius. A image that is bright all around (or the maximum of
-    several) gives the best rim. None: dark or full-frame images, noise, soft vignettes.
+    center_guess (u, v) [px] may be off by a tenth of the radius. An image that is bright on all sides (or the maximum
+    of several) gives the best rim. None for dark or full-frame images, noise, soft vignettes.
     """
     levels = _levels(image) if min(image.shape) >= MIN_SIDE_PX else None
     if levels is None:
@@ -51,8 +57,8 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
 
 
 def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
-    """The dark level, of the corners, and the light one, of the middle; None where they are too close."""
-    side = max(4, min(image.shape) // 32)
+    """Return the dark level, of the corners, and the light level, of the middle; None if they are too close."""
+    side = max(MIN_CORNER_PX, int(min(image.shape) * CORNER_PART))
     corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
     height, width = image.shape
     dark = float(np.median([np.median(corner) for corner in corners]))
@@ -61,7 +67,7 @@ def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
 
 
 def _polar(image: NDArray[np.uint8], center: tuple[float, float], radius_px: int) -> Array:
-    """The image as (AZIMUTHS, radius) about a centre, 1 px apart; NaN outside of it."""
+    """Return the polar image (AZIMUTHS, radius) about a centre, radii 1 px apart; NaN outside the image."""
     azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)[:, None]
     radii = np.arange(radius_px)
     u, v = center[0] + radii * np.cos(azimuth), center[1] + radii * np.sin(azimuth)
@@ -71,7 +77,7 @@ def _polar(image: NDArray[np.uint8], center: tuple[float, float], radius_px: int
 
 
 def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[float, float]) -> Array:
-    """Pixels (N, 2) where the light ends for good, one an azimuth at most, to a fraction of a pixel."""
+    """Return the pixels (N, 2), at most one per azimuth, beyond which the image is dark, with subpixel accuracy."""
     threshold = levels[0] + EDGE_FRACTION * (levels[1] - levels[0])
     polar = _polar(image, center, int(np.hypot(*image.shape)))
     found = [(index, radius) for index, profile in enumerate(polar) if (radius := _last_edge(profile, threshold)) > 0]
@@ -81,7 +87,7 @@ def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[
 
 
 def _last_edge(profile: Array, threshold: float) -> float:
-    """The radius [px] at which a profile falls below the threshold for good, and steeply; 0 where it does not."""
+    """Return the radius [px] of the last steep fall of a profile below the threshold; 0 if there is none."""
     profile = profile[np.isfinite(profile)]
     light = np.flatnonzero(profile >= threshold)
     last = int(light[-1]) if light.size else 0
@@ -96,23 +102,23 @@ def _last_edge(profile: Array, threshold: float) -> float:
 
 
 def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
-    """The circle (u, v, radius) on which most edges agree, refined over those that do; None where there is none."""
+    """Fit a circle (u, v, radius) to edges by RANSAC and least squares over the inliers; None if there is none."""
     if len(edges) < AZIMUTHS * MIN_ARC * MIN_SUPPORT:
         return None
     generator = np.random.default_rng(0)
-    circles = [_circle(edges[generator.choice(len(edges), 3, replace=False)]) for _ in range(FIT_ROUNDS)]
-    best = max(circles, key=lambda circle: int((_distance(edges, circle) < AGREE_PX).sum()))
-    for _ in range(3):
-        inliers = edges[_distance(edges, best) < AGREE_PX]
+    circles = [_circle(edges[generator.choice(len(edges), 3, replace=False)]) for _ in range(RANSAC_ROUNDS)]
+    best = max(circles, key=lambda circle: int((_distance(edges, circle) < INLIER_PX).sum()))
+    for _ in range(REFINEMENTS):
+        inliers = edges[_distance(edges, best) < INLIER_PX]
         if len(inliers) < 3:
             return None
         best = _circle(inliers)
-    near = np.hypot(best[0] - center[0], best[1] - center[1]) < 0.25 * best[2]
+    near = np.hypot(best[0] - center[0], best[1] - center[1]) < MAX_CENTER_SHIFT * best[2]
     return best if near else None
 
 
 def _circle(points: Array) -> Array:
-    """Centre and radius (3,) of the circle through points (N, 2), least squares (Kasa 1976)."""
+    """Return centre and radius (3,) of the circle through points (N, 2), by least squares (Kasa 1976)."""
     middle = points.mean(axis=0)
     local = points - middle
     A = np.column_stack([2 * local, np.ones(len(local))])
@@ -125,17 +131,17 @@ def _distance(points: Array, circle: Array) -> Array:
 
 
 def _supported(circle: Array, edges: Array, shape: tuple[int, ...]) -> bool:
-    """Whether enough of the circle lies in the image, and enough of that part was seen as an edge."""
+    """True if enough of the circle lies in the image, and enough of that part has an edge."""
     azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
     reach = circle[2] + 2 * EDGE_PX
     u, v = circle[0] + reach * np.cos(azimuth), circle[1] + reach * np.sin(azimuth)
     possible = int(((u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)).sum())
-    inliers = int((_distance(edges, circle) < AGREE_PX).sum())
+    inliers = int((_distance(edges, circle) < INLIER_PX).sum())
     return possible >= MIN_ARC * AZIMUTHS and inliers >= MIN_SUPPORT * possible
 
 
 def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, threshold: float) -> float:
-    """The radius [px] of a dark disc or ring about the centre, as a camera's own lens shows in its mirror; 0: none."""
+    """Return the radius [px] of a dark disc or ring about the centre, the camera's own reflection; 0: none."""
     polar = _polar(image, center, int(MAX_HUB * rim_px))
     dark = np.mean(polar < threshold, axis=0)
     inside = np.convolve(dark, np.ones(HUB_RING_PX) / HUB_RING_PX, "valid")[:-HUB_RING_PX]

@@ -1,4 +1,4 @@
-"""Whether the mirror's rim is still where a mask has it."""
+"""Comparison of the mirror's rim in images with the rim of a mask."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
-# A mask may reach so far beyond the rim that is found: a pixel or two is how well it can be, a bit more as masks are
-# drawn by hand as well.
+# Tolerance for a mask that reaches beyond the rim: a rim is found to a pixel or two, and masks are also drawn by hand.
 MAX_BEYOND_PX, MAX_BEYOND_PART = 3.0, 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class RimShift:
-    """Where the rim is, by what its centre has moved (u, v) from the mask's, how much wider it is, all in pixels."""
+    """The rim found in images, relative to a mask: shift (u, v) of its centre and difference of radii [px]."""
 
     rim: Mask
     moved_px: tuple[float, float]
@@ -25,17 +24,17 @@ class RimShift:
 
     @property
     def beyond_px(self) -> float:
-        """How far the mask reaches beyond the rim, where most."""
+        """Return the largest distance [px] by which the mask reaches beyond the rim."""
         return float(np.hypot(*self.moved_px)) - self.wider_px
 
     @property
     def fits(self) -> bool:
-        """Whether the mask shows nothing but the mirror."""
+        """True if the mask contains only the mirror, within the tolerance."""
         return self.beyond_px <= MAX_BEYOND_PX + MAX_BEYOND_PART * self.rim.outer_px
 
 
 def rim_shift(brightest: NDArray[np.uint8], mask: Mask | None) -> RimShift | None:
-    """The rim in the maximum of several images (H, W), against a mask; None where either is not known."""
+    """Compare the rim in the maximum of several images (H, W) with a mask; None if either is not known."""
     if mask is None or not np.isfinite(mask.outer_px):
         return None
     rim = find_rim(brightest, mask.center)

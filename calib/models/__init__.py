@@ -1,1 +1,1 @@
-"""Camera models: pixels to rays and back."""
+"""Camera models: projection of points to pixels, and lifting of pixels to rays."""

@@ -1,4 +1,4 @@
-"""The one face of every mirror camera: project, lift, and what part of the image counts."""
+"""The interface of central omnidirectional cameras: project, lift, and the mask of the image."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ Array = NDArray[np.float64]
 
 
 class OmniCamera(Protocol):
-    """A central camera that sees all around; pixel centres are integers, u right, v down."""
+    """A central omnidirectional camera; pixel centres are integers, u right, v down."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Image (width, height) [px]."""
+        """Return the image's (width, height) [px]."""
 
     @property
     def center(self) -> tuple[float, float]:
-        """Pixel (u, v) of the model's axis."""
+        """Return the pixel (u, v) of the model's axis."""
 
     def project(self, points: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where the model has no image."""
+        """Return pixels (N, 2) of points (N, 3) in the camera frame; NaN for points without an image."""
 
     def lift(self, pixels: Array) -> Array:
-        """Unit rays (N, 3) in the camera frame of pixels (N, 2); NaN where the model has no ray."""
+        """Return unit rays (N, 3) in the camera frame of pixels (N, 2); NaN for pixels without a ray."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """The part of an image that shows the world: a ring about a centre, minus what a image blanks out.
+    """The part of an image that shows the world: a ring about a centre, without the pixels that are 0 in image.
 
     center (u, v) [px]; inner_px and outer_px bound the radius; image (H, W) uint8, 0 = not the world.
     """
@@ -42,7 +42,7 @@ class Mask:
     image: NDArray[np.uint8] | None = None
 
     def contains(self, pixels: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Whether pixels (N, 2) lie inside, at least margin_px away from rim and hub."""
+        """True (N,) for pixels (N, 2) inside, at least margin_px away from rim and hub."""
         radius = np.hypot(pixels[:, 0] - self.center[0], pixels[:, 1] - self.center[1])
         inner = self.inner_px + margin_px if self.inner_px > 0 else 0.0
         inside = (radius >= inner) & (radius <= self.outer_px - margin_px)
@@ -58,13 +58,13 @@ class Mask:
 
 
 def inscribed_mask(camera: OmniCamera) -> Mask:
-    """The largest ring about the camera's axis that lies in its image: the mask where none is known."""
+    """Return the largest disc about the camera's axis that lies in its image: the mask if none is known."""
     (u, v), (width, height) = camera.center, camera.size
     return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
 
 
 def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
-    """Smallest and largest angle [rad] from the ray of the camera's centre inside its mask; NaN where there is none."""
+    """Return the smallest and largest angle [rad] from the ray of the camera's centre within the mask; NaN if empty."""
     width, height = camera.size
     (u, v), radius = camera.center, np.arange(0.0, np.hypot(width, height))
     azimuth = np.deg2rad(np.arange(0, 360, 5))[:, None]
@@ -77,7 +77,7 @@ def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
 
 
 def inside_image(camera: OmniCamera, pixels: Array) -> NDArray[np.bool_]:
-    """Whether pixels (N, 2) lie on the camera's image; NaN does not."""
+    """True (N,) for pixels (N, 2) on the camera's image; False for NaN."""
     width, height = camera.size
     u, v = pixels[:, 0], pixels[:, 1]
     return np.asarray((u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1))

@@ -1,8 +1,8 @@
-"""The polynomial model of OCamCalib (Scaramuzza et al. 2006): any central mirror or fisheye by f(rho).
+"""The polynomial model of OCamCalib (Scaramuzza et al. 2006) for central mirrors and fisheye lenses.
 
 x = row - row centre and y = column - column centre, after the inverse of the affine [c d; e 1]; rho = |(x, y)|.
 Seen directly the ray is (x, y, f(rho)) with x down, y right, z towards the viewer. Seen in a mirror the image is
-reflected and the right-handed ray is (x, y, -f(rho)). A flat board cannot tell the two apart, so `view` says it.
+reflected and the right-handed ray is (x, y, -f(rho)). A flat board cannot distinguish the two, so `view` selects one.
 """
 
 from __future__ import annotations
@@ -18,10 +18,14 @@ from calib.models.camera import Array
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")
 
-# Radii of the table that starts the inversion; each solve stays between two of its neighbours.
+# Size of the table of radii in which the inversion starts; each solution stays within one interval.
 TABLE_SIZE = 1025
-# Newton steps on one table interval: 3 reach the last bit, the others serve the model's end, where the slope vanishes.
+# Newton steps on one table interval: 3 reach the last bit, the others are for the model's end, where the slope is 0.
 SOLVE_STEPS = 8
+# Least determinant of the affine.
+MIN_DETERMINANT = 1e-6
+# A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal.
+REAL_ROOT_PART = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,38 +52,38 @@ class OcamCamera:
         if not self.polynomial or not np.isfinite(values).all():
             raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
         c, d, e = self.affine
-        if self.polynomial[0] >= 0 or abs(c - d * e) < 1e-6 or min(self.size) < 1 or self.view not in VIEWS:
-            raise CalibError("ocam camera: needs a0 < 0, an invertible affine, a size and view mirror or direct, "
+        if self.polynomial[0] >= 0 or abs(c - d * e) < MIN_DETERMINANT or min(self.size) < 1 or self.view not in VIEWS:
+            raise CalibError("ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, "
                              f"found a0 {self.polynomial[0]}, affine {self.affine}, size {self.size}, "
                              f"view {self.view!r}")
 
     @property
     def center(self) -> tuple[float, float]:
-        """Pixel (u, v) = (column, row) of the axis."""
+        """Return the pixel (u, v) = (column, row) of the axis."""
         row, column = self.center_row_column
         return column, row
 
     @property
     def radius_limit_px(self) -> float:
-        """Where the model ends: at the image diagonal, or before it where f(rho)/rho stops rising.
+        """Return the model's largest radius: the image diagonal, or the radius at which f(rho)/rho stops rising.
 
-        Beyond that radius two pixels would share a ray.
+        Beyond that radius two pixels would have the same ray.
         """
         diagonal = float(np.hypot(*self.size))
         turning = np.roots(self._turning()[::-1])
-        real = turning.real[(np.abs(turning.imag) < 1e-9 * diagonal) & (turning.real > 0)]
+        real = turning.real[(np.abs(turning.imag) < REAL_ROOT_PART * diagonal) & (turning.real > 0)]
         return min(diagonal, float(real.min())) if real.size else diagonal
 
     def _turning(self) -> Array:
-        """Coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""
+        """Return the coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""
         return np.array([(power - 1) * a for power, a in enumerate(self.polynomial)])
 
     def height(self, radius_px: Array) -> Array:
-        """f(rho) (N,) [px]: the ray's third component before the mirror's sign."""
+        """Return f(rho) (N,) [px]: the ray's third component before the mirror's sign."""
         return np.asarray(np.polynomial.polynomial.polyval(radius_px, self.polynomial))
 
     def lift(self, pixels: Array) -> Array:
-        """Unit rays (N, 3) of pixels (N, 2); NaN beyond the model's radius. Scaramuzza et al. 2006, eq. (6)."""
+        """Return unit rays (N, 3) of pixels (N, 2); NaN beyond the model's radius. Scaramuzza et al. 2006, eq. (6)."""
         pixels = np.asarray(pixels, float)
         c, d, e = self.affine
         row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
@@ -90,7 +94,10 @@ class OcamCamera:
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def project(self, points: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3); NaN where no radius of the model sees them. Exact, not the file's inverse."""
+        """Return pixels (N, 2) of points (N, 3); NaN if no radius of the model has their ray.
+
+        Solves f(rho) exactly, instead of the inverse polynomial of OCamCalib's file.
+        """
         points = np.asarray(points, float)
         r = np.hypot(points[:, 0], points[:, 1])
         rho = self._radius(r, self._sign * points[:, 2])
@@ -105,7 +112,7 @@ class OcamCamera:
         return -1.0 if self.view == "mirror" else 1.0
 
     def _radius(self, r: Array, z: Array) -> Array:
-        """The rho (N,) that solves f(rho) * r = z * rho, by Newton steps inside one interval of the table."""
+        """Solve f(rho) * r = z * rho for rho (N,) by Newton steps within one interval of the table."""
         norm = np.hypot(r, z)
         unit = np.where((norm > 0) & np.isfinite(norm), norm, np.nan)
         r, z, angle = r / unit, z / unit, np.arctan2(z, r)

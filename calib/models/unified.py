@@ -1,6 +1,6 @@
-"""The unified model (Geyer and Daniilidis 2000; Mei and Rives 2007): any central mirror by one number xi.
+"""The unified model (Geyer and Daniilidis 2000; Mei and Rives 2007) for central mirrors, with the mirror parameter xi.
 
-A unit ray (x, y, z) is seen from a point xi above the sphere's centre, m = (x, y) / (z + xi), then distorted and
+A unit ray (x, y, z) is projected from a point xi above the sphere's centre, m = (x, y) / (z + xi), then distorted and
 scaled: u = fu * mx + pu, v = fv * my + pv. xi = 0 is the pinhole, xi = 1 the parabolic mirror under an orthographic
 camera. fu < 0 is the mirror's flip.
 """
@@ -14,8 +14,11 @@ import numpy as np
 from calib.errors import CalibError
 from calib.models.camera import Array
 
-# Newton steps that undo the lens distortion; a mild one converges in 3 to 5, what does not is given NaN.
+# Newton steps that invert the lens distortion; a mild one converges in 3 to 5, and pixels without convergence are NaN.
 UNDISTORT_STEPS = 12
+UNDISTORT_TOLERANCE = 1e-9
+# Smallest denominator of the projection.
+MIN_SCALE = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,21 +36,21 @@ class UnifiedCamera:
         if not np.isfinite(values).all():
             raise CalibError(f"omni camera: every parameter must be a finite number, found {values}")
         if self.xi < 0 or 0 in self.focal or min(self.size) < 1:
-            raise CalibError(f"omni camera: needs xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
+            raise CalibError(f"omni camera: expected xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
                              f"focal {self.focal}, size {self.size}")
 
     def project(self, points: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3); NaN behind the projection's edge. Mei and Rives 2007, eq. (1) to (4)."""
+        """Return pixels (N, 2) of points (N, 3); NaN beyond the projection's edge. Mei and Rives 2007, eq. (1), (4)."""
         norm = np.linalg.norm(points, axis=1)
         z = points[:, 2] / np.where(norm > 0, norm, np.nan)
-        # Beyond this plane two rays would share a pixel (xi > 1), or the denominator changes sign (xi <= 1).
+        # Beyond this plane two rays would have the same pixel (xi > 1), or the denominator changes sign (xi <= 1).
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
-        m = points[:, :2] / np.where(scale > 1e-12, scale, np.nan)[:, None]
+        m = points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]
         return np.asarray(self._distort(m) * self.focal + self.center)
 
     def lift(self, pixels: Array) -> Array:
-        """Unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""
+        """Return unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""
         m = self._undistort((np.asarray(pixels, float) - self.center) / self.focal)
         r2 = (m**2).sum(axis=1)
         root = 1 + (1 - self.xi**2) * r2
@@ -71,7 +74,7 @@ class UnifiedCamera:
         with np.errstate(all="ignore"):
             for _ in range(UNDISTORT_STEPS):
                 m -= self._newton_step(m, distorted)
-            bad = ~(np.abs(self._distort(m) - distorted).max(axis=1) < 1e-9)
+            bad = ~(np.abs(self._distort(m) - distorted).max(axis=1) < UNDISTORT_TOLERANCE)
         m[bad] = np.nan
         return m
 

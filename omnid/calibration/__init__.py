@@ -1,1 +1,1 @@
-"""What stands between the calibration's commands and its numerics: images in, reports out."""
+"""Input and output of the calibration commands: images, board search, reports."""

@@ -1,4 +1,4 @@
-"""The boards in a camera's images, said as they are found."""
+"""Search for boards in a camera's images, with progress lines."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.boards.board import Board, BoardView
-from calib.boards.board_finder import find_board
+from calib.boards.board_finder import BoardSearch, find_board
 from omnid.calibration.images import Images
 from omnid.errors import OmnidError
 
 
-def find_boards(images: Images, board: Board, *, thorough: bool, tell: bool) -> list[BoardView]:
-    """The views of the board, by the images' names; OmnidError that says what was seen where there is none."""
-    views, seen = list[BoardView](), Counter[tuple[int, int]]()
+def find_boards(images: Images, board: Board, *, thorough: bool, show_progress: bool) -> list[BoardView]:
+    """Find the views of a board in images; raises OmnidError if there is none, with other grids that were found."""
+    views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
     for number, (name, image) in enumerate(images.items(), 1):
         search = find_board(image, board, name, thorough=thorough)
         if search.view is not None:
             views.append(search.view)
-        seen[_sorted(search.seen)] += search.seen != (0, 0)
-        said = f"board found, confidence {search.view.confidence:.2f}" if search.view else _no_board(search.seen)
-        if tell:
-            print(f"[{number}/{len(images)}] {name}: {said}", file=sys.stderr)
+        if search.grid_size != (0, 0):
+            other_grids[_sorted(search.grid_size)] += 1
+        if show_progress:
+            print(f"[{number}/{len(images)}] {name}: {_progress(search)}", file=sys.stderr)
     if not views:
-        raise OmnidError(_none_found(len(images), board, seen))
+        raise OmnidError(_none_found(len(images), board, other_grids))
     return views
 
 
@@ -34,19 +34,23 @@ def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
     return min(sides), max(sides)
 
 
-def _no_board(seen: tuple[int, int]) -> str:
-    return f"no board, but a grid of {seen[0]}x{seen[1]}" if seen != (0, 0) else "no board"
+def _progress(search: BoardSearch) -> str:
+    if search.view is not None:
+        return f"board found, confidence {search.view.confidence:.2f}"
+    columns, rows = search.grid_size
+    return f"no board, but a grid of {columns}x{rows}" if columns else "no board"
 
 
-def _none_found(images: int, board: Board, seen: Counter[tuple[int, int]]) -> str:
-    likely, times = seen.most_common(1)[0] if seen else ((0, 0), 0)
-    hint = (f"a grid of {likely[0]}x{likely[1]} was seen in {times}: try --corners {likely[0]}x{likely[1]}" if times
-            else "count the inner corners, and take images with the whole board in view, sharp and well lit")
+def _none_found(images: int, board: Board, other_grids: Counter[tuple[int, int]]) -> str:
+    hint = "count the inner corners, and take images with the whole board in view, sharp and well lit"
+    if other_grids:
+        (columns, rows), times = other_grids.most_common(1)[0]
+        hint = f"a grid of {columns}x{rows} was found in {times}: try --corners {columns}x{rows}"
     return f"calibrate: no board of {board.columns}x{board.rows} inner corners in any of {images} images; {hint}"
 
 
-def spread(views: Sequence[BoardView], count: int) -> list[BoardView]:
-    """At most so many views whose corners lie as far as can be from one another's."""
+def select_diverse_views(views: Sequence[BoardView], count: int) -> list[BoardView]:
+    """Select at most count views whose first and last corners are far apart (farthest point sampling)."""
     corners = np.nan_to_num(np.array([view.pixels[[0, -1]].ravel() for view in views]))
     chosen = [0]
     distance = np.full(len(views), np.inf)

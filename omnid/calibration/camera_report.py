@@ -1,4 +1,4 @@
-"""The report of a camera's calibration: one HTML file with everything in it."""
+"""The report of a camera's calibration: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from calib.fit.camera_fit import Calibration
+from calib.fit.camera_fit import CameraCalibration
 from calib.models.camera import Mask
 from calib.models.ocam import OcamCamera
 from omnid.calibration.figures import (
@@ -23,8 +23,9 @@ from omnid.report.page import figure, page, table
 MAX_SHOWN_VIEWS = 40
 
 
-def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequence[str], mask: Mask | None) -> str:
-    """The whole page; images by the views' names, missing: images without a board."""
+def camera_report_html(found: CameraCalibration, images: Mapping[str, Image], missing: Sequence[str],
+                       mask: Mask | None) -> str:
+    """Return the page; images by the views' names, missing: names of images without a board."""
     first = images[found.views[0].name]
     pixels = np.array([view.pixels for view in found.views])
     parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by image</h2>",
@@ -40,7 +41,7 @@ def report_html(found: Calibration, images: Mapping[str, Image], missing: Sequen
     return page("Camera calibration", parts)
 
 
-def _head(found: Calibration) -> str:
+def _head(found: CameraCalibration) -> str:
     camera, board = found.camera, found.board
     model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
     used = int(np.isfinite(found.fit.errors_px).sum())
@@ -49,17 +50,17 @@ def _head(found: Calibration) -> str:
             f"{len(found.views)} views, {used} corners. <b>Mean reprojection error {found.fit.mean_px:.3f} px</b>.</p>")
 
 
-def _warnings(found: Calibration) -> str:
+def _warnings(found: CameraCalibration) -> str:
     lines = [*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)]
     return "".join(f"<p class='warn'>{escape(line)}</p>" for line in lines)
 
 
-def _parameters(found: Calibration) -> str:
+def _parameters(found: CameraCalibration) -> str:
     return table(("parameter", "value", "standard deviation"),
-                  [(name, f"{value:.8g}", f"{deviation:.2g}") for name, value, deviation in found.parameters])
+                  [(name, f"{value:.8g}", f"{sigma:.2g}") for name, value, sigma in found.parameters])
 
 
-def _views(found: Calibration, missing: Sequence[str]) -> str:
+def _views(found: CameraCalibration, missing: Sequence[str]) -> str:
     errors = found.view_errors_px
     worst = float(errors.max())
     corners = [int(np.isfinite(view.pixels[:, 0]).sum()) for view in found.views]
@@ -70,7 +71,7 @@ def _views(found: Calibration, missing: Sequence[str]) -> str:
     return table(("image", "mean error [px]", "corners", "confidence", ""), rows) + none
 
 
-def _residuals(found: Calibration, images: Mapping[str, Image]) -> list[str]:
+def _residuals(found: CameraCalibration, images: Mapping[str, Image]) -> list[str]:
     shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
     return [figure(residual_image(images[view.name], view.pixels, residuals),
                     f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")

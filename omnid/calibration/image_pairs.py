@@ -1,4 +1,4 @@
-"""The images of two cameras, by instant: lower_*, upper_* of a folder, or the pairs of a log."""
+"""Pairs of images of two cameras: lower_*, upper_* of a folder, or the pairs of a log."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from omnid.config import Config
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
-# So many pairs of a log are looked at, evenly spread.
+# Number of pairs of a log that are used, evenly spread.
 LOG_PAIRS = 100
 
 
 @dataclass(frozen=True, slots=True)
 class PairedImages:
-    """Images of the lower and the upper camera by the name of the instant; some are of one camera only."""
+    """Images of the lower and the upper camera by the name of the instant; some instants have one camera only."""
 
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
 
     @property
     def names(self) -> list[str]:
-        """All instants, in their order."""
+        """Return the names of all instants, sorted."""
         return sorted({**self.sides[0], **self.sides[1]})
 
 
 def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
-    """The images in a folder or a log; lower and upper name a log's topics. OmnidError where no two make a pair."""
+    """Read the images of a folder or a log; lower and upper: a log's topics. Raises OmnidError without any pair."""
     is_log = source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
     if not is_log and (lower or upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     pairs = _of_log(source, lower, upper) if is_log else _of_folder(source)
     if not pairs.sides[0].keys() & pairs.sides[1].keys():
-        raise OmnidError(f"{source}: no two images of one instant: {_counted(pairs)}; a folder has to hold pairs "
-                         "like lower_001.png and upper_001.png, a log images with nearly equal stamps")
+        raise OmnidError(f"{source}: no pair of images: found {_counted(pairs)}; expected pairs like lower_001.png "
+                         "and upper_001.png in a folder, or images with nearly equal stamps in a log")
     return pairs
 
 
@@ -86,7 +86,7 @@ def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:
 
 
 def paired(frames: Iterator[Frame]) -> Iterator[tuple[Frame, Frame]]:
-    """The lower and upper frames of one instant, out of frames in the order of their stamps; nothing is decoded."""
+    """Yield pairs of lower and upper frames with nearly equal stamps, from frames in order of stamps, undecoded."""
     tolerance_ns = round(Config().pair.tolerance_ms * 1e6)
     waiting: Frame | None = None
     for frame in frames:

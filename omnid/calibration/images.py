@@ -1,4 +1,4 @@
-"""The images of one camera: from files, folders and patterns, or from one topic of a log."""
+"""Images of one camera: from files, folders and patterns, or from one topic of a log."""
 
 from __future__ import annotations
 
@@ -19,16 +19,19 @@ from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
-Images = dict[str, Image]  # by name, all of one size
+# By name, all of one size.
+Images = dict[str, Image]
 SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 MAX_IMAGES = 400
-# So many frames of a log are looked at, evenly spread: a board held by hand does not move much between two of them.
+# Number of frames of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_FRAMES = 120
+# The part of a log that is scanned for its topics.
 SCAN_BYTES, SCAN_MESSAGES = 64 * 2**20, 2000
 
 
 def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
-    """Grey images of files, folders and patterns, or of a log's topic; OmnidError unless all are, and of one size."""
+    """Read grey images of files, folders and patterns, or of a log's topic; raises OmnidError unless all are readable
+    and of one size."""
     logs = [source for source in sources if Path(source).suffix == ".mcap"]
     if logs and len(sources) > 1:
         raise OmnidError(f"{logs[0]}: expected images, or one log alone; found {len(sources)} names")
@@ -42,13 +45,13 @@ def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
 def _of_files(sources: Sequence[str]) -> Images:
     paths = list(dict.fromkeys(path for source in sources for path in _expanded(source)))
     if len(paths) > MAX_IMAGES:
-        raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are plenty")
+        raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
     names = _short_names(paths)
     return {name: _read(path) for name, path in zip(names, paths, strict=True)}
 
 
 def _expanded(source: str) -> list[Path]:
-    """The files that a name, a folder or a pattern stands for."""
+    """Return the files of a name, a folder or a pattern."""
     path = Path(source)
     if path.is_dir():
         found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
@@ -61,7 +64,7 @@ def _expanded(source: str) -> list[Path]:
 
 
 def _short_names(paths: Sequence[Path]) -> list[str]:
-    """File names, or whole paths where two are called the same."""
+    """Return the file names, or the whole paths if two files have the same name."""
     short = [path.name for path in paths]
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
@@ -75,12 +78,13 @@ def _read(path: Path) -> Image:
     except cv2.error:
         image = None
     if image is None or image.size > MAX_PIXELS:
-        raise OmnidError(f"{path}: expected a image (PNG, JPEG, TIFF ...) of sane size, found none; leave it out")
+        raise OmnidError(f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; "
+                         "leave it out")
     return np.ascontiguousarray(image, np.uint8)
 
 
 def one_size(images: Images) -> None:
-    """OmnidError unless all images are of one size."""
+    """Raise OmnidError unless all images are of one size."""
     sizes: dict[tuple[int, ...], str] = {}
     for name, image in images.items():
         sizes.setdefault(image.shape[::-1], name)
@@ -101,13 +105,13 @@ def _of_log(path: Path, topic: str | None) -> Images:
 
 
 def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
-    """The topic asked for, or the only one with images."""
+    """Return the requested topic, or the only one with images."""
     images = sorted(name for name, kind in catalog.topics().items() if kind in (IMAGE, COMPRESSED_IMAGE))
     if topic in images:
         return str(topic)
     if topic is None and len(images) == 1:
         return images[0]
-    wanted = f"topic {topic}" if topic else "--topic, to say which camera"
+    wanted = f"topic {topic}" if topic else "--topic, to select the camera"
     raise OmnidError(f"{path}: expected {wanted}, found image topics {', '.join(images) or '(none)'}")
 
 
@@ -119,7 +123,7 @@ def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[LogMessag
 
 
 def _frames(file: LogFile, catalog: Catalog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
-    """Every stride-th image, named by its number; what cannot be decoded is left out."""
+    """Yield every stride-th image, named by its number, without those that cannot be decoded."""
     for number, message in enumerate(_messages(file, catalog, topic)):
         kind = catalog.topic(message.channel_id)
         if number % stride or kind is None:

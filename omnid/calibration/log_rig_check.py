@@ -1,4 +1,4 @@
-"""Some pairs of a log's images, and what they say of a rig."""
+"""Check of a rig by pairs of a log's images."""
 
 from __future__ import annotations
 
@@ -23,33 +23,35 @@ from omnid.stages.decoder import Decoder
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
 
+# Number of pairs that are used.
 PAIRS = 24
 
 
 @dataclass(frozen=True, slots=True)
 class RigCheckResult:
-    """What some pairs say: the columns, and the rims of the lower and the upper mirror where they can be told."""
+    """Result of the check: columns of both panoramas, and the rims of the lower and the upper mirror if found."""
 
     finding: RigFinding
     rims: tuple[RimShift | None, RimShift | None]
 
     @property
     def good(self) -> bool:
-        """Whether the rig can be trusted."""
+        """True if columns and rims are within their tolerances."""
         return self.finding.verdict == "good" and all(rim is None or rim.fits for rim in self.rims)
 
 
 def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:
-    """The log's two cameras: by the topics asked for, by the rig's where the log has them, or by their names."""
-    named = [asked or known or None for asked, known in zip(topics, rig.topics if rig else ("", ""), strict=True)]
+    """Open the log's two cameras: by the requested topics, by the rig's if the log has them, or by their names."""
+    rig_topics = rig.topics if rig else ("", "")
+    named = [requested or known or None for requested, known in zip(topics, rig_topics, strict=True)]
     if rig and not any(topics):
         with suppress(DriverError):
             return LogReader(log, *named)
     return LogReader(log, *topics)
 
 
-def read_pairs_of(reader: LogReader, rig: Rig) -> list[FramePair]:
-    """PAIRS pairs at most, evenly spread over the log; OmnidError where there are none of the rig's size."""
+def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
+    """Read at most PAIRS pairs, evenly spread over the log; raises OmnidError if none has the rig's size."""
     stride = max(1, (sum(1 for _ in paired(reader.frames())) - 1) // PAIRS + 1)
     decode, found = Decoder(rig), list[FramePair]()
     for number, (lower, upper) in enumerate(paired(reader.frames())):
@@ -60,14 +62,14 @@ def read_pairs_of(reader: LogReader, rig: Rig) -> list[FramePair]:
             found.append(FramePair(number, lower.stamp_ns, images[0], images[1]))
     if not found:
         raise OmnidError("calibrate check: no pair of images in the log; "
-                         f"{decode.fault or 'the stamps of both cameras must agree'}")
+                         f"{decode.fault or 'expected nearly equal stamps of both cameras'}")
     return found
 
 
-def look(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> RigCheckResult:
-    """What the pairs say of a rig."""
-    place = geometry(rig, config)
-    dewarp, check = Dewarp(place, config), RigCheck(place.cylinder, len(pairs))
+def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> RigCheckResult:
+    """Check a rig by pairs of images."""
+    rectification = geometry(rig, config)
+    dewarp, check = Dewarp(rectification, config), RigCheck(rectification.cylinder, len(pairs))
     for pair in pairs:
         panoramas = dewarp.process(pair)
         check.add(panoramas.lower, panoramas.upper, panoramas.visible)

@@ -1,4 +1,4 @@
-"""The report of a rig's calibration: one HTML file with everything in it."""
+"""The report of a rig's calibration: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from omnid.calibration.image_pairs import SIDES, PairedImages
 from omnid.report.page import figure, page, table
 
 MAX_SHOWN_VIEWS = 20
-LINES = 24  # columns drawn through both panoramas
+# Number of columns drawn through both panoramas, and their colour (BGR).
+LINES, LINE_COLOR = 24, (80, 200, 0)
 PANORAMA_WIDTH = 1400
 
 
 def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
-    """The whole page."""
+    """Return the page."""
     parts = [_head(found), "<h2>Between the cameras</h2>", _motion(found)]
-    for name, rows in zip(SIDES, found.parameters, strict=True):
-        told = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in rows]
-        parts += [f"<h2>The {name} camera</h2>", table(("parameter", "value", "standard deviation"), told) if told
-                  else "<p>Taken as it was given.</p>"]
+    for name, parameters in zip(SIDES, found.parameters, strict=True):
+        rows = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in parameters]
+        parts += [f"<h2>The {name} camera</h2>", table(("parameter", "value", "standard deviation"), rows) if rows
+                  else "<p>Not changed: the camera was given.</p>"]
     parts += ["<h2>Error by instant</h2>", _views(found), "<h2>Rectified</h2>", *_rectified(found, images, rig),
               "<h2>Residuals</h2>", *_residuals(found, images)]
     return page("Rig calibration", parts)
@@ -37,12 +38,12 @@ def _head(found: RigCalibration) -> str:
     left_out = "".join(f"<p class='warn'>left out {escape(bad.name)}: {escape(bad.reason)}</p>"
                        for bad in found.rejected)
     return (f"<h1>Rig calibration</h1><p>{found.pairs} pairs, {len(found.views) - found.pairs} views of one camera. "
-            f"<b>Baseline {found.baseline_m * 1e3:.2f} mm</b>, deviation {found.baseline_sigma_m * 1e3:.2f} mm. Mean "
-            f"reprojection error {found.fit.mean_px:.3f} px.</p>{left_out}")
+            f"<b>Baseline {found.baseline_m * 1e3:.2f} mm</b>, standard deviation {found.baseline_sigma_m * 1e3:.2f} "
+            f"mm. Mean reprojection error {found.fit.mean_px:.3f} px.</p>{left_out}")
 
 
 def _motion(found: RigCalibration) -> str:
-    """T_upper_lower in millimetres and degrees."""
+    """Return the table of T_upper_lower in millimetres and degrees."""
     turn = se3.rotation_log(found.T_upper_lower[:3, :3])
     values = np.concatenate([found.T_upper_lower[:3, 3] * 1e3, np.rad2deg(turn)])
     sigmas = np.concatenate([found.motion_sigma[:3] * 1e3, np.rad2deg(found.motion_sigma[3:])])
@@ -64,7 +65,7 @@ def _number(error: float) -> str:
 
 
 def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> list[str]:
-    """Both panoramas of one instant, one above the other: what lies on a line above lies on it below."""
+    """Return the figure of both panoramas of one instant, one above the other, with common columns."""
     name = next(view.name for view in found.views if None not in view.seen)
     try:
         cylinder = fit_cylinder(rig, PANORAMA_WIDTH)
@@ -74,8 +75,8 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> list[st
             for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)]
     canvas = np.asarray(cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR), np.uint8)
     for column in range(PANORAMA_WIDTH // (2 * LINES), PANORAMA_WIDTH, PANORAMA_WIDTH // LINES):
-        canvas[:, column] = (80, 200, 0)
-    return [figure(canvas, f"{name}: the upper panorama above the lower one; everything is on the same line in both")]
+        canvas[:, column] = LINE_COLOR
+    return [figure(canvas, f"{name}: the upper panorama above the lower one; a point is in the same column of both")]
 
 
 def _residuals(found: RigCalibration, images: PairedImages) -> list[str]:

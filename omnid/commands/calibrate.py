@@ -1,4 +1,4 @@
-"""`omnid calibrate`: cameras and rigs from images of a board, checks of a rig; Kalibr and OCamCalib files."""
+"""`omnid calibrate`: calibration of cameras and rigs, checks of a rig, import and export of other formats."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml")
     parser.add_argument("--lower", default="", help="the lower camera: its name in the camchain (cam0), or its "
                         "calib_results.txt")
-    parser.add_argument("--upper", default="", help="the upper camera, likewise")
+    parser.add_argument("--upper", default="", help="the same for the upper camera")
     between = parser.add_mutually_exclusive_group()
     between.add_argument("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers")
     between.add_argument("--baseline", type=float, metavar="M", help="metres from the lower viewpoint straight up to "
-                         "the upper one, cameras looking up and turned alike")
-    parser.add_argument("--view", choices=VIEWS, help="OCamCalib: whether the world is seen in a mirror (default) or "
-                        "directly through a lens")
+                         "the upper one; both cameras look up and are equally oriented")
+    parser.add_argument("--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly "
+                        "through a lens")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
 
 
@@ -58,7 +58,7 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import or export, and print one line of what was made."""
+    """Import or export a rig, and print one line about it."""
     _must_be_writable(args.output)
     if args.action == "import":
         rig = _kalibr(args) if args.camchain else _ocam(args)
@@ -93,8 +93,8 @@ def _ocam(args: argparse.Namespace) -> Rig:
         raise OmnidError("calibrate import: expected a Kalibr camchain.yaml, or two OCamCalib files as --lower and "
                          "--upper")
     if args.transform is None and args.baseline is None:
-        raise OmnidError("calibrate import: OCamCalib files do not say where the cameras are: give --transform FILE or "
-                         "--baseline METRES")
+        raise OmnidError("calibrate import: OCamCalib files do not contain the transform between the cameras: give "
+                         "--transform FILE or --baseline METRES")
     read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
     T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
@@ -119,16 +119,17 @@ def _export_ocam(rig: Rig, path: Path) -> list[Path]:
 def _left_out(rig: Rig) -> str:
     masks = rig.lower.mask is not None or rig.upper.mask is not None
     left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
-    return f"; left out, as the format has no place for it: {', '.join(left)}" if left else ""
+    return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
 
 
 def describe(rig: Rig) -> str:
-    """One line about a rig: models, sizes, fields of view, baseline, the turn between the cameras, topics."""
+    """Return one line about a rig: models, sizes, fields of view, baseline, rotation between the cameras, topics."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    turn = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
     lower, upper = (_describe(mounted, topic)
                     for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True))
-    return f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper turned by {turn:.2f} deg"
+    return (f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
+            f"{rotation_deg:.2f} deg")
 
 
 def _describe(mounted: MountedCamera, topic: str) -> str:

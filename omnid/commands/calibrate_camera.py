@@ -1,4 +1,4 @@
-"""`omnid calibrate camera`: a camera.toml from images of a checkerboard."""
+"""`omnid calibrate camera`: calibrate one camera by images of a checkerboard."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, Quality, camera_toml
-from calib.fit.camera_fit import MODELS, Calibration, Model, calibrate, sharpened
+from calib.fit.camera_fit import MODELS, CameraCalibration, Model, calibrate_camera, refine_camera_calibration
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS
 from calib.rig_file import write_file
-from omnid.calibration.board_search import find_boards, spread
-from omnid.calibration.camera_report import report_html
+from omnid.calibration.board_search import find_boards, select_diverse_views
+from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, read_images
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
-# A log shows the same board over and over: so many views, far apart, say as much as all, in a fraction of the time.
+# A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40
 
 
@@ -32,23 +32,23 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Add `camera` to `omnid calibrate`."""
     parser = actions.add_parser("camera", help="a camera.toml from images of a checkerboard")
     parser.add_argument("images", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
-    parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="where four squares meet, "
-                        "counted along both sides of the board")
+    parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="inner corners (points where "
+                        "four squares meet) along both sides of the board")
     parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
     parser.add_argument("--topic", help="the camera's topic in a log")
     parser.add_argument("--model", choices=MODELS, default="ocam", help="polynomial (default) or unified model")
-    parser.add_argument("--view", choices=VIEWS, default="mirror", help="whether the world is seen in a mirror "
-                        "(default) or directly through a lens: a flat board cannot tell")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="a page (HTML) with all there is to see about it")
-    parser.add_argument("--mask", type=Path, metavar="FILE", help="also find rim, hub and struts, and paint them into "
-                        "this PNG beside the camera's file: edit it as you like")
+    parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in a mirror (default) or "
+                        "directly through a lens: images of a flat board do not distinguish the two")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage")
+    parser.add_argument("--mask", type=Path, metavar="FILE", help="also find rim, hub and struts, and write them to "
+                        "this PNG in the folder of the camera's file; it may be edited")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the camera.toml to write")
     parser.set_defaults(run=run)
 
 
 def corners(text: str) -> tuple[int, int]:
-    """The inner corners along both sides, out of 6x7."""
+    """Parse the inner corners along both sides, like 6x7."""
     sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
     if sides is None:
         raise argparse.ArgumentTypeError(f"expected two numbers of inner corners like 6x7, found {text!r}")
@@ -56,20 +56,20 @@ def corners(text: str) -> tuple[int, int]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds the boards, fits the camera, writes the files and prints one line."""
+    """Find the boards, fit the camera, write the files and print one line."""
     columns, rows = args.corners
     board = Board(columns, rows, args.square_mm / 1e3)
     _check_outputs(args)
     images = read_images(args.images, args.topic)
     many = any(source.endswith(".mcap") for source in args.images)
-    views = find_boards(images, board, thorough=not many, tell=not args.quiet)
-    views = spread(views, MAX_LOG_VIEWS) if many else views
+    views = find_boards(images, board, thorough=not many, show_progress=not args.quiet)
+    views = select_diverse_views(views, MAX_LOG_VIEWS) if many else views
     found = _fitted(views, images, board, args)
     mask = find_mask(list(images.values()), found.camera.center) if args.mask else None
     _write(found, mask, args)
     if args.report:
         missing = sorted(set(images) - {view.name for view in views})
-        write_file(args.report, report_html(found, images, missing, mask).encode())
+        write_file(args.report, camera_report_html(found, images, missing, mask).encode())
     for line in (*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
     print(f"{args.output}: {describe(found)}")
@@ -78,20 +78,20 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     named = [("--output", args.output), ("--report", args.report), ("--mask", args.mask)]
-    read = [("a image that is read", Path(source)) for source in args.images if Path(source).is_file()]
+    read = [("an image that is read", Path(source)) for source in args.images if Path(source).is_file()]
     check_outputs([(option, path) for option, path in named if path is not None], read)
     if args.mask and (args.mask.suffix.lower() != ".png" or args.mask.parent.resolve() != args.output.parent.resolve()):
-        raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}, where it is looked for")
+        raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}")
 
 
-def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> Calibration:
+def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> CameraCalibration:
     height, width = images[views[0].name].shape
     model: Model = args.model
-    found = calibrate(views, board, (width, height), model, args.view)
-    return sharpened(found, images, model, args.view)
+    found = calibrate_camera(views, board, (width, height), model, args.view)
+    return refine_camera_calibration(found, images, model, args.view)
 
 
-def _write(found: Calibration, mask: Mask | None, args: argparse.Namespace) -> None:
+def _write(found: CameraCalibration, mask: Mask | None, args: argparse.Namespace) -> None:
     if mask is not None and mask.image is not None:
         write_file(args.mask, _png(mask.image))
     quality = Quality(found.fit.mean_px, len(found.views), found.parameters)
@@ -103,8 +103,8 @@ def _png(image: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
 
 
-def describe(found: Calibration) -> str:
-    """One line about a camera: model, size, error, views, centre."""
+def describe(found: CameraCalibration) -> str:
+    """Return one line about a camera: size, centre, error, views."""
     u, v = found.camera.center
     corners = int(np.isfinite(found.fit.errors_px).sum())
     return (f"{found.camera.size[0]}x{found.camera.size[1]}, centre {u:.2f} {v:.2f}, mean reprojection error "

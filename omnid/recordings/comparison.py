@@ -9,7 +9,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 
 from calib.errors import CalibError
-from calib.strict import toml_table
+from calib.validation import toml_table
 from omnid.errors import OmnidError
 from omnid.recordings.run_reader import STATES, Run
 from omnid.recordings.series_differences import (

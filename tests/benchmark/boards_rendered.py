@@ -1,4 +1,5 @@
-"""Checkerboards in mirror and fisheye images that are hard to find, each from one number, with exact corners."""
+"""Rendered mirror and fisheye images of checkerboards that are hard to find, each from one number, with exact corners.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from tests.simulation import textures
-from tests.simulation.boards import Studio, board_pose, in_view, six_walls
+from tests.simulation.boards import BoardRenderer, board_pose, in_view, six_walls
 from tests.simulation.sensor import Exposure, Sensor
 
 Random = np.random.Generator
@@ -25,15 +26,15 @@ BOARDS = ((6, 7), (4, 3), (8, 11), (5, 4), (9, 6), (7, 5))
 MIRRORS = ("parabolic", "hyperbolic", "fisheye")
 WALLS = ("clouds", "brick", "tiles", "windows", "chequers", "stripes", "page", "granite")
 SQUARE_M = 0.03
-# A board is hard but no riddle: squares of so many pixels, the narrower side foreshortened to no less than this.
+# Range of the squares' median side, and least side of any square.
 SQUARE_PX, LEAST_PX = (5.0, 45.0), 3.0
 TRIES = 4000
 BEHIND_THE_WALLS = se3.transform(np.eye(3), [0.0, 0.0, 100.0])
 
 
 @dataclass(frozen=True, slots=True)
-class Hard:
-    """A image of a board, or of the same place without it, and what there is to know about it."""
+class HardBoard:
+    """An image of a board, an image of the same place without it, and the ground truth."""
 
     name: str
     board: Board
@@ -42,26 +43,26 @@ class Hard:
     corners: Array  # (N, 2) px
 
 
-def hard(seed: int, number: int) -> Hard:
-    """The image of that number, mirror, walls and board taking turns, all else by chance."""
+def render_hard_board(seed: int, number: int) -> HardBoard:
+    """Render the image of that number: mirror, walls and board alternate, all else is random."""
     rng = np.random.default_rng([seed, number])
     kind, walls = MIRRORS[number % len(MIRRORS)], WALLS[number % len(WALLS)]
     size, board = SIZES[rng.integers(len(SIZES))], Board(*BOARDS[number % len(BOARDS)], SQUARE_M)
     camera, mask = _camera(rng, kind, size)
-    studio, sensor = Studio.of(board, camera, mask), _sensor(rng)
+    renderer, sensor = BoardRenderer.of(board, camera, mask), _sensor(rng)
     radius_m = rng.uniform(1.2, 3.5)
     painted = six_walls(lambda: _painted(rng, walls, radius_m), radius_m)
     low, light = rng.uniform(15, 90), rng.uniform(45, 160)
-    looks = {"sensor": sensor, "supersample": 2, "walls": painted, "seed": number,
+    options = {"sensor": sensor, "supersample": 2, "walls": painted, "seed": number,
              "contrast": (low, min(250.0, low + light)), "shadow": rng.choice([1.0, 1.0, rng.uniform(0.35, 0.8)])}
-    shot = studio.photograph(_pose(rng, kind, studio), **looks)
-    empty = studio.photograph(BEHIND_THE_WALLS, **looks)
+    rendered = renderer.render_board(_pose(rng, kind, renderer), **options)
+    empty = renderer.render_board(BEHIND_THE_WALLS, **options)
     exposure = Exposure.of(sensor, mask, size)
     images = [cv2.imdecode(np.frombuffer(exposure.jpeg(made.image), np.uint8), cv2.IMREAD_GRAYSCALE)
-                for made in (shot, empty)]
+                for made in (rendered, empty)]
     name = (f"{number:03d} {kind} {size[0]}x{size[1]} {walls} {board.columns}x{board.rows} noise "
             f"{sensor.noise_sigma:.1f} blur {sensor.blur_px:.1f} step {light:.0f}")
-    return Hard(name, board, images[0].astype(np.uint8), images[1].astype(np.uint8), shot.corners)
+    return HardBoard(name, board, images[0].astype(np.uint8), images[1].astype(np.uint8), rendered.corners)
 
 
 def _camera(rng: Random, kind: str, size: tuple[int, int]) -> tuple[OmniCamera, Mask]:
@@ -82,9 +83,9 @@ def _sensor(rng: Random) -> Sensor:
                   jpeg_quality=int(rng.integers(40, 96)))
 
 
-def _pose(rng: Random, kind: str, studio: Studio) -> Array:
-    """T_cam_board of a board that is whole in view, its squares in SQUARE_PX; askew by up to 60 degrees."""
-    camera, mask, board = studio.mounted.camera, studio.mounted.visible, studio.board
+def _pose(rng: Random, kind: str, renderer: BoardRenderer) -> Array:
+    """Return T_cam_board of a board entirely in view, its squares within SQUARE_PX, tilted by up to 60 degrees."""
+    camera, mask, board = renderer.mounted.camera, renderer.mounted.visible, renderer.board
     down = (115.0, 175.0) if kind == "fisheye" else (35.0, 105.0)
     for _ in range(TRIES):
         azimuth, away = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(*down))
@@ -104,7 +105,7 @@ def _fair(corners: Array, board: Board) -> bool:
 
 
 def _painted(rng: Random, kind: str, radius_m: float) -> Image:
-    """A wall's texture, 5 mm to a pixel at most."""
+    """Return a wall's texture, pixels of 5 mm or larger."""
     side = min(1400, round(2 * radius_m * 200))
     px_per_m = side / (2 * radius_m)
     own: dict[str, Callable[[], Image]] = {
@@ -115,7 +116,7 @@ def _painted(rng: Random, kind: str, radius_m: float) -> Image:
 
 
 def _windows(rng: Random, side: int, px_per_m: float) -> Image:
-    """Dark panes in a light frame, or the other way round, a few by a few."""
+    """Return a grid of dark panes in a light frame, or of light panes in a dark frame."""
     pane, bar = (max(3, round(px_per_m * rng.uniform(*size))) for size in ((0.12, 0.35), (0.03, 0.1)))
     frame, glass = rng.permutation([rng.uniform(30, 80), rng.uniform(150, 220)])
     place = np.arange(side) % (pane + bar) < pane
@@ -123,14 +124,14 @@ def _windows(rng: Random, side: int, px_per_m: float) -> Image:
 
 
 def _chequers(rng: Random, side: int, px_per_m: float) -> Image:
-    """A floor of dark and light slabs, as regular as a board but without its end."""
+    """Return a floor of dark and light slabs, as regular as a board but without its outline."""
     slab = max(3, round(px_per_m * rng.uniform(0.15, 0.45)))
     j, i = np.indices((side, side)) // slab
     return np.where((i + j) % 2, rng.uniform(30, 90), rng.uniform(140, 220)).astype(np.uint8)
 
 
 def _stripes(rng: Random, side: int, px_per_m: float) -> Image:
-    """A wall paper of stripes with a second, fainter row across."""
+    """Return a wallpaper of stripes with fainter stripes across."""
     width = max(2, round(px_per_m * rng.uniform(0.04, 0.15)))
     j, i = np.indices((side, side)) // width
     return (rng.uniform(60, 110) + 90 * (i % 2) + rng.uniform(0, 25) * (j % 2)).astype(np.uint8)

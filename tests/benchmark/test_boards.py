@@ -1,4 +1,4 @@
-"""A few of the hard renderings: `python -m tests.benchmark.boards` has more, and OpenCV's detectors beside them."""
+"""A few of the hard renderings; `python -m tests.benchmark.boards` has more and compares with OpenCV's detectors."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ import pytest
 
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
-from tests.benchmark.boards import DETECTORS, count, enough, judged
-from tests.benchmark.boards_rendered import Hard, hard
+from tests.benchmark.boards import DETECTORS, classify_detection, count, meets_requirement
+from tests.benchmark.boards_rendered import HardBoard, render_hard_board
 
-NUMBERS = (2, 14, 16, 23, 24, 25)  # small images, one of each kind of mirror and of many walls
+# Small images of every kind of mirror and of many walls.
+NUMBERS = (2, 14, 16, 23, 24, 25)
 
 
 @pytest.mark.slow
-def test_more_boards_than_opencv_finds_and_none_that_is_wrong() -> None:
-    shots = [hard(7, number) for number in NUMBERS]
+def test_finds_more_boards_than_opencv_and_no_wrong_one() -> None:
+    shots = [render_hard_board(7, number) for number in NUMBERS]
     sums = {name: count(shots, detect, empty=name == "omnid") for name, detect in DETECTORS.items()}
-    assert enough(sums, len(shots)), sums
+    assert meets_requirement(sums, len(shots)), sums
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [3, 4, 5, 13, 17, 25, 27])
-def test_windows_bricks_stripes_and_floors_are_no_boards(number: int) -> None:
-    image = hard(7, number).empty
+def test_finds_no_board_in_windows_bricks_stripes_and_floors(number: int) -> None:
+    image = render_hard_board(7, number).empty
     assert [board for board in ((4, 3), (5, 4), (3, 3)) if find_board(image, Board(*board, 0.03)).view] == []
 
 
-def test_a_board_a_square_off_is_wrong() -> None:
+def test_classifies_a_board_shifted_by_a_square_as_wrong() -> None:
     x, y = np.meshgrid(10.0 * np.arange(5), 10.0 * np.arange(4))
     corners, image = np.column_stack([x.ravel(), y.ravel()]), np.zeros((9, 9), np.uint8)
-    shot = Hard("", Board(5, 4, 0.03), image, image, corners)
-    assert [judged(found, shot) for found in (None, corners[::-1] + 0.5, corners + np.array([10.0, 0.0]))] == [
-        "missed", "found", "wrong"]
+    rendered = HardBoard("", Board(5, 4, 0.03), image, image, corners)
+    detections = (None, corners[::-1] + 0.5, corners + np.array([10.0, 0.0]))
+    assert [classify_detection(found, rendered) for found in detections] == ["missed", "found", "wrong"]

@@ -1,4 +1,4 @@
-"""Rigs whose transforms are no one's inverse, with cameras of both models."""
+"""Rigs whose transforms differ from their inverses, with cameras of both models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T_DOWN = se3.transform([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], [0, 0, 0])
 
 
 def misaligned(lower: OmniCamera, upper: OmniCamera) -> Rig:
-    """A rig that is turned and shifted about every axis, so that no transform passes for its inverse."""
+    """Return a rig that is rotated and shifted about every axis, so that a transform differs from its inverse."""
     T_lower_rig = se3.exp([0.01, -0.02, 0.03, 0.04, -0.05, 0.6]) @ T_DOWN
     T_upper_lower = se3.exp([-0.008, 0.011, 0.17, 0.03, 0.02, -0.25])
     T_base_rig = se3.exp([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
@@ -54,7 +54,7 @@ def ocam_rig() -> Rig:
 
 @pytest.fixture
 def around() -> Array:
-    """Points (N, 3) [m] all around a rig's frame, 1 to 5 m away, from 35 degrees below to 30 above the horizon."""
+    """Return points (N, 3) [m] on all sides of a rig, 1 to 5 m away, from 35 degrees below to 30 above the horizon."""
     random = np.random.default_rng(1)
     azimuth, elevation = random.uniform(-np.pi, np.pi, 300), np.deg2rad(random.uniform(-35, 30, 300))
     level = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])

@@ -1,4 +1,4 @@
-"""camera.toml: written, read back as it was, and refused where it is wrong."""
+"""camera.toml: round trips, masks, errors."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ QUALITY = Quality(0.25, 10, [("a0", -131.64, 0.2), ("d = e", 2.2e-4, 1e-5)])
 
 @pytest.mark.parametrize("camera", [OMNI, OCAM, OcamCamera(OCAM.polynomial, (382.4, 514.6), OCAM.affine, (1024, 768),
                                                            "direct")])
-def test_a_camera_comes_back_as_it_was(camera: OmniCamera, tmp_path: Path) -> None:
+def test_camera_round_trip(camera: OmniCamera, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(camera_toml(CameraFile(camera), QUALITY))
     assert read_camera(path) == CameraFile(camera)
 
 
-def test_its_mask_comes_back_from_beside_it_or_from_within(tmp_path: Path) -> None:
+def test_mask_round_trip_as_file_and_embedded(tmp_path: Path) -> None:
     image = np.zeros((768, 1024), np.uint8)
     image[100:600, 200:800] = 255
     for name in ("", "edited.png"):
@@ -48,7 +48,7 @@ def test_its_mask_comes_back_from_beside_it_or_from_within(tmp_path: Path) -> No
     ("c = 0.99923", "cc = 0.99923", "camera.intrinsics.cc: unknown key"),
     ("schema = 1", "schema = ", "not a TOML file"),
 ])
-def test_what_is_wrong_is_named(old: str, new: str, says: str) -> None:
+def test_errors_name_the_key(old: str, new: str, says: str) -> None:
     text = camera_toml(CameraFile(OCAM), QUALITY)
     assert old in text
     with pytest.raises(CalibError, match=says):

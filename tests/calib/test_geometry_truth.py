@@ -1,4 +1,4 @@
-"""The physical truth of axes: mirrors by the law of reflection, rigs of all kinds, panoramas seen from inside."""
+"""Axes and signs: mirrors by the law of reflection, misaligned rigs, panoramas seen from inside."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ DIRECTIONS = {"forward": (1.0, 0, 0), "left": (0, 1.0, 0), "right": (0, -1.0, 0)
 
 
 def reflected(points: Array) -> Array:
-    """Pixels of world points in an orthographic camera that looks up at a convex paraboloid with focus at the origin.
+    """Return pixels of world points in an orthographic camera below a convex paraboloid with focus at the origin.
 
-    The paraboloid r^2 = 1 + 2 z hangs with its vertex down: |p| = 1 + z. A ray towards the focus leaves it straight
-    down, which is proved here by the law of reflection. The image's u runs left, its v backward: u x v is up.
+    The paraboloid r^2 = 1 + 2 z has its vertex at the bottom: |p| = 1 + z. A ray towards the focus is reflected
+    vertically down, which the law of reflection proves here. u points left, v backward: u x v is up.
     """
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     on_mirror = rays / (1 - rays[:, 2:])
@@ -47,27 +47,27 @@ def reflected(points: Array) -> Array:
 
 
 def parabolic_omni() -> MountedCamera:
-    """The mirror as Kalibr would have it: fu < 0, camera x right, y backward, z down."""
+    """Return the mirror in Kalibr's convention: fu < 0, camera x right, y backward, z down."""
     T_cam_rig = se3.transform([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], [0, 0, 0])
     return MountedCamera(UnifiedCamera(1.0, (-FOCAL_PX, FOCAL_PX), CENTER, (768, 768)), T_cam_rig)
 
 
 def parabolic_ocam() -> MountedCamera:
-    """The mirror as the toolbox would have it: camera x backward (rows), y left (columns), z down."""
+    """Return the mirror in the toolbox's convention: camera x backward (rows), y left (columns), z down."""
     polynomial = (-FOCAL_PX / 2, 0.0, 1 / (2 * FOCAL_PX))
     T_cam_rig = se3.transform([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], [0, 0, 0])
     return MountedCamera(OcamCamera(polynomial, CENTER[::-1], (1.0, 0.0, 0.0), (768, 768)), T_cam_rig)
 
 
 @pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
-def test_both_models_see_in_a_mirror_what_the_law_of_reflection_says(mounted: MountedCamera, around: Array) -> None:
+def test_both_models_follow_the_law_of_reflection(mounted: MountedCamera, around: Array) -> None:
     assert se3.is_rigid(mounted.T_cam_rig)
     pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, around))
     np.testing.assert_allclose(pixels, reflected(around), rtol=0, atol=1e-7)
 
 
-def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -> None:
-    """An equidistant-like lens: the angle from straight up grows with the radius; the sides are those of a mirror."""
+def test_upward_fisheye_projects_the_ceiling_to_the_middle(around: Array) -> None:
+    """Nearly equidistant lens: the angle from the vertical increases with the radius; sides as in a mirror."""
     camera = OcamCamera((-FOCAL_PX, 0.0, 1 / FOCAL_PX), CENTER[::-1], (1.0, 0.0, 0.0), (768, 768), "direct")
     T_cam_rig = se3.transform([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], [0, 0, 0])
     pixels = camera.project(se3.apply(T_cam_rig, around))
@@ -80,12 +80,12 @@ def test_a_fisheye_that_looks_up_sees_the_ceiling_in_the_middle(around: Array) -
 
 @pytest.mark.parametrize("mounted", [parabolic_omni(), parabolic_ocam()], ids=["omni", "ocam"])
 @pytest.mark.parametrize("side", DIRECTIONS)
-def test_left_of_the_robot_is_on_the_right_of_a_image_taken_from_below(mounted: MountedCamera, side: str) -> None:
+def test_left_of_the_robot_is_on_the_right_of_the_image(mounted: MountedCamera, side: str) -> None:
     (pixel,) = mounted.camera.project(se3.apply(mounted.T_cam_rig, np.array([DIRECTIONS[side]])))
     np.testing.assert_allclose((pixel - CENTER) / FOCAL_PX, SEEN_FROM_BELOW[side], rtol=0, atol=1e-9)
 
 
-def test_higher_things_are_further_out_in_a_mirror() -> None:
+def test_higher_points_are_farther_from_the_centre_in_a_mirror() -> None:
     mounted = parabolic_omni()
     steps = np.array([[1, 0, -1.0], [1, 0, 0], [1, 0, 0.7]])
     pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig, steps))
@@ -93,7 +93,7 @@ def test_higher_things_are_further_out_in_a_mirror() -> None:
 
 
 def rectified(rig: Rig, points: Array, cylinder: Cylinder) -> tuple[Array, Array]:
-    """Panorama pixels of points (rig frame), through each camera's image: project, lift, turn to the cylinder."""
+    """Return panorama pixels of points (rig frame) through each camera: project, lift, rotate to the cylinder."""
     found = []
     for mounted in (rig.lower, rig.upper):
         rays = mounted.camera.lift(mounted.camera.project(se3.apply(mounted.T_cam_rig, points)))
@@ -102,7 +102,7 @@ def rectified(rig: Rig, points: Array, cylinder: Cylinder) -> tuple[Array, Array
     return found[0], found[1]
 
 
-def test_columns_are_shared_and_disparity_is_focal_times_baseline_by_distance(rig: Rig, around: Array) -> None:
+def test_columns_are_equal_and_disparity_is_focal_baseline_over_distance(rig: Rig, around: Array) -> None:
     cylinder = Cylinder(1200, 400, 200.0)
     lower, upper = rectified(rig, around, cylinder)
     assert np.isfinite(lower).all() and np.isfinite(upper).all()
@@ -114,7 +114,7 @@ def test_columns_are_shared_and_disparity_is_focal_times_baseline_by_distance(ri
     np.testing.assert_allclose(disparity, 1200 / (2 * np.pi) * rig.baseline_m / distance, rtol=0, atol=1e-8)
 
 
-def test_the_viewpoint_is_where_the_camera_is(rig: Rig) -> None:
+def test_viewpoint_is_the_camera_origin(rig: Rig) -> None:
     for mounted in (rig.lower, rig.upper):
         np.testing.assert_allclose(mounted.T_cam_rig @ np.r_[mounted.viewpoint, 1], [0, 0, 0, 1], rtol=0, atol=1e-14)
     upper_rect = rig.T_rect_rig @ np.r_[rig.upper.viewpoint, 1]
@@ -123,7 +123,7 @@ def test_the_viewpoint_is_where_the_camera_is(rig: Rig) -> None:
     assert se3.is_rigid(rig.T_rect_rig)
 
 
-def test_the_panorama_is_seen_from_inside_left_on_the_left_and_up_is_up() -> None:
+def test_panorama_is_seen_from_inside() -> None:
     cylinder = Cylinder(1000, 400, 150.0)
     ahead, behind = [[1.0, 0, 0], [1, 0.1, 0], [1, -0.1, 0], [1, 0, 0.1]], [[-1, 1e-9, 0], [-1, -1e-9, 0]]
     pixels = cylinder.pixels(np.array(ahead + behind))
@@ -135,7 +135,7 @@ def test_the_panorama_is_seen_from_inside_left_on_the_left_and_up_is_up() -> Non
     np.testing.assert_allclose(cylinder.pixels(cylinder.rays(grid)), grid, rtol=0, atol=1e-9)
 
 
-def test_a_turn_to_the_left_moves_the_image_right(rig: Rig, around: Array) -> None:
+def test_rotation_to_the_left_moves_the_image_right(rig: Rig, around: Array) -> None:
     cylinder, turn = Cylinder(1200, 400, 200.0), 0.2
     T_before_after = se3.transform(se3.rotation_exp(turn * se3.inverse(rig.T_rect_rig)[:3, 2]), np.zeros(3))
     away = around * 1e6
@@ -144,7 +144,7 @@ def test_a_turn_to_the_left_moves_the_image_right(rig: Rig, around: Array) -> No
     np.testing.assert_allclose(cylinder.wrap(after[:, 0] - before[:, 0]), turn * cylinder.focal_px, rtol=0, atol=1e-3)
 
 
-def test_remap_tables_lead_from_the_panorama_to_the_very_pixel(rig: Rig) -> None:
+def test_remap_tables_equal_the_projection(rig: Rig) -> None:
     cylinder = fit_cylinder(rig, 800)
     for mounted in (rig.lower, rig.upper):
         maps = remap_tables(rig, mounted, cylinder, pad_px=16)
@@ -159,7 +159,7 @@ def test_remap_tables_lead_from_the_panorama_to_the_very_pixel(rig: Rig) -> None
         np.testing.assert_allclose([maps[0][row, column + 16], maps[1][row, column + 16]], pixel[0], rtol=0, atol=1e-3)
 
 
-def test_a_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
+def test_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
     cylinder = fit_cylinder(omni_rig, 800)
     maps = remap_tables(omni_rig, omni_rig.lower, cylinder)
     masked = replace(omni_rig.lower, mask=Mask(omni_rig.lower.camera.center, 120.0, 300.0))
@@ -168,7 +168,7 @@ def test_a_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
     np.testing.assert_array_equal(seen, (maps[0] >= 0) & (radius >= 122) & (radius <= 298))
 
 
-def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_image_runs() -> None:
+def test_rig_between_is_upright_with_x_along_the_image_axis() -> None:
     lower, upper = parabolic_omni().camera, parabolic_ocam().camera
     for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
         rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
@@ -178,7 +178,7 @@ def test_a_rig_of_a_known_transform_stands_up_and_faces_where_the_image_runs() -
 
 
 def first_images(log: Path, topics: tuple[str, str]) -> list[Any]:
-    """The first image of each topic of a log."""
+    """Return the first image of each topic of a log."""
     images: dict[str, Any] = dict.fromkeys(topics)
     store = get_typestore(Stores.ROS2_HUMBLE)
     with log.open("rb") as file:
@@ -191,7 +191,7 @@ def first_images(log: Path, topics: tuple[str, str]) -> list[Any]:
 
 
 def tracked(first: Any, second: Any) -> Array:
-    """Offsets (N, 2) of features that go from one image to the other and come back."""
+    """Return offsets (N, 2) of features tracked from one image to the other and back."""
     corners: Any = cv2.goodFeaturesToTrack(first, 400, 0.02, 8)
     track: Any = cv2.calcOpticalFlowPyrLK
     moved, there, _ = track(first, second, corners, None, winSize=(21, 21), maxLevel=4)
@@ -200,8 +200,8 @@ def tracked(first: Any, second: Any) -> Array:
     return np.asarray((moved - corners).reshape(-1, 2)[good])
 
 
-def test_columns_of_a_real_pair_agree(shared_data: Path) -> None:
-    """What the two cameras of a misaligned rig saw lies in the same columns, and lower in the upper panorama."""
+def test_columns_of_a_recorded_pair_are_equal(shared_data: Path) -> None:
+    """Points are in the same columns of both panoramas, and lower in the upper one."""
     folder = shared_data / "two_walls_crooked"
     rig = import_kalibr(folder / "camchain.yaml")
     cylinder = fit_cylinder(rig)

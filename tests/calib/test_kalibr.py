@@ -1,4 +1,4 @@
-"""Kalibr's camchain.yaml: in, out, which camera is lower, and what is refused."""
+"""Kalibr's camchain.yaml: import, export, identification of the lower camera, errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAMERA = """
   distortion_coeffs: [0.01, -0.02, 0.003, 0.004]
   resolution: [768, 770]
 """
-# The lower camera looks up and is turned about every axis: as a transform, nobody's inverse.
+# The lower camera looks up and is rotated about every axis, so that the transform differs from its inverse.
 T_LOWER_IMU = se3.exp([0.01, 0.02, 0.03, 0.1, -0.2, 0.7]) @ np.diag([1, -1, -1, 1.0])
 T_UPPER_LOWER = se3.exp([0.02, -0.01, 0.2, 0.02, 0.05, 0.3])
 
@@ -40,7 +40,7 @@ BOTH = (T_LOWER_IMU, T_UPPER_LOWER @ T_LOWER_IMU)
 NAMED = ("/lower/image_raw", "/upper/image_raw")
 
 
-def test_every_number_lands_where_kalibr_means_it() -> None:
+def test_parses_every_number_as_kalibr_defines_it() -> None:
     rig = parse_kalibr(chain(BOTH, T_UPPER_LOWER, NAMED))
     bent = (0.01, -0.02, 0.003, 0.004)
     assert rig.lower.camera == UnifiedCamera(1.0, (-207.0, 208.0), (383.5, 384.5), (768, 770), bent)
@@ -49,7 +49,7 @@ def test_every_number_lands_where_kalibr_means_it() -> None:
     assert rig.topics == NAMED
 
 
-def test_a_rig_goes_out_and_comes_back_bit_for_bit(omni_rig: Rig) -> None:
+def test_rig_round_trip_is_exact(omni_rig: Rig) -> None:
     found = parse_kalibr(export_kalibr(omni_rig))
     for a, b in ((found.lower, omni_rig.lower), (found.upper, omni_rig.upper)):
         assert a.camera == b.camera
@@ -57,12 +57,12 @@ def test_a_rig_goes_out_and_comes_back_bit_for_bit(omni_rig: Rig) -> None:
     assert found.topics == omni_rig.topics
 
 
-def test_an_ocam_rig_is_not_exported(ocam_rig: Rig) -> None:
+def test_refuses_to_export_an_ocam_rig(ocam_rig: Rig) -> None:
     with pytest.raises(CalibError, match="found an ocam camera; use --format ocam"):
         export_kalibr(ocam_rig)
 
 
-def test_without_an_imu_the_chain_places_the_cameras() -> None:
+def test_uses_the_camera_chain_without_imu_transforms() -> None:
     rig = parse_kalibr(chain((None, None), T_UPPER_LOWER, NAMED))
     T_found = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     np.testing.assert_allclose(T_found, T_UPPER_LOWER, atol=1e-14)
@@ -76,7 +76,7 @@ def test_without_an_imu_the_chain_places_the_cameras() -> None:
     np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 2], z_lower, atol=1e-14)
 
 
-def test_one_imu_transform_and_the_chain_are_enough() -> None:
+def test_combines_one_imu_transform_with_the_chain() -> None:
     for T_imu in ((BOTH[0], None), (None, BOTH[1])):
         rig = parse_kalibr(chain(T_imu, T_UPPER_LOWER, NAMED))
         np.testing.assert_allclose(rig.lower.T_cam_rig, BOTH[0], atol=1e-14)
@@ -87,32 +87,32 @@ def test_one_imu_transform_and_the_chain_are_enough() -> None:
     (("/lower/image", "/upper/image"), True), (("/upper/image", "/lower/image"), False),
     (("/cam_top/image", ""), False), (("", "/rig/Top"), True), (("/bottom", "/x"), True),
     (("/desktop/a", "/desktop/b"), True), (("/follower/a", "/laptop/b"), True)])
-def test_which_is_lower_by_topic_else_by_height(topics: tuple[str, str], lower_is_cam0: bool) -> None:
+def test_identifies_the_lower_camera_by_topic_or_height(topics: tuple[str, str], lower_is_cam0: bool) -> None:
     rig = parse_kalibr(chain(BOTH, None, topics))
     np.testing.assert_array_equal(rig.lower.T_cam_rig, BOTH[not lower_is_cam0])
 
 
-def test_height_is_the_viewpoints_and_not_the_transforms() -> None:
-    """A camera whose z axis points up: its T_cam_imu falls as it is mounted higher."""
+def test_height_is_that_of_the_viewpoint() -> None:
+    """The z of T_cam_imu of a camera whose z axis points up decreases with its height."""
     low, high = (se3.inverse(se3.transform(np.eye(3), (0.0, 0.0, z))) for z in (0.5, 0.7))
     assert parse_kalibr(chain((high, low), None)).lower.viewpoint[2] == pytest.approx(0.5)
 
 
-def test_small_numbers_keep_the_point_that_yaml_1_1_needs(omni_rig: Rig) -> None:
+def test_writes_small_numbers_for_yaml_1_1(omni_rig: Rig) -> None:
     camera = UnifiedCamera(1.0, (-2e2, 2e2), (3e2, 3e2), (600, 600), (1e-07, -2.5e-08, 0.0, 1e22))
     text = export_kalibr(replace(omni_rig, lower=replace(omni_rig.lower, camera=camera)))
     assert "distortion_coeffs: [1.0e-07, -2.5e-08, 0.0, 1.0e+22]" in text
     assert parse_kalibr(text).lower.camera == camera
 
 
-def test_which_is_lower_when_told() -> None:
+def test_uses_the_named_lower_and_upper_cameras() -> None:
     assert parse_kalibr(chain(BOTH, None), lower="cam1").upper.T_cam_rig.tolist() == BOTH[0].tolist()
     assert parse_kalibr(chain(BOTH, None, NAMED), upper="cam0").lower.T_cam_rig.tolist() == BOTH[1].tolist()
     swapped = parse_kalibr(chain(BOTH[::-1], None))
     np.testing.assert_array_equal(swapped.lower.T_cam_rig, BOTH[0])
 
 
-def test_two_of_three_cameras_can_be_named() -> None:
+def test_selects_two_of_three_cameras_by_name() -> None:
     text = chain(BOTH, T_UPPER_LOWER, NAMED) + f"cam2:{CAMERA}  T_cn_cnm1: {T_UPPER_LOWER.tolist()}\n"
     with pytest.raises(CalibError, match="expected two cameras, found cam0, cam1, cam2"):
         parse_kalibr(text, lower="cam0")
@@ -129,7 +129,7 @@ def test_two_of_three_cameras_can_be_named() -> None:
     ("distortion_model: radtan", "distortion_model: equidistant", "distortion_model: expected radtan or none"),
     ("[0.01, -0.02, 0.003, 0.004]", "[]", "cam0.distortion_coeffs: expected 4 finite numbers"),
     ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[-207.0, 208.0, 383.5, 384.5]", "cam0.intrinsics: expected 5"),
-    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[1.0, 0.0, 208.0, 383.5, 384.5]", "cam0: omni camera: needs"),
+    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[1.0, 0.0, 208.0, 383.5, 384.5]", "cam0: omni camera: expected"),
     ("[768, 770]", "768", "cam0.resolution"),
     ("cam1:", "cam0:", "not a YAML file"),
     ("cam1:", "camera1:", "expected two cameras"),
@@ -138,7 +138,7 @@ def test_two_of_three_cameras_can_be_named() -> None:
     ("cam0:", "- cam0:", "not a YAML file"),
     ("cam0:", "cam0: &a [*a]\ncam2:", "cam0: expected a table"),
 ])
-def test_what_is_wrong_is_named(old: str, new: str, says: str) -> None:
+def test_errors_name_the_key(old: str, new: str, says: str) -> None:
     text = chain(BOTH, T_UPPER_LOWER, NAMED)
     assert old in text
     with pytest.raises(CalibError, match=says) as caught:
@@ -148,14 +148,14 @@ def test_what_is_wrong_is_named(old: str, new: str, says: str) -> None:
 
 @pytest.mark.parametrize("wrong", [se3.inverse(T_UPPER_LOWER), T_UPPER_LOWER @ se3.exp([0.0015, 0, 0, 0, 0, 0]),
                                    T_UPPER_LOWER @ se3.exp([0, 0, 0, 0, 0.002, 0])])
-def test_transforms_that_contradict_each_other_are_refused(wrong: Array) -> None:
+def test_refuses_contradicting_transforms(wrong: Array) -> None:
     with pytest.raises(CalibError, match=r"cam1: T_cam_imu and T_cn_cnm1 contradict each other by"):
         parse_kalibr(chain(BOTH, wrong, NAMED))
     parse_kalibr(chain(BOTH, T_UPPER_LOWER @ se3.exp([0.0005, 0, 0, 0, 0.001, 0]), NAMED))
 
 
 @pytest.mark.parametrize(("text", "arguments", "says"), [
-    (chain((None, None), None, NAMED), {}, "no transform ties cam0 to cam1"),
+    (chain((None, None), None, NAMED), {}, "no transform between cam0 and cam1"),
     (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
     (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
     (chain((BOTH[0], BOTH[0]), None, NAMED), {}, "viewpoints must lie apart"),
@@ -164,12 +164,12 @@ def test_transforms_that_contradict_each_other_are_refused(wrong: Array) -> None
     (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),
     ("", {}, "expected a YAML mapping"), ("[" * 3000, {}, "not a YAML file"), ("!!python/none x", {}, "YAML"),
 ])
-def test_what_cannot_be_told_is_asked_for(text: str, arguments: dict[str, str], says: str) -> None:
+def test_refuses_files_with_missing_information(text: str, arguments: dict[str, str], says: str) -> None:
     with pytest.raises(CalibError, match=says):
         parse_kalibr(text, **arguments)
 
 
-def test_any_damage_is_a_calib_error_or_a_rig() -> None:
+def test_damaged_text_is_a_calib_error_or_a_rig() -> None:
     text, random = chain(BOTH, None, NAMED).encode(), np.random.default_rng(0)
     for _ in range(60):
         damaged = bytearray(text)
@@ -181,7 +181,7 @@ def test_any_damage_is_a_calib_error_or_a_rig() -> None:
             assert "\n" not in str(error)
 
 
-def test_the_crooked_file_is_read_as_its_makers_mean_it(shared_data: Path) -> None:
+def test_reads_the_file_of_a_misaligned_rig(shared_data: Path) -> None:
     rig = import_kalibr(shared_data / "two_walls_crooked" / "camchain.yaml")
     assert rig.baseline_m == pytest.approx(0.16, abs=1e-3)
     assert rig.upper.viewpoint[2] - rig.lower.viewpoint[2] > 0.15

@@ -1,4 +1,4 @@
-"""OCamCalib's own results, through its file's conventions: its poses and corners give its errors to the last digit."""
+"""OCamCalib's results by its file's conventions: its poses and corners give its reprojection errors."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from calib.ocam_file import export_ocam, parse_ocam
 KEYS = ("ocam_std", "ocam_subpix")
 
 
-def told(shared_data: Path, key: str) -> dict[str, Any]:
+def reference(shared_data: Path, key: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
     return found
 
 
 def text(numbers: dict[str, Any]) -> str:
-    """calib_results.txt as the toolbox writes it from these numbers: MATLAB counts from 1, the file from 0."""
+    """Return the toolbox's calib_results.txt of these numbers: MATLAB counts from 1, the file from 0."""
     polynomial = " ".join(f"{value:.17e}" for value in numbers["ss"])
     center = f"{numbers['xc_row_1based'] - 1:.15f} {numbers['yc_col_1based'] - 1:.15f}"
     return (f"#polynomial\n\n{len(numbers['ss'])} {polynomial} \n\n#inverse\n\n2 1.0 1.0 \n\n#center\n\n{center}\n\n"
@@ -31,15 +31,15 @@ def text(numbers: dict[str, Any]) -> str:
 
 
 def board_in_camera(numbers: dict[str, Any], image: dict[str, Any], view: View) -> Array:
-    """The corners (N, 3) [mm] in the camera's frame: [r1 r2 t] of the toolbox, which looks into its mirror directly."""
+    """Return the corners (N, 3) [mm] in the camera's frame by [r1 r2 t] of the toolbox, which assumes a direct view."""
     plane = np.column_stack([numbers["Xt_mm"], numbers["Yt_mm"], np.ones(len(numbers["Xt_mm"]))])
     return np.asarray(plane @ np.array(image["RRfin_r1_r2_t"]).T * ((1, 1, -1) if view == "mirror" else (1, 1, 1)))
 
 
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("view", ["mirror", "direct"])
-def test_its_errors_come_out_as_it_has_them(shared_data: Path, key: str, view: View) -> None:
-    numbers = told(shared_data, key)
+def test_reproduces_the_toolbox_errors(shared_data: Path, key: str, view: View) -> None:
+    numbers = reference(shared_data, key)
     camera = parse_ocam(text(numbers), view)
     assert camera.size == (1024, 768)
     for image, stored in zip(numbers["images"], numbers["stored_errMean_px"], strict=True):
@@ -49,9 +49,9 @@ def test_its_errors_come_out_as_it_has_them(shared_data: Path, key: str, view: V
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_what_is_exported_serves_its_c_code(shared_data: Path, key: str) -> None:
+def test_exported_file_projects_like_the_toolbox_c_code(shared_data: Path, key: str) -> None:
     """world2cam of the toolbox's C code: rho by the inverse polynomial of atan(z / r), then the affine."""
-    numbers = told(shared_data, key)
+    numbers = reference(shared_data, key)
     camera = parse_ocam(text(numbers), "direct")
     lines = [line.split() for line in export_ocam(camera).splitlines() if line and not line.startswith("#")]
     polynomial, inverse, center, affine, size = (list(map(float, line)) for line in lines)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.models.camera import Array
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 from tests.simulation.surfaces import Rectangle
 
 DPI = 110
@@ -72,7 +72,7 @@ def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], pat
     _save(figure, path)
 
 
-def floor_plan(run: Run, points: Array, path_xy: dict[str, Array], path: Path) -> None:
+def floor_plan(run: SimulatedRun, points: Array, path_xy: dict[str, Array], path: Path) -> None:
     """Draw the map's points (N, 3) in the world, black, and paths (N, 2) over the true floor plan, grey (fig. 10)."""
     figure = Figure(figsize=(9, 6.8), layout="constrained")
     axes = figure.subplots()

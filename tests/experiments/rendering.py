@@ -14,13 +14,13 @@ import numpy as np
 
 from tests.experiments.povray import shoot, write_world
 from tests.simulation.logs import pack_log, write_log
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 from tests.simulation.sensor import Floats
 
 CAMERAS = ("lower", "upper")
 
 
-def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs: int = 2) -> None:
+def render_log(folder: Path, run: SimulatedRun, seed: int, *, supersample: int = 2, jobs: int = 2) -> None:
     """Render the missing images in folder/frames and write log.mcap, truth.txt, rig.toml and camchain.yaml beside it.
 
     Does nothing if the log exists. An image file is always complete, so the same command continues an interrupted
@@ -45,7 +45,7 @@ def render_log(folder: Path, run: Run, seed: int, *, supersample: int = 2, jobs:
     _remove(frames, folder / "world")
 
 
-def cast_log(folder: Path, run: Run, seed: int, *, supersample: int = 2) -> None:
+def cast_log(folder: Path, run: SimulatedRun, seed: int, *, supersample: int = 2) -> None:
     """Render a run by the ray caster of tests/simulation and write the same files; does nothing if the log exists."""
     if not (folder / "log.mcap").exists():
         write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=seed, supersample=supersample,

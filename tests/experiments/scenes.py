@@ -12,7 +12,7 @@ from tests.experiments.building import building, round_trip
 from tests.simulation import paths
 from tests.simulation.builders import CEILING_M, corridor
 from tests.simulation.builders import wall as upright
-from tests.simulation.recipes import TURN_DEG, Run
+from tests.simulation.recipes import TURN_DEG, SimulatedRun
 from tests.simulation.rigs import RIM, make_rig
 from tests.simulation.surfaces import Rectangle, Scene
 from tests.simulation.textures import PAINTERS, value_noise
@@ -58,17 +58,17 @@ def _paper_rig(seed: int, size: int, options: RigOptions) -> Rig:
                                           misaligned=misaligned))
 
 
-def brick(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def brick(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return a run before a wall of identical bricks (section V.B)."""
     return _facing(seed, size, pairs, options, "brick")
 
 
-def control(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def control(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return the run of `brick` with a wall texture that does not repeat."""
     return _facing(seed, size, pairs, options, "granite")
 
 
-def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return the run of `brick` with a smooth wall: soft clouds without edges, the weakness named in section III.C."""
     run = _facing(seed, size, pairs, options, "plain")
     rng = np.random.default_rng([seed, 25])
@@ -80,7 +80,7 @@ def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
     return replace(run, scene=Scene((replace(front, texture=texture), *others)))
 
 
-def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) -> Run:
+def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) -> SimulatedRun:
     """Return a run WALL_M before a wall named 'wall'; other walls are plaster. The pairs are 7 cm apart, sideways."""
     rng = np.random.default_rng([seed, 24])
     half = WALL_SIZE_M[0] / 2
@@ -91,16 +91,16 @@ def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) ->
                       PAINTERS["tiles"](rng, (900, 1800), 200.0), "floor")
     scene = Scene((replace(front, name="wall"), *others, floor))
     aside = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
-    return Run(_paper_rig(seed, size, options), paths.planar_poses(aside, np.zeros(pairs)), scene)
+    return SimulatedRun(_paper_rig(seed, size, options), paths.planar_poses(aside, np.zeros(pairs)), scene)
 
 
-def two_walls(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def two_walls(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return 5 cm steps along a spline between two walls, with a turn of 94 degrees just before the end (V.C)."""
     poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
-    return Run(seeded_rig(seed, size, options), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+    return SimulatedRun(seeded_rig(seed, size, options), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
-def turns(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return a first pair with yaw 0, pairs turned left by TURNS_DEG, and pairs turned by MOVED_TURNS_DEG and moved.
 
     Section IV.F. Tracking from the first pair to another is a turn to the left, the other way a turn to the right.
@@ -108,23 +108,24 @@ def turns(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
     angles = np.deg2rad([0, *TURNS_DEG, *MOVED_TURNS_DEG])
     xy = np.zeros((len(angles), 2))
     xy[-len(MOVED_TURNS_DEG):] = MOVED_M
-    return Run(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
+    return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
 
 
-def building_run(seed: int, size: int, pairs: int, options: RigOptions) -> Run:
+def building_run(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
     """Return one round through the corridor of a building, back to its start (section V.D)."""
     plan, scene = building(seed)
-    return Run(seeded_rig(seed, size, options), round_trip(seed, plan, pairs), scene)
+    return SimulatedRun(seeded_rig(seed, size, options), round_trip(seed, plan, pairs), scene)
 
 
-Recipe = Callable[[int, int, int, RigOptions], Run]
+Recipe = Callable[[int, int, int, RigOptions], SimulatedRun]
 EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
     "brick": (brick, 3), "control": (control, 3), "smooth": (smooth, 3), "two_walls": (two_walls, 99),
     "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)), "building": (building_run, 349),
 }
 
 
-def build(name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None) -> Run:
+def build(name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None
+          ) -> SimulatedRun:
     """Return the run of a name; pairs None: as many as the paper has."""
     recipe, default_pairs = EXPERIMENTS[name]
     return recipe(seed, size, pairs or default_pairs, options or RigOptions())

@@ -19,7 +19,7 @@ from tests.experiments.scenes import build
 from tests.experiments.tables import angle, percent, spread
 from tests.experiments.views import Experiment
 from tests.experiments.whole_building import map_errors
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 
 # Rendered by POV-Ray: render brick --seed 1 --size 512 --pairs 1, turns --size 448 --pairs 5 --supersample 3.
 SMALL = Path(__file__).parent / "small"
@@ -111,7 +111,7 @@ def test_every_method_of_the_table_is_a_valid_configuration(method: Method) -> N
     assert method.config.stereo.matching.method in {"auto", *wall_matching.SAD_METHODS.values()}
 
 
-def points_on(run: Run, off_m: float) -> MapPoints:
+def points_on(run: SimulatedRun, off_m: float) -> MapPoints:
     """Return points off_m in front of the first wall, in the frame of the first pose."""
     side = run.scene.rectangles[0]
     uv = np.random.default_rng(1).uniform(0.05, 0.95, (500, 2))

@@ -20,7 +20,7 @@ from omnid.core.odometry.yaw_search import correlation_peaks
 from tests.experiments.scenes import MOVED_TURNS_DEG, TURNS_DEG
 from tests.experiments.truth import Flags, cast, sees
 from tests.experiments.views import Experiment, Views, load_views
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 
 FEATURES = 500
 RIGHT_PX = 3.0  # largest distance of a right feature from its true pixel
@@ -84,14 +84,14 @@ def turns(pairs: int) -> Iterator[Turn]:
             yield Turn(number, 0, -angle_deg, moved)
 
 
-def _row(run: Run, views: Views, frames: list[StereoFrame], turn: Turn) -> dict[str, Any]:
+def _row(run: SimulatedRun, views: Views, frames: list[StereoFrame], turn: Turn) -> dict[str, Any]:
     features = _features(run, views, frames[turn.before], run.poses[turn.before])
     found = {name: _count(run, views, (frames[turn.before], frames[turn.after]), features, run.poses[turn.after],
                           tracker) for name, tracker in TRACKERS.items()}
     return {"turn_deg": turn.angle_deg, "moved": turn.moved, "features": len(features.pixels), "found": found}
 
 
-def _features(run: Run, views: Views, frame: StereoFrame, T_world_rig: Array) -> Features:
+def _features(run: SimulatedRun, views: Views, frame: StereoFrame, T_world_rig: Array) -> Features:
     pixels = corners(frame.lower, frame.usable, FEATURES)
     origin, rays = views.viewpoint(T_world_rig), views.rays(pixels) @ T_world_rig[:3, :3].T
     distance, _ = cast(run.scene, origin, rays)
@@ -99,8 +99,8 @@ def _features(run: Run, views: Views, frame: StereoFrame, T_world_rig: Array) ->
     return Features(pixels[hit], origin + distance[hit, None] * rays[hit])
 
 
-def _count(run: Run, views: Views, frames: tuple[StereoFrame, StereoFrame], features: Features, T_world_rig: Array,
-           tracker: Tracker) -> dict[str, float]:
+def _count(run: SimulatedRun, views: Views, frames: tuple[StereoFrame, StereoFrame], features: Features,
+           T_world_rig: Array, tracker: Tracker) -> dict[str, float]:
     """Track features from the first frame into the second, whose true pose is T_world_rig, and count the right ones."""
     started_s = time.process_time()
     pixels, claimed = tracker(frames[0], frames[1], features.pixels)

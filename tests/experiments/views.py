@@ -19,7 +19,7 @@ from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from tests.experiments.scenes import RigOptions, build
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 
 DESCRIPTION = "experiment.json"
 RENDERERS = ("povray", "ray_caster")
@@ -37,7 +37,7 @@ class Experiment:
     renderer: str = "povray"  # one of RENDERERS
 
     @property
-    def run(self) -> Run:
+    def run(self) -> SimulatedRun:
         """Rig, path and scene."""
         return build(self.name, self.seed, self.size, self.pairs, self.options)
 

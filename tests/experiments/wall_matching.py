@@ -23,7 +23,7 @@ from tests.experiments.feature_matching import Detector, harris, match_pair, sif
 from tests.experiments.scenes import WALL_M
 from tests.experiments.truth import Flags, cast
 from tests.experiments.views import Experiment, Views, load_views
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 
 SAD_METHODS = {"original SAD": "sad", "enhanced SAD": "enhanced", "semi-global (omnid)": "semiglobal"}
 FEATURE_METHODS: dict[str, tuple[Detector, bool]] = {  # detector; candidates from the same column only
@@ -85,7 +85,7 @@ def _located_features(place: Geometry, detect: Detector, along_column: bool, pan
     return views[finite, :2], se3.apply(place.T_rig_rect, points[finite])
 
 
-def _on_wall(run: Run, views: Views, matching: Matching, pair: int) -> WallMatches:
+def _on_wall(run: SimulatedRun, views: Views, matching: Matching, pair: int) -> WallMatches:
     """Return one pair's matches whose pixels truly show the wall."""
     panoramas, T_world_rig = views.panoramas[pair], run.poses[pair]
     pixels, points = matching(panoramas)
@@ -95,7 +95,7 @@ def _on_wall(run: Run, views: Views, matching: Matching, pair: int) -> WallMatch
     return WallMatches(se3.apply(T_world_rig, points)[on_wall], spots, int(edges.sum()))
 
 
-def _wall_points(run: Run, views: Views, T_world_rig: Array, pixels: Array) -> tuple[Array, Array]:
+def _wall_points(run: SimulatedRun, views: Views, T_world_rig: Array, pixels: Array) -> tuple[Array, Array]:
     """Return which pixels (N, 2) show the wall within HALF_ANGLE_DEG of straight ahead, and their points (N, 3)."""
     rays = views.rays(pixels) @ T_world_rig[:3, :3].T
     origin = views.viewpoint(T_world_rig)
@@ -114,7 +114,7 @@ def _edges(panoramas: Panoramas) -> Array:
     return np.column_stack([columns, rows]).astype(float)
 
 
-def _errors(run: Run, pairs: list[WallMatches], *, is_dense: bool) -> dict[str, float]:
+def _errors(run: SimulatedRun, pairs: list[WallMatches], *, is_dense: bool) -> dict[str, float]:
     """Return the errors over all pairs; completeness only for methods that match every edge pixel."""
     error_m = np.concatenate([p.points[:, 0] for p in pairs]) - WALL_M
     right = np.abs(error_m) <= WRONG_M
@@ -135,7 +135,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
-def _coverage(run: Run, pairs: list[WallMatches]) -> float:
+def _coverage(run: SimulatedRun, pairs: list[WallMatches]) -> float:
     """Return the share of the squares of the wall within HALF_ANGLE_DEG that hold a right match, mean of the pairs."""
     half_m = WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG))
     wall = next(r for r in run.scene.rectangles if r.name == "wall")

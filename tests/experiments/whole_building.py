@@ -17,7 +17,7 @@ from tests.experiments.path_following import METHODS as PATH_METHODS
 from tests.experiments.path_following import THE_PAPER, against_truth
 from tests.experiments.truth import sees, surface_distance_m
 from tests.experiments.views import Experiment
-from tests.simulation.recipes import Run
+from tests.simulation.recipes import SimulatedRun
 from tests.simulation.surfaces import Rectangle
 
 METHODS: dict[str, Method] = {
@@ -37,7 +37,7 @@ def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
     return {name: _errors(folder, run, *estimate(folder, method)) for name, method in METHODS.items()}
 
 
-def _errors(folder: Path, run: Run, trajectory: Trajectory, points: MapPoints | None) -> dict[str, Any]:
+def _errors(folder: Path, run: SimulatedRun, trajectory: Trajectory, points: MapPoints | None) -> dict[str, Any]:
     true_end = se3.inverse(run.poses[0]) @ run.poses[-1]
     gap = se3.inverse(true_end) @ se3.inverse(trajectory.T[0]) @ trajectory.T[-1]
     values = against_truth(trajectory, folder) | {"end_to_start_m": float(np.linalg.norm(gap[:3, 3]))}
@@ -54,7 +54,7 @@ def draw(folder: Path, experiment: Experiment, path: Path) -> None:
     figures.floor_plan(run, in_world, paths, path)
 
 
-def map_errors(run: Run, points: MapPoints) -> dict[str, float]:
+def map_errors(run: SimulatedRun, points: MapPoints) -> dict[str, float]:
     """Return distances [m] of map points near the path from the nearest true surface, and the share of walls mapped."""
     in_world = se3.apply(run.poses[0], points.xyz.astype(float))
     near = _distance_from_path(run, in_world[:, :2]) < NEAR_M
@@ -64,13 +64,13 @@ def map_errors(run: Run, points: MapPoints) -> dict[str, float]:
             "completeness": _completeness(run, in_world[near]), **off}
 
 
-def _distance_from_path(run: Run, xy: Array) -> Array:
+def _distance_from_path(run: SimulatedRun, xy: Array) -> Array:
     """Return the horizontal distance (N,) [m] of points (N, 2) from the path."""
     path = run.poses[::3, :2, 3]
     return np.asarray(np.sqrt(np.min([((xy - p) ** 2).sum(axis=1) for p in path], axis=0)))
 
 
-def _completeness(run: Run, points: Array) -> float:
+def _completeness(run: SimulatedRun, points: Array) -> float:
     """Return the share of the spots on walls near the path that have a map point within SEEN_M."""
     spots = np.concatenate([_spots(r) for r in run.scene.rectangles if _is_wall(r)])
     spots = spots[_visible(run, spots)]
@@ -97,7 +97,7 @@ def _spots(r: Rectangle) -> Array:
     return points[(points[:, 2] > HEIGHT_M[0]) & (points[:, 2] < HEIGHT_M[1])]
 
 
-def _visible(run: Run, spots: Array) -> Array:
+def _visible(run: SimulatedRun, spots: Array) -> Array:
     """Return which spots (N, 3) are visible from a pose less than NEAR_M away."""
     seen = np.zeros(len(spots), bool)
     for T in run.poses[::5]:

@@ -1,4 +1,4 @@
-"""`python -m tests.simulation NAME --seed N --out DIR [--size 768] [--pairs N]` renders a log with its truth."""
+"""`python -m tests.simulation NAME --seed N --out DIR [--size 768] [--pairs N]` renders a log with ground truth."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from tests.simulation.recipes import RECIPES, build
 
 
 def main() -> None:
-    """Renders one recipe into a folder."""
-    parser = argparse.ArgumentParser(prog="python -m tests.simulation", description="Render a log with exact truth.")
+    """Render one recipe into a folder."""
+    parser = argparse.ArgumentParser(prog="python -m tests.simulation",
+                                     description="Render a log with exact ground truth.")
     parser.add_argument("name", choices=sorted(RECIPES))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for log.mcap, camchain.yaml and truth.txt")

@@ -1,4 +1,4 @@
-"""Checkerboards held before one mirror camera, with the exact pixel of every corner."""
+"""Rendered checkerboards in front of a mirror camera, with the exact pixel of every corner."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from tests.simulation.sensor import Exposure, Sensor
 from tests.simulation.surfaces import Rectangle, Scene
 from tests.simulation.textures import value_noise
 
-SQUARE_PX = 24  # of the board's texture
-MARGIN_SQUARES = 1.0  # white around the squares
+# Side of a square in the board's texture.
+SQUARE_PX = 24
+# Width of the light margin around the squares.
+MARGIN_SQUARES = 1.0
 
 
 @dataclass(frozen=True)
-class Shot:
-    """A image (H, W) uint8 of a board, the truth about it: corners (N, 2) [px] and T_cam_board (4, 4)."""
+class BoardImage:
+    """An image (H, W) uint8 of a board with its ground truth: corners (N, 2) [px] and T_cam_board (4, 4)."""
 
     image: NDArray[np.uint8]
     corners: Array
@@ -31,7 +33,7 @@ class Shot:
 
 
 def board_texture(board: Board, dark: float = 25.0, light: float = 225.0) -> NDArray[np.uint8]:
-    """The print: (columns + 1) x (rows + 1) squares with a light margin; the first square inside is dark."""
+    """Return the print: (columns + 1) x (rows + 1) squares with a light margin; the first square is dark."""
     j, i = np.indices((board.rows + 1, board.columns + 1))
     squares = np.where((i + j) % 2 == 0, dark, light)
     margin = round(MARGIN_SQUARES * SQUARE_PX)
@@ -40,7 +42,7 @@ def board_texture(board: Board, dark: float = 25.0, light: float = 225.0) -> NDA
 
 
 def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]) -> Rectangle:
-    """The print as a rectangle in the rig's frame; the board's origin is its first inner corner."""
+    """Return the print as a rectangle in the rig's frame; the board's origin is its first inner corner."""
     edge = (1 + MARGIN_SQUARES) * board.square_m
     width, height = ((side + 1 + 2 * MARGIN_SQUARES) * board.square_m for side in (board.columns, board.rows))
     origin, right, below = se3.apply(T_rig_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0],
@@ -49,12 +51,12 @@ def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]
 
 
 def clutter(rng: np.random.Generator, radius_m: float = 3.0) -> list[Rectangle]:
-    """Six noisy walls around the camera."""
+    """Return six noisy walls around the camera."""
     return six_walls(lambda: np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8), radius_m)
 
 
 def six_walls(paint: Callable[[], NDArray[np.uint8]], radius_m: float) -> list[Rectangle]:
-    """Six square walls around the camera, each painted anew."""
+    """Return six square walls around the camera, each with a texture of its own."""
     walls = []
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         side = np.roll(axis, 1) * 2 * radius_m
@@ -64,7 +66,7 @@ def six_walls(paint: Callable[[], NDArray[np.uint8]], radius_m: float) -> list[R
 
 
 def board_pose(ray: Array, distance_m: float, tilt_rad: Array, board: Board) -> Array:
-    """T_cam_board (4, 4) of a board whose middle lies along a ray and whose face, tilted so (3,), is towards it."""
+    """Return T_cam_board (4, 4) of a board with its middle along a ray, facing the camera up to a tilt (3,)."""
     z = ray / np.linalg.norm(ray)
     x = np.cross([0.3, 0.2, 1.0], z)
     x /= np.linalg.norm(x)
@@ -74,45 +76,45 @@ def board_pose(ray: Array, distance_m: float, tilt_rad: Array, board: Board) -> 
 
 
 @dataclass(frozen=True)
-class Studio:
-    """A camera with its mask on a rig, and a board; its rays are cast once for all its images."""
+class BoardRenderer:
+    """Renders images of a board by a mounted camera, whose rays are computed once for all images."""
 
     board: Board
     mounted: MountedCamera
 
     @staticmethod
-    def of(board: Board, camera: OmniCamera, mask: Mask) -> Studio:
-        """The studio of a camera that stands in the origin."""
-        return Studio(board, MountedCamera(camera, np.eye(4), mask))
+    def of(board: Board, camera: OmniCamera, mask: Mask) -> BoardRenderer:
+        """Return the renderer of a camera at the origin."""
+        return BoardRenderer(board, MountedCamera(camera, np.eye(4), mask))
 
-    def photograph(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
+    def render_board(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
                    contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0,
-                   walls: Sequence[Rectangle] | None = None) -> Shot:
-        """The image taken of the board among noisy walls, or others; shadow: what part of it is darkened to."""
+                   walls: Sequence[Rectangle] | None = None) -> BoardImage:
+        """Render the board among walls (noisy ones if None); shadow: brightness factor of a part of the board."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
         texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
-        around = clutter(rng) if walls is None else walls
-        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *around))
+        board_poses_around_camera = clutter(rng) if walls is None else walls
+        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *board_poses_around_camera))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
         exposure = Exposure.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
         T_cam_board = self.mounted.T_cam_rig @ T_rig_board
         corners = self.mounted.camera.project(se3.apply(T_cam_board, self.board.points))
-        return Shot(exposure.expose(ideal, rng), corners, T_cam_board)
+        return BoardImage(exposure.expose(ideal, rng), corners, T_cam_board)
 
 
 def in_view(camera: OmniCamera, T_cam_board: Array, board: Board, mask: Mask) -> bool:
-    """Whether all the print but its margin lies inside the mask and faces the camera."""
+    """True if the print without its margin lies inside the mask and faces the camera."""
     outline = np.array([[x, y, 0] for x in np.linspace(-1.3, board.columns + 0.3, 12)
                         for y in np.linspace(-1.3, board.rows + 0.3, 12)]) * board.square_m
     pixels = camera.project(se3.apply(T_cam_board, outline))
     return bool(np.isfinite(pixels).all() and mask.contains(pixels, 2.0).all())
 
 
-def around(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: int = 0,
-           distance_m: tuple[float, float] = (0.2, 0.5), tilt_deg: float = 30.0,
-           elevation_deg: Sequence[float] = (35.0, 100.0)) -> list[Array]:
-    """Poses T_cam_board of boards all around a camera, wholly in view; elevation from the ray of the centre."""
+def board_poses_around_camera(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: int = 0,
+                              distance_m: tuple[float, float] = (0.2, 0.5), tilt_deg: float = 30.0,
+                              elevation_deg: Sequence[float] = (35.0, 100.0)) -> list[Array]:
+    """Return poses T_cam_board on all sides of a camera, entirely in view; elevation from the ray of the centre."""
     rng, poses = np.random.default_rng(seed), list[Array]()
     for _ in range(200 * count):
         azimuth = 2 * np.pi * (len(poses) / count + 0.1 * rng.uniform())
@@ -127,13 +129,14 @@ def around(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: in
     raise AssertionError(f"only {len(poses)} of {count} boards fit into the view")
 
 
-def around_both(rig: Rig, board: Board, count: int, *, seed: int = 0, distance_m: tuple[float, float] = (0.25, 0.5),
-                elevation_deg: Sequence[float] = (50.0, 110.0)) -> list[Array]:
-    """Poses T_rig_board of boards all around a rig that stands in its lower camera, wholly in view of both."""
+def board_poses_around_rig(rig: Rig, board: Board, count: int, *, seed: int = 0,
+                           distance_m: tuple[float, float] = (0.25, 0.5),
+                           elevation_deg: Sequence[float] = (50.0, 110.0)) -> list[Array]:
+    """Return poses T_rig_board on all sides of a rig whose frame is its lower camera's, entirely in view of both."""
     poses: list[Array] = []
     for turn in range(20 * count):
-        tried = around(rig.lower.camera, board, rig.lower.visible, 1, seed=100 * seed + turn, distance_m=distance_m,
-                       elevation_deg=elevation_deg)[0]
+        tried = board_poses_around_camera(rig.lower.camera, board, rig.lower.visible, 1, seed=100 * seed + turn,
+                                          distance_m=distance_m, elevation_deg=elevation_deg)[0]
         T = _about_axis(2 * np.pi * len(poses) / count) @ tried
         if all(in_view(m.camera, m.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig) @ T, board, m.visible)
                for m in (rig.lower, rig.upper)):

@@ -1,4 +1,4 @@
-"""Seeded worlds: a corridor between two walls and a room with boxes; floor at z = 0, x along the corridor."""
+"""Seeded worlds: a corridor between two walls, and a room with boxes; floor at z = 0, x along the corridor."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def _texture(rng: Random, kind: str, size_m: Point) -> Texture:
 
 
 def wall(rng: Random, kind: str, left: Point, right: Point) -> Rectangle:
-    """A wall from floor to ceiling between two points (x, y) [m], left and right as its viewer sees them."""
+    """Return a wall from floor to ceiling between two points (x, y) [m], left and right as seen from inside."""
     a, b = np.array([*left, CEILING_M]), np.array([*right, CEILING_M])
     return Rectangle(a, b - a, np.array([0, 0, -CEILING_M]),
                      _texture(rng, kind, (float(np.linalg.norm(b - a)), CEILING_M)), kind)
 
 
 def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, Rectangle]:
-    """Floor (of that kind) and ceiling (tiles) between two corners (x, y) [m]."""
+    """Return floor (of that kind) and ceiling (tiles) between two corners (x, y) [m]."""
     (x0, y0), (x1, y1) = low, high
     size = (x1 - x0, y1 - y0)
     along = np.array([x1 - x0, 0.0, 0])
@@ -38,7 +38,7 @@ def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, R
 
 
 def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rectangle]:
-    """Images at random places of a wall, one per equal stretch so that they do not overlap; named poster<number>."""
+    """Return posters at random places of a wall, one per equal stretch so that they do not overlap."""
     stretch, hung = on.width_m / max(count, 1), []
     for i in range(count):
         width = min(rng.uniform(0.25, 0.6), 0.8 * stretch)
@@ -46,12 +46,12 @@ def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rect
         left = i * stretch + rng.uniform(0, stretch - width)
         top = rng.uniform(0.5, CEILING_M - 0.9 - height)
         texture = textures.poster(rng, (round(width * 500), round(height * 500)))
-        hung.append(on.image(texture, (left, top, width, height), f"poster{first + i}"))
+        hung.append(on.poster(texture, (left, top, width, height), f"poster{first + i}"))
     return hung
 
 
 def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad: float) -> list[Rectangle]:
-    """A box on the floor: four sides and the top, each with a texture of its own."""
+    """Return a box on the floor: four sides and the top, each with a texture of its own."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     x, y, up = np.array([c, s, 0]) * size_m[0], np.array([-s, c, 0]) * size_m[1], np.array([0, 0, size_m[2]])
     low = np.array([*centre, 0]) - (x + y) / 2
@@ -67,18 +67,18 @@ def _face(rng: Random, u: Array, v: Array) -> Texture:
 
 
 def _enclosed(rng: Random, kinds: tuple[str, ...], low: Point, high: Point) -> list[Rectangle]:
-    """Left (+y), right (-y), front (+x) and back wall, then floor and ceiling, of a box-shaped space."""
+    """Return left (+y), right (-y), front (+x) and back wall, then floor and ceiling, of a box-shaped space."""
     (x0, y0), (x1, y1) = low, high
     ends = [((x0, y1), (x1, y1)), ((x1, y0), (x0, y0)), ((x1, y1), (x1, y0)), ((x0, y0), (x0, y1))]
     walls = [wall(rng, kind, a, b) for kind, (a, b) in zip(kinds[:4], ends, strict=True)]
     return [*walls, *_flat(rng, kinds[4], low, high)]
 
 
-def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = None, images: int = 6) -> Scene:
-    """Two walls 1.5 to 3 m apart along x with end walls, floor, ceiling, posters and a few low boxes.
+def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = None, posters_per_8m: int = 6) -> Scene:
+    """Return two walls 1.5 to 3 m apart along x with end walls, floor, ceiling, posters and a few low boxes.
 
     x runs from -2 to length_m - 2, y = 0 lies between the walls. kinds: textures of the left, right, front and back
-    wall and the floor; by default one of the two walls is brick and the other one is chance.
+    wall and the floor; by default one of the two walls is brick and the other one is random.
     """
     rng = np.random.default_rng([seed, 1])
     if kinds is None:
@@ -87,7 +87,7 @@ def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = N
         kinds = (*pair, str(rng.choice(["brick", "granite"])), str(rng.choice(["granite", "plaster"])), "tiles")
     left, right = rng.uniform(0.9, 1.6), -rng.uniform(0.8, 1.4)
     space = _enclosed(rng, kinds, (-2.0, right), (length_m - 2.0, left))
-    long, short = max(1, round(images * length_m / 8)), min(images, 2)
+    long, short = max(1, round(posters_per_8m * length_m / 8)), min(posters_per_8m, 2)
     hung: list[Rectangle] = []
     for side, count in zip(space[:4], (long, long, short, short), strict=True):
         hung += posters(rng, side, count, len(hung))
@@ -96,7 +96,7 @@ def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = N
 
 
 def _by_a_wall(rng: Random, x: float, walls: Point) -> list[Rectangle]:
-    """A low box at one of the walls y = walls[0] or walls[1]."""
+    """Return a low box at one of the walls y = walls[0] or walls[1]."""
     size = (rng.uniform(0.2, 0.4), rng.uniform(0.15, 0.25), rng.uniform(0.25, 0.8))
     at_left = bool(rng.integers(2))
     y = walls[1] - 0.2 if at_left else walls[0] + 0.2
@@ -104,7 +104,7 @@ def _by_a_wall(rng: Random, x: float, walls: Point) -> list[Rectangle]:
 
 
 def room(seed: int, size_m: Point = (6.0, 5.0), boxes: int = 8, kinds: tuple[str, ...] | None = None) -> Scene:
-    """A room about the origin with posters and boxes of up to 1.5 m height along its walls; 1.3 m around 0 are free."""
+    """Return a room about the origin with posters and boxes up to 1.5 m high at its walls; 1.3 m around 0 are free."""
     rng = np.random.default_rng([seed, 2])
     half = (size_m[0] / 2, size_m[1] / 2)
     drawn = tuple(str(k) for k in rng.choice(["brick", "plaster", "granite", "plain"], 4))

@@ -1,4 +1,4 @@
-"""Writes a rendered run as a log with exact truth: log.mcap, camchain.yaml, rig.toml, truth.txt."""
+"""Writer of a rendered run as a log with exact ground truth: log.mcap, camchain.yaml, rig.toml, truth.txt."""
 
 from __future__ import annotations
 
@@ -22,36 +22,42 @@ from tests.simulation.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
-ARRIVAL_NS = 3_000_000  # a image reaches the recorder this long after its stamp
-SKEW_NS = 2_000_000  # the two cameras' stamps differ by at most this
+# Delay from an image's stamp to its arrival at the recorder.
+ARRIVAL_NS = 3_000_000
+# Largest difference of the two cameras' stamps.
+SKEW_NS = 2_000_000
 SCHEMA = "sensor_msgs/msg/CompressedImage"
-Stamps = NDArray[np.int64]  # [ns]
-Images = Iterator[tuple[int, bytes, bytes]]  # pair, JPEG of lower and upper
-Look = Callable[[int, int], Floats]  # the ideal image (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper)
+# [ns]
+Stamps = NDArray[np.int64]
+# Number of the pair, JPEG of lower and upper camera.
+Images = Iterator[tuple[int, bytes, bytes]]
+# Returns the ideal image (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper).
+ImageSource = Callable[[int, int], Floats]
 
 
 def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
               supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
-    """Casts both cameras' images at poses T_world_rig (N, 4, 4) and writes the log and its truth into folder."""
+    """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder."""
     cameras = (rig.lower, rig.upper)
 
-    def look(pair: int, camera: int) -> Floats:
+    def ideal_image(pair: int, camera: int) -> Floats:
         return render_grey(scene, cameras[camera], poses[pair], supersample)
 
-    pack_log(folder, rig, poses, look, sensor=sensor, seed=seed, progress=progress)
+    pack_log(folder, rig, poses, ideal_image, sensor=sensor, seed=seed, progress=progress)
 
 
-def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor | None = None, seed: int = 0,
-             progress: Callable[[int, int], None] | None = None) -> None:
-    """Writes the log of a run at poses T_world_rig (N, 4, 4), and its truth, from ideal images that are looked up.
+def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, sensor: Sensor | None = None,
+             seed: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
+    """Write the log of a run at poses T_world_rig (N, 4, 4), and its ground truth, from ideal images.
 
-    rig.toml knows the rims only; where struts or a hub hide something, rig_masked.toml knows those too. Both images
-    of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
+    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. Both
+    images of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stamps: Stamps = START_NS + PERIOD_NS * np.arange(len(poses), dtype=np.int64)
     (folder / "truth.txt").write_text(tum(stamps, poses))
-    if isinstance(rig.lower.camera, UnifiedCamera):  # Kalibr has no file for others
+    # Kalibr's file holds unified cameras only.
+    if isinstance(rig.lower.camera, UnifiedCamera):
         (folder / "camchain.yaml").write_text(camchain(rig))
     write_rig(folder / "rig.toml", rig)
     rng = np.random.default_rng([seed, 6])
@@ -64,12 +70,12 @@ def pack_log(folder: Path, rig: Rig, poses: Array, look: Look, *, sensor: Sensor
 
     def images() -> Images:
         for i in range(len(poses)):
-            both = [e.jpeg(e.expose(look(i, k), rng)) for k, e in enumerate(exposures)]
+            both = [e.jpeg(e.expose(ideal_image(i, k), rng)) for k, e in enumerate(exposures)]
             yield i, both[0], both[1]
             if progress:
                 progress(i + 1, len(poses))
 
-    # Whoever finds log.mcap finds it whole.
+    # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
     (folder / "log.mcap.part").replace(folder / "log.mcap")
 
@@ -95,7 +101,7 @@ def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], images: Ima
 
 
 def tum(stamps_ns: Stamps, poses: Array) -> str:
-    """The trajectory as TUM text: t x y z qx qy qz qw."""
+    """Return the trajectory as TUM text: t x y z qx qy qz qw."""
     rows = []
     for stamp, T in zip(stamps_ns, poses, strict=True):
         values = " ".join(f"{x:.9f}" for x in (*T[:3, 3], *se3.quaternion(T[:3, :3])))
@@ -104,7 +110,7 @@ def tum(stamps_ns: Stamps, poses: Array) -> str:
 
 
 def camchain(rig: Rig) -> str:
-    """The rig as Kalibr's camchain.yaml; T_cam_imu is T_cam_rig."""
+    """Return the rig as Kalibr's camchain.yaml; T_cam_imu is T_cam_rig."""
     lower, upper = _kalibr("cam0", rig.lower, rig.topics[0]), _kalibr("cam1", rig.upper, rig.topics[1])
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     return "".join([*lower, *upper, *_matrix("T_cn_cnm1", T_upper_lower)])
@@ -113,10 +119,10 @@ def camchain(rig: Rig) -> str:
 def _kalibr(name: str, mounted: MountedCamera, topic: str) -> list[str]:
     camera = _unified(mounted.camera)
     numbers = (camera.xi, *camera.focal, *camera.center)
-    bent = any(camera.distortion)
+    has_distortion = any(camera.distortion)
     return [f"{name}:\n  camera_model: omni\n  intrinsics: [{', '.join(map(_number, numbers))}]\n",
-            f"  distortion_model: {'radtan' if bent else 'none'}\n",
-            f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if bent else ''}]\n",
+            f"  distortion_model: {'radtan' if has_distortion else 'none'}\n",
+            f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if has_distortion else ''}]\n",
             f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n  rostopic: {topic}\n",
             *_matrix("T_cam_imu", mounted.T_cam_rig)]
 
@@ -135,6 +141,6 @@ def _unified(camera: OmniCamera) -> UnifiedCamera:
 
 
 def _masked(mounted: MountedCamera, exposure: Exposure) -> MountedCamera:
-    """The camera with a mask that leaves out struts and hub."""
+    """Return the camera with a mask that excludes struts and hub."""
     clear = (255 * (exposure.hidden == 0)).astype(np.uint8)
     return replace(mounted, mask=replace(mounted.visible, image=clear))

@@ -11,14 +11,14 @@ HEIGHT_M = 1.2
 
 
 def planar_poses(xy_m: Array, heading_rad: Array) -> Array:
-    """Poses (N, 4, 4) of an upright rig at xy_m (N, 2) with heading_rad (N,)."""
+    """Return poses (N, 4, 4) of an upright rig at xy_m (N, 2) with heading_rad (N,)."""
     zero = np.zeros(len(xy_m))
     R = se3.rotation_exp(np.column_stack([zero, zero, heading_rad]))
     return se3.transform(R, np.column_stack([xy_m, zero + HEIGHT_M]))
 
 
 def _natural_spline(y: Array, s: Array) -> tuple[Array, Array]:
-    """Value and slope at s (N,) of the natural cubic spline through y (K,) at 0, 1, 2 ..."""
+    """Return value and slope at s (N,) of the natural cubic spline through y (K,) at 0, 1, 2 ..."""
     count = len(y)
     A = np.eye(count)
     for i in range(1, count - 1):
@@ -32,9 +32,9 @@ def _natural_spline(y: Array, s: Array) -> tuple[Array, Array]:
 
 def spline_path(seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3,
                 turn: tuple[int, float] | None = None) -> Array:
-    """A swaying path along +x from the origin, step_m of arc between pairs, heading along the path.
+    """Return a swaying path along +x from the origin, step_m of arc between pairs, heading along the path.
 
-    turn = (pair, degrees): from that pair on the rig faces that much further left, and it moves half a step before.
+    turn = (pair, degrees): from that pair on the rig is rotated to the left, after half a step of motion.
     """
     rng = np.random.default_rng([seed, 3])
     knots = int(pairs * step_m) + 4
@@ -52,24 +52,24 @@ def spline_path(seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3,
 
 
 def turns(angles_deg: list[float], step_m: float = 0.03) -> Array:
-    """len + 1 poses: between two pairs the rig turns by an angle and moves step_m ahead."""
+    """Return len + 1 poses: between two pairs the rig rotates by an angle and moves step_m ahead."""
     heading = np.deg2rad(np.concatenate([[0], np.cumsum(angles_deg)]))
     moves = step_m * np.column_stack([np.cos(heading[:-1]), np.sin(heading[:-1])])
     return planar_poses(np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)]), heading)
 
 
 def still(pairs: int) -> Array:
-    """The rig stands at the origin."""
+    """Return poses of a rig that stands at the origin."""
     return planar_poses(np.zeros((pairs, 2)), np.zeros(pairs))
 
 
 def back_again(poses: Array) -> Array:
-    """The path forwards and then backwards over the same poses, 2 N - 1 of them."""
+    """Return the path forwards and then backwards over the same poses, 2 N - 1 of them."""
     return np.concatenate([poses, poses[-2::-1]])
 
 
 def loop(seed: int, pairs: int, radius_m: float = 0.9) -> Array:
-    """A closed, uneven round about the origin with changing speed, heading along the path."""
+    """Return a closed, uneven loop about the origin with changing speed, heading along the path."""
     rng = np.random.default_rng([seed, 4])
     phases = rng.uniform(0, 2 * np.pi, 3)
 
@@ -84,7 +84,7 @@ def loop(seed: int, pairs: int, radius_m: float = 0.9) -> Array:
 
 
 def vibrate(poses: Array, seed: int, tilt_deg: float = 0.3, shake_mm: float = 1.0) -> Array:
-    """The poses with roll and pitch (standard deviation tilt_deg) and up and down (shake_mm) of an uneven floor."""
+    """Return the poses on an uneven floor: roll and pitch (standard deviation tilt_deg), height (shake_mm)."""
     rng = np.random.default_rng([seed, 5])
     tilt = np.deg2rad(tilt_deg) * rng.standard_normal((len(poses), 2))
     lift = 1e-3 * shake_mm * rng.standard_normal(len(poses))

@@ -1,7 +1,7 @@
-"""Renders what a mirror camera sees of a scene, by casting the rays its model lifts from the pixels.
+"""Ray caster: images of a mirror camera, by casting the rays that its model lifts from the pixels.
 
-Exact by construction: no mirror is modelled, the camera's own lift() is the mirror. Rays are cast in square tiles, and
-a rectangle meets only the tiles whose cone of directions overlaps its own.
+No mirror is modelled: the camera's lift() defines the rays. Rays are cast in square tiles, and a rectangle is
+intersected only with the tiles whose cone of directions overlaps its own.
 """
 
 from __future__ import annotations
@@ -19,9 +19,20 @@ from tests.simulation.surfaces import Rectangle, Scene
 
 Floats = NDArray[np.float32]
 TILE_PX = 32
-REMAP_COLUMNS = 1024  # cv2.remap takes images, not lists: samples are folded into rows of this length
+# cv2.remap expects images, not lists: samples are folded into rows of this length.
+REMAP_COLUMNS = 1024
+# Pixels lifted at once, which bounds memory.
 RAY_CHUNK = 1 << 18
+# Number of ray tables that are cached.
 MAX_TABLES = 6
+# Added to the half angle of a tile's cone: rounding of float32 rays.
+CONE_MARGIN_RAD = 1e-3
+# A cone bounds a rectangle between its corners only if it is narrower than a half space.
+MAX_CONE_RAD = 1.5
+# Least cosine between a ray and a rectangle's normal in a sample's footprint.
+MIN_SLANT = 0.02
+# Guards against division by zero at a rectangle through the viewpoint [m].
+MIN_DISTANCE_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +50,7 @@ class RayTable:
 
 
 def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
-    """The rays of all samples (supersample^2 per pixel) inside the camera's mask."""
+    """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask."""
     width, height = mounted.camera.size
     rays, spacing = _lift_grid(mounted, supersample)
     ss_height, ss_width = height * supersample, width * supersample
@@ -55,7 +66,7 @@ def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
 
 
 def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
-    """Rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
+    """Return rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
     width, height = mounted.camera.size
     u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
     v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
@@ -68,18 +79,18 @@ def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Axis (M, 3) and half angle (M,) of the cone around each tile's rays."""
+    """Return axis (M, 3) and half angle (M,) of the cone around each tile's rays."""
     axes = np.add.reduceat(rays.astype(float), starts[:-1])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     cosines = np.einsum("ij,ij->i", rays, np.repeat(axes, np.diff(starts), axis=0))
-    return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + 1e-3
+    return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + CONE_MARGIN_RAD
 
 
 _tables: dict[tuple[int, int], tuple[MountedCamera, RayTable]] = {}
 
 
-def _remembered_table(mounted: MountedCamera, supersample: int) -> RayTable:
-    """The camera's table, built once; the camera is kept with it so that its id cannot be given away."""
+def _cached_table(mounted: MountedCamera, supersample: int) -> RayTable:
+    """Return the camera's table, computed once; the camera is kept with it so that its id stays unique."""
     key = (id(mounted), supersample)
     if key not in _tables:
         if len(_tables) >= MAX_TABLES:
@@ -89,15 +100,15 @@ def _remembered_table(mounted: MountedCamera, supersample: int) -> RayTable:
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
-    """The image (H, W) uint8 of the camera on a rig that stands at T_world_rig; 0 outside the mask."""
+    """Return the image (H, W) uint8 of the camera on a rig at T_world_rig; 0 outside the mask."""
     return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
 
 
 def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
-    """The image (H, W) float32 before any sensor, 0 to 255; 0 outside the mask and where no rectangle is hit."""
-    table = _remembered_table(mounted, supersample)
+    """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle."""
+    table = _cached_table(mounted, supersample)
     T_world_cam = T_world_rig @ se3.inverse(mounted.T_cam_rig)
-    hits = _Hits.nothing(table.rays.shape[1])
+    hits = _Hits.none(table.rays.shape[1])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for number, rectangle in enumerate(scene.rectangles):
             _cast(table, rectangle, T_world_cam, (hits, number))
@@ -117,16 +128,16 @@ class _Hits:
     number: NDArray[np.int16]
 
     @staticmethod
-    def nothing(count: int) -> _Hits:
+    def none(count: int) -> _Hits:
         u, v = np.empty((2, count), np.float32)
         return _Hits(np.full(count, np.inf, np.float32), u, v, np.full(count, -1, np.int16))
 
 
 def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tuple[_Hits, int]) -> None:
-    """Meets the rays of all tiles that may see the rectangle, and keeps the hits nearer than those before."""
+    """Intersect the rays of all tiles that may see the rectangle, and keep hits nearer than the earlier ones."""
     hits, number = target
     axes = np.column_stack([rectangle.edge_u, rectangle.edge_v, rectangle.normal])
-    # In the rectangle's own coordinates (u, v, height) the camera stands at q and a ray runs along M @ ray.
+    # In the rectangle's own coordinates (u, v, height) the camera is at q and a ray has the direction M @ ray.
     q = np.linalg.solve(axes, T_world_cam[:3, 3] - rectangle.origin).astype(np.float32)
     M = np.linalg.solve(axes, T_world_cam[:3, :3]).astype(np.float32)
     for start, stop in _runs(table, _tiles_that_see(table, rectangle, T_world_cam)):
@@ -140,37 +151,37 @@ def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tup
 
 
 def _tiles_that_see(table: RayTable, rectangle: Rectangle, T_world_cam: Array) -> NDArray[np.bool_]:
-    """Which tiles (M,) have a cone that overlaps the cone through the rectangle's corners."""
+    """Return the mask (M,) of tiles whose cone overlaps the cone through the rectangle's corners."""
     corners = se3.apply(se3.inverse(T_world_cam), rectangle.corners)
-    rays = corners / np.maximum(np.linalg.norm(corners, axis=1, keepdims=True), 1e-9)
-    axis = rays.sum(axis=0) / max(float(np.linalg.norm(rays.sum(axis=0))), 1e-9)
+    rays = corners / np.maximum(np.linalg.norm(corners, axis=1, keepdims=True), MIN_DISTANCE_M)
+    axis = rays.sum(axis=0) / max(float(np.linalg.norm(rays.sum(axis=0))), MIN_DISTANCE_M)
     angle = np.arccos(np.clip(rays @ axis, -1, 1)).max()
-    if angle > 1.5:  # a cone bounds what lies between its corners only if it is narrower than a half space
+    if angle > MAX_CONE_RAD:
         return np.ones(len(table.angles), bool)
     return np.asarray(np.arccos(np.clip(table.axes @ axis, -1, 1)) <= angle + table.angles)
 
 
 def _runs(table: RayTable, chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Sample ranges [start, stop) of runs of neighbouring chosen tiles."""
+    """Return sample ranges [start, stop) of runs of neighbouring chosen tiles."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
     return [(int(table.starts[a]), int(table.starts[b])) for a, b in edges.reshape(-1, 2)]
 
 
 def _shade(table: RayTable, scene: Scene, hits: _Hits, T_world_cam: Array) -> Floats:
-    """Grey (N,) of every ray's nearest rectangle."""
+    """Return the grey level (N,) of every ray's nearest rectangle."""
     grey = np.zeros(len(hits.distance), np.float32)
     for number, rectangle in enumerate(scene.rectangles):
         mine = np.flatnonzero(hits.number == number)
         if len(mine):
             normal = (T_world_cam[:3, :3].T @ rectangle.normal).astype(np.float32)
-            slant = np.maximum(np.abs(normal @ table.rays[:, mine]), 0.02)
+            slant = np.maximum(np.abs(normal @ table.rays[:, mine]), MIN_SLANT)
             footprint_m2 = (hits.distance[mine] * table.spacing[mine]) ** 2 / slant
             grey[mine] = rectangle.brightness * _sample(rectangle, (hits.u[mine], hits.v[mine]), footprint_m2)
     return grey
 
 
 def _sample(rectangle: Rectangle, uv: tuple[Floats, Floats], footprint_m2: Floats) -> Floats:
-    """Texture grey (N,) at fractions uv, from the level whose pixels are about as large as a sample's footprint."""
+    """Return texture grey (N,) at fractions uv, from the level whose pixels are about as large as the footprint."""
     height, width = rectangle.texture.shape
     pixels = footprint_m2 * np.float32(height * width / (rectangle.height_m * rectangle.width_m))
     level = np.clip(np.rint(0.5 * np.log2(pixels)), 0, len(rectangle.pyramid) - 1).astype(np.int8)
@@ -183,7 +194,7 @@ def _sample(rectangle: Rectangle, uv: tuple[Floats, Floats], footprint_m2: Float
 
 
 def _bilinear(texture: Floats, u: Floats, v: Floats) -> Floats:
-    """Texture (H, W) at fractions u, v (N,) of its outline, bilinear, the border repeated."""
+    """Return the texture (H, W) at fractions u, v (N,) of its outline, bilinear, with the border repeated."""
     height, width = texture.shape
     rows = -(-len(u) // REMAP_COLUMNS)
     maps = np.zeros((2, rows * REMAP_COLUMNS), np.float32)

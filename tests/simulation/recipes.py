@@ -1,4 +1,4 @@
-"""Whole runs by name: a rig, a path, a world and a sensor from one seed."""
+"""Complete runs by name: a rig, a path, a world and a sensor from one seed."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ TURN_DEG = 94.0
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """All that write_log needs."""
+class SimulatedRun:
+    """A rendered run: the arguments of write_log."""
 
     rig: Rig
     poses: Array  # T_world_rig (N, 4, 4)
@@ -28,11 +28,12 @@ class Run:
     sensor: Sensor = field(default_factory=Sensor)
 
 
-Recipe = Callable[[int, int, int], Run]  # (seed, image size, pairs)
+# Makes a run of (seed, image size, pairs).
+Recipe = Callable[[int, int, int], SimulatedRun]
 
 
 def mild_rig(seed: int, size: int) -> Rig:
-    """A rig with a mirror scale, a baseline and a little misalignment of its own per seed."""
+    """Return a rig with mirror scale, baseline and a small misalignment that depend on the seed."""
     rng = np.random.default_rng([seed, 7])
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
     turned, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
@@ -41,76 +42,77 @@ def mild_rig(seed: int, size: int) -> Rig:
                     misaligned_deg=(turned[0], turned[1], turned[2]), lower_misaligned_deg=(lower[0], lower[1], 0.0))
 
 
-def two_walls(seed: int, size: int, pairs: int) -> Run:
-    """The paper's second experiment: 5 cm steps between two walls, a turn of 94 degrees just before the end."""
+def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return the paper's second experiment: 5 cm steps between two walls, a turn of 94 degrees just before the end."""
     poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
-    return Run(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
-def misaligned(seed: int, size: int, pairs: int) -> Run:
-    """15 cm steps with viewpoints and cameras turned about every axis; the rig frame is neither camera's."""
+def misaligned(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return 15 cm steps with cameras rotated about every axis; the rig frame is neither camera's."""
     rig = make_rig(size=size, scale=0.95, baseline_m=0.16, misaligned_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
                    lower_misaligned_deg=(-0.7, 0.6, 25.0), lower_offset_mm=(30.0, -20.0), centre_px=(1.7, -2.4))
     poses = paths.spline_path(seed, pairs, 0.15)
-    return Run(rig, poses, corridor(seed, max(8.0, 0.15 * pairs + 3.2)))
+    return SimulatedRun(rig, poses, corridor(seed, max(8.0, 0.15 * pairs + 3.2)))
 
 
-def turns(seed: int, size: int, pairs: int) -> Run:
-    """Turns of 9 to 30 degrees between pairs, either way, with a few centimetres of motion."""
+def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return turns of 9 to 30 degrees between pairs, to both sides, with a few centimetres of motion."""
     rng = np.random.default_rng([seed, 8])
     angles = np.linspace(9, 30, max(1, pairs - 1)) * rng.choice([-1, 1], max(1, pairs - 1))
-    return Run(mild_rig(seed, size), paths.turns([float(a) for a in angles[:pairs - 1]]), corridor(seed))
+    return SimulatedRun(mild_rig(seed, size), paths.turns([float(a) for a in angles[:pairs - 1]]), corridor(seed))
 
 
-def struts(seed: int, size: int, pairs: int) -> Run:
-    """two_walls through a mirror on three struts with a hub, an uneven image and changing light."""
+def struts(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return two_walls seen by a mirror on three struts with a hub, vignetting and changing light."""
     run = two_walls(seed, size, pairs)
     sensor = Sensor(strut_angles_deg=(35.0, 155.0, 275.0), hub=0.07, vignette=0.3, flicker=0.03)
-    return Run(run.rig, run.poses, run.scene, sensor)
+    return SimulatedRun(run.rig, run.poses, run.scene, sensor)
 
 
-def still(seed: int, size: int, pairs: int) -> Run:
-    """The rig stands; only the noise is new."""
-    return Run(mild_rig(seed, size), paths.still(pairs), corridor(seed))
+def still(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a rig that stands; only the noise changes."""
+    return SimulatedRun(mild_rig(seed, size), paths.still(pairs), corridor(seed))
 
 
-def fast(seed: int, size: int, pairs: int) -> Run:
-    """30 cm between pairs (3 m/s), with a little vibration."""
+def fast(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return 30 cm between pairs (3 m/s), with a little vibration."""
     poses = paths.vibrate(paths.spline_path(seed, pairs, 0.3), seed)
-    return Run(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.3 * pairs + 3.2)))
+    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.3 * pairs + 3.2)))
 
 
-def rooms(seed: int, size: int, pairs: int) -> Run:
-    """A closed round through a room with boxes at changing speed, with a little vibration."""
-    return Run(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
+def rooms(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a closed loop through a room with boxes at changing speed, with a little vibration."""
+    return SimulatedRun(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
 
 
-def back(seed: int, size: int, pairs: int) -> Run:
-    """Stands, drives on, and comes back backwards over the same poses, then stands: what drifts shows at the end."""
+def back(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a rig that stands, drives, comes back in reverse over the same poses, and stands: the end shows drift."""
     there = paths.spline_path(seed, max(1, pairs // 2 - 4), 0.06)
     poses = np.concatenate([there[[0] * 5], paths.back_again(there), there[[0] * 5]])[:pairs]
-    return Run(mild_rig(seed, size), poses, corridor(seed))
+    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed))
 
 
-def plain(seed: int, size: int, pairs: int) -> Run:
-    """Bare walls and floor, a few images and boxes, a tiled ceiling: a pose must be called degraded, not guessed."""
-    scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, images=2)
-    return Run(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.05), scene)
+def plain(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return bare walls and floor, a few posters and boxes, a tiled ceiling: poses must be reported as degraded."""
+    scene = corridor(seed, max(8.0, 0.05 * pairs + 3.2), ("plain",) * 5, posters_per_8m=2)
+    return SimulatedRun(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.05), scene)
 
 
-def spin(seed: int, size: int, pairs: int) -> Run:
-    """Turns on the spot, 12 degrees a pair."""
-    return Run(mild_rig(seed, size), paths.turns([12.0] * (pairs - 1), 0.0), corridor(seed))
+def spin(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return turns on the spot, 12 degrees a pair."""
+    return SimulatedRun(mild_rig(seed, size), paths.turns([12.0] * (pairs - 1), 0.0), corridor(seed))
 
 
-RECIPES: dict[str, tuple[Recipe, int]] = {  # and how many pairs it has unless told otherwise
+# By name, with the default number of pairs.
+RECIPES: dict[str, tuple[Recipe, int]] = {
     "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
     "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
     "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
 }
 
 
-def build(name: str, seed: int, size: int = 768, pairs: int | None = None) -> Run:
-    """The run of that name; pairs None takes the recipe's own length."""
+def build(name: str, seed: int, size: int = 768, pairs: int | None = None) -> SimulatedRun:
+    """Make the run of that name; pairs None: the recipe's default."""
     recipe, usual = RECIPES[name]
     return recipe(seed, size, pairs or usual)

@@ -1,4 +1,4 @@
-"""Rigs of two cameras that look up into mirrors, as misaligned as asked."""
+"""Rigs of two cameras that look up into mirrors, with given misalignments."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 
-HORIZON = 207.5676 / 768  # radius of the horizon at scale 1, of the image's width
-RIM = 373.0 / 768  # radius of the mirror's rim
+# Radii of the horizon at scale 1 and of the mirror's rim, in parts of the image's width.
+HORIZON = 207.5676 / 768
+RIM = 373.0 / 768
 TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
 # The image's centre shows the floor; up in the image is forward, and the mirror's flip is in fu < 0.
 R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
@@ -24,11 +25,11 @@ def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, ri
              lower_offset_mm: tuple[float, float] = (0, 0),
              distortion: tuple[float, float, float, float] = (0, 0, 0, 0),
              centre_px: tuple[float, float] = (0, 0)) -> Rig:
-    """A rig whose frame is the lower viewpoint's, z up, unless lower_* says otherwise.
+    """Return a rig with its frame at the lower viewpoint, z up, unless lower_* are given.
 
-    misaligned_deg: rotation vector, in the rig frame, that turns the upper camera about its viewpoint, which lies
-    offset_mm (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves
-    the optical centre (and the rim) off the image's centre.
+    misaligned_deg: rotation vector of the upper camera, in the rig frame, about its viewpoint, which lies offset_mm
+    (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves the optical
+    centre (and the rim) off the image's centre.
     """
     focal = HORIZON * size * scale * (xi if xi > 0 else 1.0)
     centre = ((size - 1) / 2 + centre_px[0], (size - 1) / 2 + centre_px[1])
@@ -44,8 +45,8 @@ def _T_cam_rig(misaligned_deg: tuple[float, float, float], viewpoint_mm: tuple[f
     return se3.inverse(se3.transform(R, 1e-3 * np.array(viewpoint_mm)))
 
 
-def misturned(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
-    """The rig whose upper camera would have to turn so, in the rectified frame, to be where it is."""
+def with_upper_rotated(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
+    """Return the rig whose upper camera would have to rotate by turn_deg, in the rectified frame, to be correct."""
     R = rig.T_rect_rig[:3, :3]
     T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
     back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R

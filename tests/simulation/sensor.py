@@ -1,4 +1,4 @@
-"""What a real camera adds to an ideal image: blur, struts, hub, vignette, changing light, noise, JPEG."""
+"""Model of a real camera's sensor: blur, struts, hub, vignetting, changing light, noise, JPEG."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from calib.models.camera import Mask
 
 Floats = NDArray[np.float32]
-FITTING_GREY = 18.0  # struts and hub
-EDGE_STEPS = 4  # samples per pixel and axis of a strut's edge
+# Grey level of struts and hub.
+FITTING_GREY = 18.0
+# Samples per pixel and axis of a strut's edge.
+EDGE_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """All faults of a camera; lengths are fractions of the image's width, angles in the image."""
+    """Parameters of the sensor; lengths are fractions of the image's width, angles in the image."""
 
     noise_sigma: float = 1.5
     blur_px: float = 0.5
@@ -31,7 +33,7 @@ class Sensor:
 
 
 def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
-    """How much of each pixel (H, W) struts and hub hide, 0 to 1; they turn with the camera."""
+    """Return the part (H, W) of each pixel that struts and hub hide, 0 to 1; they are fixed to the camera."""
     width, height = size
     fine = (np.arange(width * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[0]
     x, y = np.meshgrid(fine, (np.arange(height * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[1])
@@ -43,7 +45,7 @@ def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
 
 
 def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
-    """Brightness factor (H, W): 1 in the middle, 1 - vignette at the rim, falling with the square of the radius."""
+    """Return the brightness factor (H, W): 1 in the middle, 1 - vignette at the rim, quadratic in the radius."""
     x, y = np.meshgrid(np.arange(size[0]) - mask.center[0], np.arange(size[1]) - mask.center[1])
     rim_px = min(mask.outer_px, size[0] / 2)
     return np.asarray(1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1), np.float32)
@@ -51,7 +53,7 @@ def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """One camera's sensor with its fixed patterns computed once."""
+    """One camera's sensor with its fixed patterns, computed once."""
 
     sensor: Sensor
     hidden: Floats
@@ -59,11 +61,11 @@ class Exposure:
 
     @staticmethod
     def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Exposure:
-        """The exposure of a camera with that mask and image size (width, height)."""
+        """Return the exposure of a camera with that mask and image size (width, height)."""
         return Exposure(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
 
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The image (H, W) uint8 the sensor gives of an ideal one."""
+        """Return the sensor's image (H, W) uint8 of an ideal one."""
         s = self.sensor
         gain = max(0.0, 1 + s.flicker * float(rng.standard_normal()))
         grey = (ideal * self.falloff * np.float32(gain)) * (1 - self.hidden) + FITTING_GREY * self.hidden
@@ -73,6 +75,6 @@ class Exposure:
         return np.clip(np.rint(grey * (1 - s.black_level / 255) + s.black_level + noise), 0, 255).astype(np.uint8)
 
     def jpeg(self, image: NDArray[np.uint8]) -> bytes:
-        """The image as grey JPEG."""
+        """Return the image as grey JPEG."""
         _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.sensor.jpeg_quality])
         return data.tobytes()

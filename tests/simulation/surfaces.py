@@ -1,4 +1,4 @@
-"""What a rendered world is made of: flat textured rectangles."""
+"""Surfaces of rendered worlds: flat textured rectangles."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from calib.models.camera import Array
 
 Texture = NDArray[np.uint8]
-POSTER_GAP_M = 0.002  # in front of its wall; well above the depth error of float32
-LIGHT = np.array([0.35, 0.55, 0.76])  # direction of the light in the world; faces differ in grey by it
+# Distance of a poster from its wall: well above the depth error of float32.
+POSTER_GAP_M = 0.002
+# Direction of the light in the world; faces differ in grey by it.
+LIGHT = np.array([0.35, 0.55, 0.76])
+AMBIENT, DIFFUSE = 0.72, 0.28
 
 
 @dataclass(frozen=True)
@@ -32,37 +35,37 @@ class Rectangle:
 
     @property
     def width_m(self) -> float:
-        """Length of edge_u [m]."""
+        """Return the length of edge_u [m]."""
         return float(np.linalg.norm(self.edge_u))
 
     @property
     def height_m(self) -> float:
-        """Length of edge_v [m]."""
+        """Return the length of edge_v [m]."""
         return float(np.linalg.norm(self.edge_v))
 
     @cached_property
     def normal(self) -> Array:
-        """Unit normal (3,), away from whoever reads the texture the right way round."""
+        """Return the unit normal (3,), away from the side on which the texture is not mirrored."""
         n = np.cross(self.edge_u, self.edge_v)
         return np.asarray(n / np.linalg.norm(n))
 
     @property
     def corners(self) -> Array:
-        """The four corners (4, 3) [m]: upper left, upper right, lower right, lower left."""
+        """Return the four corners (4, 3) [m]: upper left, upper right, lower right, lower left."""
         return self.points(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
 
     def points(self, uv: Array) -> Array:
-        """World points (N, 3) [m] at fractions uv (N, 2) of the edges."""
+        """Return world points (N, 3) [m] at fractions uv (N, 2) of the edges."""
         return np.asarray(self.origin + uv[:, :1] * self.edge_u + uv[:, 1:] * self.edge_v)
 
     @cached_property
     def brightness(self) -> float:
-        """Factor on the texture's grey by the angle to the light; the same on both sides."""
-        return float(0.72 + 0.28 * abs(self.normal @ LIGHT))
+        """Return the factor of the texture's grey by the angle to the light; the same on both sides."""
+        return float(AMBIENT + DIFFUSE * abs(self.normal @ LIGHT))
 
     @cached_property
     def pyramid(self) -> list[NDArray[np.float32]]:
-        """The texture at halved sizes, all with the same outline (box filter), until a side is below 4 pixels."""
+        """Return the texture at halved sizes, all with the same outline (box filter), until a side is below 8 px."""
         levels = [self.texture.astype(np.float32)]
         while min(levels[-1].shape) >= 8:
             height, width = levels[-1].shape
@@ -70,20 +73,20 @@ class Rectangle:
             levels.append(half.astype(np.float32))
         return levels
 
-    def image(self, texture: Texture, place_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
-        """A poster hung just in front of this wall; place_m = (left, top, width, height) along the edges."""
+    def poster(self, texture: Texture, area_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
+        """Return a poster just in front of this wall; area_m = (left, top, width, height) along the edges."""
         u, v = self.edge_u / self.width_m, self.edge_v / self.height_m
-        left, top, width, height = place_m
+        left, top, width, height = area_m
         origin = self.origin + left * u + top * v - POSTER_GAP_M * self.normal
         return Rectangle(origin, width * u, height * v, texture, name)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All rectangles of a world."""
+    """The rectangles of a world."""
 
     rectangles: tuple[Rectangle, ...]
 
     def named(self, name: str) -> Rectangle:
-        """The rectangle of that name."""
+        """Return the rectangle of that name."""
         return next(r for r in self.rectangles if r.name == name)

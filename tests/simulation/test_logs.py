@@ -1,4 +1,4 @@
-"""Recipes are the same for the same seed, and a written log says what was rendered."""
+"""Recipes are reproducible, and a written log contains what was rendered."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ SCHEMA = "sensor_msgs/msg/CompressedImage"
 
 
 def messages(path: Path) -> list[tuple[str, int, Any]]:
-    """(topic, stamp, message) in the order of arrival."""
+    """Return (topic, stamp, message) in the order of arrival."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     with path.open("rb") as file:
         reader = make_reader(file)
@@ -44,13 +44,13 @@ def write(folder: Path, name: str = "misaligned", seed: int = 4, pairs: int = 3)
     return folder
 
 
-def test_same_seed_same_bytes_other_seed_other_images(tmp_path: Path) -> None:
+def test_same_seed_gives_same_bytes(tmp_path: Path) -> None:
     one, again, other = (write(tmp_path / n, seed=s) / "log.mcap" for n, s in (("a", 4), ("b", 4), ("c", 5)))
     assert one.read_bytes() == again.read_bytes()
     assert one.read_bytes() != other.read_bytes()
 
 
-def test_log_has_both_cameras_and_stamps_of_the_truth(tmp_path: Path) -> None:
+def test_log_has_both_cameras_and_the_stamps_of_the_ground_truth(tmp_path: Path) -> None:
     read = messages(write(tmp_path, pairs=15) / "log.mcap")
     stamps = {side: np.array([t for topic, t, _ in read if topic == f"/{side}/image_raw/compressed"])
               for side in ("lower", "upper")}
@@ -61,7 +61,7 @@ def test_log_has_both_cameras_and_stamps_of_the_truth(tmp_path: Path) -> None:
     assert decoded(read[0][2]).shape == (SIZE, SIZE)
 
 
-def test_truth_and_camchain_carry_the_poses_and_the_rig(tmp_path: Path) -> None:
+def test_ground_truth_and_camchain_contain_poses_and_rig(tmp_path: Path) -> None:
     run = build("misaligned", 4, SIZE, 3)
     folder = write(tmp_path)
     rows = np.loadtxt(folder / "truth.txt")
@@ -76,7 +76,7 @@ def test_truth_and_camchain_carry_the_poses_and_the_rig(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(RECIPES))
-def test_every_recipe_keeps_the_rig_inside_its_walls(name: str) -> None:
+def test_every_recipe_stays_inside_its_walls(name: str) -> None:
     run = build(name, 9, SIZE, 3)
     assert len(run.poses) == 3
     x, y = run.poses[:, 0, 3], run.poses[:, 1, 3]
@@ -86,7 +86,7 @@ def test_every_recipe_keeps_the_rig_inside_its_walls(name: str) -> None:
     assert (y > low[1] + 0.4).all() and (y < high[1] - 0.4).all()
 
 
-def test_spline_steps_and_turn_are_as_asked() -> None:
+def test_spline_path_has_the_given_steps_and_turn() -> None:
     poses = spline_path(1, 60, 0.05, turn=(58, TURN_DEG))
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert np.allclose(steps[:57], 0.05, atol=1e-4)
@@ -98,14 +98,14 @@ def test_spline_steps_and_turn_are_as_asked() -> None:
     assert along.min() > 0.99
 
 
-def test_turns_and_the_way_back() -> None:
+def test_turns_and_return_path() -> None:
     poses = turns([10.0, -25.0], 0.03)
     assert np.rad2deg(se3.yaw(poses)) == pytest.approx([0, 10, -15])
     back = back_again(poses)
     assert len(back) == 5 and np.array_equal(back[0], back[-1])
 
 
-def test_struts_and_hub_are_dark_and_stay_where_they_are() -> None:
+def test_struts_and_hub_are_dark_and_fixed() -> None:
     rig = make_rig(size=SIZE)
     exposure = Exposure.of(Sensor(strut_angles_deg=(0.0,), strut_width=0.05, hub=0.1, noise_sigma=0), rig.lower.visible,
                            (SIZE, SIZE))
@@ -115,14 +115,14 @@ def test_struts_and_hub_are_dark_and_stay_where_they_are() -> None:
     assert image[middle, 10] > 180 and image[10, middle] > 180
 
 
-def test_masked_rig_hides_the_struts_and_the_plain_one_does_not(tmp_path: Path) -> None:
+def test_only_the_masked_rig_excludes_struts(tmp_path: Path) -> None:
     write(tmp_path, "struts")
     on_hub = np.full((1, 2), SIZE / 2)
     assert read_rig(tmp_path / "rig.toml").lower.visible.contains(on_hub).all()
     assert not read_rig(tmp_path / "rig_masked.toml").lower.visible.contains(on_hub).any()
 
 
-def test_noise_is_new_in_every_image_of_a_standing_rig(tmp_path: Path) -> None:
+def test_noise_differs_in_every_image_of_a_standing_rig(tmp_path: Path) -> None:
     read = messages(write(tmp_path, "still") / "log.mcap")
     lower = [decoded(m).astype(float) for topic, _, m in read if "lower" in topic]
     difference = (lower[1] - lower[0])[SIZE // 3:-SIZE // 3, SIZE // 3:-SIZE // 3]

@@ -1,4 +1,4 @@
-"""A rendered corner lies where the camera model says, and not where a swapped or inverted transform would put it."""
+"""Rendered corners equal the camera model's projection, so that exchanged or inverted transforms are detected."""
 
 import itertools
 
@@ -25,7 +25,7 @@ POSE = se3.exp([0.31, -0.22, 1.17, 0.05, -0.04, 0.7])
 
 
 def chessboards(pose: np.ndarray, count: int = 4) -> Scene:
-    """Chessboards all around the pose, at its height and each tilted a little."""
+    """Return chessboards on all sides of the pose, at its height, each tilted a little."""
     board = np.kron(np.indices((SQUARES, SQUARES)).sum(axis=0) % 2, np.ones((100, 100)))
     texture = (40 + 180 * board).astype(np.uint8)
     sheets = []
@@ -47,7 +47,7 @@ def project(mounted: MountedCamera, points: np.ndarray) -> np.ndarray:
 
 
 def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
-    """Distance of every visible corner found in the image from where project() puts it."""
+    """Return the distance of every visible corner in the image from its projection."""
     scene = chessboards(POSE)
     image = render(scene, mounted, POSE, 3)
     expected = project(mounted, np.concatenate([inner_corners(s) for s in scene.rectangles]))
@@ -60,7 +60,7 @@ def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
 
 @pytest.mark.parametrize("which", ["lower", "upper"])
 @pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
-def test_corners_lie_where_the_model_projects_them(rig: Rig, which: str) -> None:
+def test_rendered_corners_equal_the_projection(rig: Rig, which: str) -> None:
     errors = corner_errors_px(getattr(rig, which))
     assert len(errors) >= 15
     assert np.median(errors) < 0.1
@@ -68,7 +68,7 @@ def test_corners_lie_where_the_model_projects_them(rig: Rig, which: str) -> None
 
 
 def spot(bearing: tuple[float, float, float]) -> tuple[float, float]:
-    """Where a straight rig's lower camera sees a white spot 2 m away in direction (x, y, z) of the rig."""
+    """Return the pixel of a white spot 2 m away in direction (x, y, z) in a straight rig's lower camera."""
     centre = 2 * np.array(bearing) / np.linalg.norm(bearing)
     side = np.cross(bearing, [0.3, 0.2, 1.0])
     side *= 0.1 / np.linalg.norm(side)
@@ -80,8 +80,8 @@ def spot(bearing: tuple[float, float, float]) -> tuple[float, float]:
     return float((columns * image).sum() / image.sum()), float((rows * image).sum() / image.sum())
 
 
-def test_forward_is_up_and_left_is_right_as_in_a_mirror() -> None:
-    """Worked by hand for a paraboloid: radius = f tan(theta / 2), theta from straight down."""
+def test_forward_is_up_and_left_is_right_in_a_mirror() -> None:
+    """Paraboloid: radius = f tan(theta / 2), theta from the vertical."""
     middle, horizon = (SIZE - 1) / 2, 207.5676 / 768 * SIZE
     assert spot((1, 0, 0)) == pytest.approx((middle, middle - horizon), abs=0.3)
     assert spot((0, 1, 0)) == pytest.approx((middle + horizon, middle), abs=0.3)
@@ -89,7 +89,7 @@ def test_forward_is_up_and_left_is_right_as_in_a_mirror() -> None:
     assert spot((-1, 0, -1)) == pytest.approx((middle, middle + below), abs=0.3)
 
 
-def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
+def test_nearer_surfaces_occlude_farther_ones_in_any_order() -> None:
     rng = np.random.default_rng(0)
     far, near = (wall(rng, "plain", (x, 1.0), (x, -1.0)) for x in (2.0, 1.5))
     dark = Rectangle(near.origin, near.edge_u, near.edge_v, np.full((8, 8), 10, np.uint8))
@@ -99,7 +99,7 @@ def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
     assert np.array_equal(one, render(Scene((dark,)), camera, pose))
 
 
-def test_outside_the_rim_is_black_and_inside_nothing_is_missing() -> None:
+def test_image_is_black_outside_the_rim_and_filled_inside() -> None:
     run = build("two_walls", 3, SIZE)
     mask = run.rig.lower.visible
     image = render(run.scene, run.rig.lower, run.poses[0])
@@ -110,8 +110,8 @@ def test_outside_the_rim_is_black_and_inside_nothing_is_missing() -> None:
     assert (image[inside] > 0).mean() > 0.999
 
 
-def test_texture_far_away_is_averaged_not_sampled() -> None:
-    """A fine chessboard far away is grey; sampled without a pyramid it would be noise that moves."""
+def test_distant_texture_is_averaged() -> None:
+    """A fine chessboard far away is uniform grey; sampled without a pyramid it would be noise."""
     board = (255 * (np.indices((600, 600)).sum(axis=0) % 2)).astype(np.uint8)
     sheet = Rectangle(np.array([3.0, 1, 1]), np.array([0, -2.0, 0]), np.array([0, 0, -2.0]), board)
     image = render(Scene((sheet,)), RIGS["straight"].lower, np.eye(4))

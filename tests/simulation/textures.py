@@ -12,8 +12,10 @@ from calib.models.camera import Array
 from tests.simulation.surfaces import Texture
 
 Random = np.random.Generator
-Size = tuple[int, int]  # (width, height) [px]
-Painter = Callable[[Random, Size, float], Texture]  # the last argument: pixels per metre
+# (width, height) [px]
+Size = tuple[int, int]
+# Paints a texture by a random generator, a size, and pixels per metre.
+Painter = Callable[[Random, Size, float], Texture]
 
 
 def _grey(values: Array | NDArray[np.float32]) -> Texture:
@@ -21,7 +23,7 @@ def _grey(values: Array | NDArray[np.float32]) -> Texture:
 
 
 def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float = 0.6) -> NDArray[np.float32]:
-    """Noise (H, W) float32 of mean 0 and standard deviation 1 with all scales from coarsest_px to 2 pixels."""
+    """Return noise (H, W) float32 of mean 0 and standard deviation 1 with all scales from coarsest_px to 2 pixels."""
     width, height = size
     total, weight = np.zeros((height, width), np.float32), 1.0
     while coarsest_px >= 2:
@@ -33,7 +35,7 @@ def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float 
 
 
 def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Running bond of bricks that look exactly alike: one pair of courses, repeated."""
+    """Return a running bond of identical bricks: one pair of courses, repeated."""
     length, course = round(px_per_m * rng.uniform(0.22, 0.32)), round(px_per_m * rng.uniform(0.075, 0.11))
     joint = max(1, round(px_per_m * rng.uniform(0.008, 0.014)))
     face, mortar = rng.uniform(60, 110), rng.uniform(140, 190)
@@ -45,17 +47,17 @@ def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
 
 
 def plaster(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Soft cloudy wall with fine grain."""
+    """Return a soft cloudy wall with fine grain."""
     return _grey(rng.uniform(115, 165) + 11 * value_noise(rng, size, px_per_m * 0.5, 0.7))
 
 
 def granite(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Strong contrast at every scale."""
+    """Return a texture of strong contrast at every scale."""
     return _grey(rng.uniform(100, 140) + 42 * value_noise(rng, size, px_per_m * 0.4, 0.75))
 
 
 def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Square tiles with joints, each of its own grey, grained."""
+    """Return grained square tiles with joints, each of its own grey."""
     side, joint = max(4, round(px_per_m * rng.uniform(0.25, 0.45))), max(1, round(px_per_m * 0.006))
     rows, columns = np.arange(size[1]) // side, np.arange(size[0]) // side
     level = rng.uniform(120, 160) + 7 * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))
@@ -66,7 +68,7 @@ def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
 
 
 def plain(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Nearly textureless paint: a few grey levels of very coarse clouds."""
+    """Return nearly textureless paint: a few grey levels of very coarse clouds."""
     return _grey(rng.uniform(130, 180) + 1.2 * value_noise(rng, size, px_per_m * 1.0, 0.35))
 
 
@@ -74,13 +76,13 @@ PAINTERS: dict[str, Painter] = {"brick": brick, "plaster": plaster, "granite": g
 
 
 def poster(rng: Random, size: Size) -> Texture:
-    """A printed page, a drawing or a photograph, by chance."""
+    """Return a printed page, a drawing, two-tone shapes or a photograph, at random."""
     kinds = (_page, _drawing, _blobs, _photograph)
     return kinds[rng.integers(len(kinds))](rng, size)
 
 
 def _page(rng: Random, size: Size) -> Texture:
-    """Lines of writing on white paper; real letters, so that a mirrored image shows."""
+    """Return lines of letters on white paper; a mirrored image of letters is recognised."""
     page = np.full(size[::-1], rng.uniform(215, 245), np.uint8)
     height = max(10, size[1] // int(rng.integers(8, 16)))
     for bottom in range(2 * height, size[1] - height, height):
@@ -91,7 +93,7 @@ def _page(rng: Random, size: Size) -> Texture:
 
 
 def _drawing(rng: Random, size: Size) -> Texture:
-    """Lines and filled shapes of any grey."""
+    """Return lines and filled shapes of any grey."""
     sheet = np.full(size[::-1], rng.uniform(60, 220), np.uint8)
     for _ in range(int(rng.integers(12, 30))):
         a, b = (tuple(int(x) for x in rng.uniform(0, size)) for _ in range(2))
@@ -101,13 +103,13 @@ def _drawing(rng: Random, size: Size) -> Texture:
 
 
 def _blobs(rng: Random, size: Size) -> Texture:
-    """Two tones with wavy outlines."""
+    """Return two tones with wavy outlines."""
     dark, light = rng.uniform(15, 80), rng.uniform(150, 240)
     return _grey(np.where(value_noise(rng, size, size[0] / 4, 0.5) > 0, light, dark))
 
 
 def _photograph(rng: Random, size: Size) -> Texture:
-    """Noise of strong contrast with a few round things in front."""
+    """Return noise of strong contrast with a few ellipses in front."""
     image = _grey(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
     for _ in range(int(rng.integers(2, 6))):
         centre = tuple(int(x) for x in rng.uniform(0, size))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.fit.rig_drift import Drift, find_drift
+from calib.fit.rig_drift import RigDrift, estimate_rig_drift
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
@@ -67,7 +67,7 @@ class RigFinding:
     spread_px: float  # 1.48 times the median distance from it
     by_azimuth: tuple[tuple[float, float, int], ...]  # degrees, median offset [px] or NaN, matches
     left_px: float  # what half of these exceed once the drift is taken away: no turn of a camera explains it
-    drift: Drift | None
+    drift: RigDrift | None
 
     @property
     def turn_deg(self) -> float:
@@ -153,7 +153,7 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     offset = float(np.median(aside)) if len(aside) else float("nan")
     spread = 1.4826 * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
     enough = len(aside) >= MIN_MATCHES
-    drift = find_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
+    drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
     left = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
     offsets = [abs(median) for _, median, count in left if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
@@ -161,7 +161,7 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
                       _by_azimuth(found.lower, aside, cylinder), left_px, drift)
 
 
-def _verdict(drift: Drift | None, left_px: float, counts: tuple[int, int]) -> Verdict:
+def _verdict(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> Verdict:
     matches, clear = counts
     if clear >= MIN_CLEAR and matches < MIN_SHARE * clear:
         return "broken"

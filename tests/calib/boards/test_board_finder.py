@@ -1,4 +1,4 @@
-"""Boards in rendered mirror images: found in noise, shadow and haze, to a fraction of a pixel, and never invented."""
+"""Detection of boards in rendered mirror images: noise, shadow, low contrast, accuracy, images without a board."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
-from calib.boards.board_shape import is_whole
+from calib.boards.board_shape import is_complete_board
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from tests.simulation.boards import Studio, around
+from tests.simulation.boards import BoardRenderer, board_poses_around_camera
 from tests.simulation.sensor import Sensor
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480))
 MASK = Mask((241.3, 237.8), 40.0, 232.0)
-STUDIO = Studio.of(BOARD, CAMERA, MASK)
+RENDERER = BoardRenderer.of(BOARD, CAMERA, MASK)
 
 
 def poses(count: int, seed: int = 0, distance_m: tuple[float, float] = (0.15, 0.28)) -> list[Array]:
-    return around(CAMERA, BOARD, MASK, count, seed=seed, distance_m=distance_m)
+    return board_poses_around_camera(CAMERA, BOARD, MASK, count, seed=seed, distance_m=distance_m)
 
 
 def errors_px(found: Array, truth: Array) -> Array:
-    """Distances to the truth, of the way round and the flip that fit: a flat board does not tell."""
+    """Return the distances to the truth in the best order of corners: a flat board does not determine it."""
     grid = truth.reshape(BOARD.rows, BOARD.columns, 2)
     ways = [way.reshape(-1, 2) for way in (grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1])]
     distances = [np.linalg.norm(found - way, axis=1) for way in ways]
@@ -44,72 +44,72 @@ def errors_px(found: Array, truth: Array) -> Array:
     (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 1.0, 0.5),
     (Sensor(), (25.0, 225.0), 0.3, 0.5),
 ])
-def test_boards_are_found_all_around(sensor: Sensor, contrast: tuple[float, float], shadow: float,
+def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], shadow: float,
                                      limit_px: float) -> None:
     for seed, T in enumerate(poses(3)):
-        shot = STUDIO.photograph(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
-        view = find_board(shot.image, BOARD, "x").view
+        rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
+        view = find_board(rendered.image, BOARD, "x").view
         assert view is not None and view.confidence > 0.7, seed
-        off = errors_px(view.pixels, shot.corners)
+        off = errors_px(view.pixels, rendered.corners)
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
 
 
-def test_squares_of_six_pixels_are_enough() -> None:
+def test_finds_boards_with_squares_of_six_pixels() -> None:
     T = poses(1, distance_m=(0.55, 0.6))[0]
-    shot = STUDIO.photograph(T)
-    sides = np.linalg.norm(np.diff(shot.corners.reshape(5, 6, 2), axis=1), axis=2)
+    rendered = RENDERER.render_board(T)
+    sides = np.linalg.norm(np.diff(rendered.corners.reshape(5, 6, 2), axis=1), axis=2)
     assert 4 < np.median(sides) < 8
-    view = find_board(shot.image, BOARD).view
+    view = find_board(rendered.image, BOARD).view
     assert view is not None
-    assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.3
+    assert np.nanmax(errors_px(view.pixels, rendered.corners)) < 0.3
 
 
-def test_a_board_through_a_fisheye_lens_is_found() -> None:
+def test_finds_a_board_through_a_fisheye_lens() -> None:
     camera = OcamCamera((-180.0, 0.0, 1.2e-3), (238.0, 241.0), (1.0, 0.0, 0.0), (480, 480), "direct")
     mask = Mask(camera.center, 0.0, 232.0)
-    T = around(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
-    shot = Studio.of(BOARD, camera, mask).photograph(T)
-    view = find_board(shot.image, BOARD).view
+    T = board_poses_around_camera(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
+    rendered = BoardRenderer.of(BOARD, camera, mask).render_board(T)
+    view = find_board(rendered.image, BOARD).view
     assert view is not None
-    assert np.nanmax(errors_px(view.pixels, shot.corners)) < 0.2
+    assert np.nanmax(errors_px(view.pixels, rendered.corners)) < 0.2
 
 
-def test_the_order_is_a_grid_that_turns_clockwise_and_starts_at_a_dark_square() -> None:
+def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
     for seed, T in enumerate(poses(3, seed=4)):
-        shot = STUDIO.photograph(T, seed=seed)
-        view = find_board(shot.image, BOARD).view
+        rendered = RENDERER.render_board(T, seed=seed)
+        view = find_board(rendered.image, BOARD).view
         assert view is not None
         grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
         along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
         first, second = (grid[:2, i:i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
-        assert shot.image[first[1], first[0]] < shot.image[second[1], second[0]]
-        flipped = find_board(np.ascontiguousarray(shot.image[:, ::-1]), BOARD).view
-        assert flipped is not None  # whichever way the optics flip the image
+        assert rendered.image[first[1], first[0]] < rendered.image[second[1], second[0]]
+        flipped = find_board(np.ascontiguousarray(rendered.image[:, ::-1]), BOARD).view
+        assert flipped is not None
 
 
-def test_a_hidden_corner_is_left_out_and_the_rest_is_kept() -> None:
-    shot = STUDIO.photograph(poses(1)[0])
-    image = shot.image.copy()
-    u, v = shot.corners[14].round().astype(int)
+def test_drops_a_hidden_corner_and_keeps_the_others() -> None:
+    rendered = RENDERER.render_board(poses(1)[0])
+    image = rendered.image.copy()
+    u, v = rendered.corners[14].round().astype(int)
     cv2.circle(image, (int(u), int(v)), 4, 128, -1)
     view = find_board(image, BOARD).view
     assert view is not None
-    off = errors_px(view.pixels, shot.corners)
+    off = errors_px(view.pixels, rendered.corners)
     assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
-def test_another_count_is_not_found_and_the_right_one_is_told(asked: tuple[int, int]) -> None:
-    shot = STUDIO.photograph(poses(1, seed=2)[0])
-    search = find_board(shot.image, Board(*asked, 0.03))
+def test_reports_the_grid_size_if_the_requested_count_is_wrong(asked: tuple[int, int]) -> None:
+    rendered = RENDERER.render_board(poses(1, seed=2)[0])
+    search = find_board(rendered.image, Board(*asked, 0.03))
     assert search.view is None
-    assert sorted(search.seen) == [5, 6]
+    assert sorted(search.grid_size) == [5, 6]
 
 
 @pytest.mark.slow
-def test_no_board_is_found_where_there_is_none() -> None:
+def test_finds_no_board_in_images_without_one() -> None:
     rng = np.random.default_rng(3)
     noise = rng.integers(0, 255, (300, 300)).astype(np.uint8)
     stripes = np.where(np.arange(300) // 10 % 2, 40, 200).astype(np.uint8)
@@ -123,23 +123,23 @@ def test_no_board_is_found_where_there_is_none() -> None:
 
 
 def chequers(columns: int, rows: int, margin_px: int) -> NDArray[np.uint8]:
-    """Squares of 12 px and what surrounds them, plain and light."""
+    """Return squares of 12 px with a light margin."""
     squares = np.kron(np.indices((rows, columns)).sum(axis=0) % 2, np.ones((12, 12))) * 150 + 40
     return np.pad(squares, margin_px, constant_values=190).astype(np.uint8)
 
 
 @pytest.mark.parametrize(("columns", "rows", "margin_px", "whole"), [
     (7, 6, 40, True), (9, 6, 40, False), (7, 9, 40, False), (20, 20, 0, False), (6, 5, 40, False)])
-def test_a_board_ends_where_it_must_and_a_chequered_floor_goes_on(columns: int, rows: int, margin_px: int,
+def test_distinguishes_a_board_from_a_chequered_floor(columns: int, rows: int, margin_px: int,
                                                                   whole: bool) -> None:
-    """6x5 corners looked for two squares from the upper left, in floors, in larger boards, and in too small a one."""
+    """Check 6x5 corners in a board of that size, in larger boards, in a floor, and in a smaller board."""
     corner = 12.0 * (1 + (columns > 8) + (rows > 8)) + margin_px - 0.5
     grid = np.stack(np.meshgrid(corner + 12 * np.arange(6), corner + 12 * np.arange(5)), axis=-1)
-    assert is_whole(chequers(columns, rows, margin_px).astype(np.float32), grid) is whole
+    assert is_complete_board(chequers(columns, rows, margin_px).astype(np.float32), grid) is whole
 
 
 @pytest.mark.slow
-def test_all_ten_real_images(shared_data: Path) -> None:
+def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
     for number in range(10):
         image = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
         view = find_board(image.astype(np.uint8), Board(6, 7, 0.03)).view
@@ -148,6 +148,6 @@ def test_all_ten_real_images(shared_data: Path) -> None:
 
 @pytest.mark.parametrize(("columns", "rows", "square_m"), [(2, 5, 0.03), (6, 61, 0.03), (6, 5, 0.0), (6, 5, -0.03),
                                                            (6, 5, float("nan"))])
-def test_an_impossible_board_is_refused(columns: int, rows: int, square_m: float) -> None:
+def test_refuses_an_impossible_board(columns: int, rows: int, square_m: float) -> None:
     with pytest.raises(CalibError, match="board: expected"):
         Board(columns, rows, square_m)

@@ -1,4 +1,4 @@
-"""Ten real images of a mirror camera, and what OCamCalib made of them: corners, polynomial, centre, errors."""
+"""Calibration by ten real images of a mirror camera, compared with OCamCalib's corners, polynomial, centre, errors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import find_board
-from calib.fit.camera_fit import MODELS, Calibration, calibrate, sharpened
-from calib.fit.unified_fit import axes
+from calib.fit.camera_fit import MODELS, CameraCalibration, calibrate_camera, refine_camera_calibration
+from calib.fit.unified_fit import unified_from_ocam
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
 
@@ -29,56 +29,59 @@ def read_images(shared_data: Path) -> Images:
 
 
 def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[BoardView], Array]:
-    """OCamCalib's numbers, its corners as views, and its errors by image; its board runs along rows first."""
-    told = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
+    """Return OCamCalib's numbers, its corners as views, and its errors by image."""
+    numbers = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
     views = [BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
-             for entry in told["images"]]
-    order = np.lexsort((told["Xt_mm"], told["Yt_mm"]))  # from its order to the board's: x fastest
-    return told, [BoardView(view.name, view.pixels[order]) for view in views], np.array(told["stored_errMean_px"])
+             for entry in numbers["images"]]
+    # From the toolbox's order of corners to Board.points: x varies fastest.
+    order = np.lexsort((numbers["Xt_mm"], numbers["Yt_mm"]))
+    reordered = [BoardView(view.name, view.pixels[order]) for view in views]
+    return numbers, reordered, np.array(numbers["stored_errMean_px"])
 
 
-def lifted_apart_deg(ocam: Calibration, omni: Calibration) -> Array:
-    """Angles between the rays of both cameras, where corners were seen."""
+def ray_angles_deg(ocam: CameraCalibration, omni: CameraCalibration) -> Array:
+    """Return angles between the rays of both cameras at the corners."""
     assert isinstance(ocam.camera, OcamCamera)
     pixels = np.concatenate([view.pixels for view in ocam.views])
-    one, other = ocam.camera.lift(pixels) @ axes(ocam.camera)[:3, :3].T, omni.camera.lift(pixels)
+    one, other = ocam.camera.lift(pixels) @ unified_from_ocam(ocam.camera)[:3, :3].T, omni.camera.lift(pixels)
     return np.asarray(np.rad2deg(np.linalg.norm(one - other, axis=1)))
 
 
 @pytest.mark.slow
-def test_all_boards_are_found_and_both_models_fit_and_agree(shared_data: Path) -> None:
+def test_both_models_fit_real_images_and_are_consistent(shared_data: Path) -> None:
     images = read_images(shared_data)
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 10
-    ocam, omni = (sharpened(calibrate([view for view in views if view], BOARD, SIZE, model), images, model, "mirror")
+    known = [view for view in views if view]
+    ocam, omni = (refine_camera_calibration(calibrate_camera(known, BOARD, SIZE, model), images, model, "mirror")
                   for model in MODELS)
     assert ocam.rejected == omni.rejected == ()
     assert ocam.fit.mean_px < 0.285 and omni.fit.mean_px < 0.285
-    assert lifted_apart_deg(ocam, omni).max() < 0.1
+    assert ray_angles_deg(ocam, omni).max() < 0.1
 
 
 @pytest.mark.parametrize(("key", "mean_px", "apart_deg"), [
     pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)])
-def test_the_toolboxs_own_corners_give_its_camera_with_less_error(shared_data: Path, key: str, mean_px: float,
+def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(shared_data: Path, key: str, mean_px: float,
                                                                       apart_deg: float) -> None:
-    told, views, errors = reference(shared_data, key)
-    found = calibrate(views, BOARD, SIZE)
-    assert found.fit.mean_px < mean_px < told["stored_mean_err_px"]
+    numbers, views, errors = reference(shared_data, key)
+    found = calibrate_camera(views, BOARD, SIZE)
+    assert found.fit.mean_px < mean_px < numbers["stored_mean_err_px"]
     assert (found.view_errors_px < errors * 1.15).all()
     assert isinstance(found.camera, OcamCamera)
     row, column = found.camera.center_row_column
-    assert (row + 1, column + 1) == pytest.approx((told["xc_row_1based"], told["yc_col_1based"]), abs=2.0)
+    assert (row + 1, column + 1) == pytest.approx((numbers["xc_row_1based"], numbers["yc_col_1based"]), abs=2.0)
     radius = np.linspace(100, 350, 26)
-    theirs = np.polynomial.polynomial.polyval(radius, told["ss"])
+    theirs = np.polynomial.polynomial.polyval(radius, numbers["ss"])
     ours = found.camera.height(radius)
     assert np.rad2deg(np.abs(np.arctan2(ours, radius) - np.arctan2(theirs, radius))).max() < apart_deg
 
 
-def test_our_corners_are_where_the_toolbox_has_them(shared_data: Path) -> None:
+def test_corners_are_near_those_of_the_toolbox(shared_data: Path) -> None:
     _, views, _ = reference(shared_data, "ocam_subpix")
     images = read_images(shared_data)
-    for told in views[:3]:
-        found = find_board(images[told.name], BOARD).view
+    for expected in views[:3]:
+        found = find_board(images[expected.name], BOARD).view
         assert found is not None
-        nearest = np.linalg.norm(found.pixels[:, None] - told.pixels, axis=2).min(axis=1)
+        nearest = np.linalg.norm(found.pixels[:, None] - expected.pixels, axis=2).min(axis=1)
         assert np.median(nearest) < 0.25 and nearest.max() < 1.5

@@ -1,4 +1,4 @@
-"""The drift of a rig from rays: found about every axis, past false matches, honest, and undone in the rig."""
+"""Drift of a rig from rays: estimates about every axis, false matches, standard deviations, correction."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.fit.rig_drift import corrected, find_drift
+from calib.fit.rig_drift import apply_drift, estimate_rig_drift
 from calib.masks.rim_check import rim_shift
 from calib.models.camera import Array, Mask
 from calib.rig import Rig
-from tests.simulation.rigs import misturned
+from tests.simulation.rigs import with_upper_rotated
 
 
 def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
-    """Rays to points (rig frame) as the true rig sees them, in the rectified frame that another rig makes of them."""
+    """Return the true rig's rays to points (rig frame), in the rectified frame of an assumed rig."""
     found = []
     for true, wrong in ((rig.lower, assumed.lower), (rig.upper, assumed.upper)):
         seen = se3.apply(true.T_cam_rig, points)
@@ -25,52 +25,52 @@ def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (-3.0, 2.0, 5.0), (0, 0, 0)])
-def test_a_turn_is_found_about_every_axis_and_undone(rig: Rig, around: Array,
+def test_estimates_and_corrects_a_rotation_about_every_axis(rig: Rig, around: Array,
                                                      turn_deg: tuple[float, float, float]) -> None:
-    wrong = misturned(rig, turn_deg)
-    drift = find_drift(*rays(rig, around, wrong))
+    wrong = with_upper_rotated(rig, turn_deg)
+    drift = estimate_rig_drift(*rays(rig, around, wrong))
     assert drift is not None
     assert np.rad2deg(drift.turn) == pytest.approx(turn_deg, abs=1e-5)
     assert np.abs(drift.shift).max() < 1e-6 and np.abs(drift.residuals).max() < 1e-7
-    again = corrected(wrong, drift)
+    again = apply_drift(wrong, drift)
     np.testing.assert_allclose(again.upper.T_cam_rig, rig.upper.T_cam_rig, atol=1e-6)
     assert again.lower is wrong.lower and again.topics == rig.topics
 
 
-def test_a_viewpoint_aside_is_told_from_a_tilt(rig: Rig, around: Array) -> None:
+def test_distinguishes_a_shifted_viewpoint_from_a_tilt(rig: Rig, around: Array) -> None:
     R = rig.T_rect_rig[:3, :3]
     T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
     T_rig_upper[:3, 3] -= R.T @ np.array([0.02, -0.01, 0.0]) * rig.baseline_m
     wrong = replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T_rig_upper)))
-    drift = find_drift(*rays(rig, around, wrong))
+    drift = estimate_rig_drift(*rays(rig, around, wrong))
     assert drift is not None
-    again = corrected(wrong, drift)
+    again = apply_drift(wrong, drift)
     T_true, T_found = (r.lower.T_cam_rig @ se3.inverse(r.upper.T_cam_rig) for r in (rig, again))
     assert np.rad2deg(np.linalg.norm(se3.rotation_log(T_true[:3, :3].T @ T_found[:3, :3]))) < 0.01
     along = [T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (T_true, T_found)]
     assert np.linalg.norm(along[0] - along[1]) < 2e-4
 
 
-def test_false_matches_hardly_move_it_and_deviations_are_honest(rig: Rig, around: Array) -> None:
-    wrong, misses = misturned(rig, (0.3, -0.2, 0.4)), []
+def test_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: Array) -> None:
+    wrong, misses = with_upper_rotated(rig, (0.3, -0.2, 0.4)), []
     for seed in range(30):
         rng = np.random.default_rng(seed)
         lower, upper = rays(rig, around, wrong)
         upper = upper / np.linalg.norm(upper, axis=1, keepdims=True) + 2e-3 * rng.standard_normal(upper.shape)
         upper[:60] += 0.1 * rng.standard_normal((60, 3))
-        drift = find_drift(lower, upper)
+        drift = estimate_rig_drift(lower, upper)
         assert drift is not None
         misses.append((np.rad2deg(drift.turn) - (0.3, -0.2, 0.4)) / np.rad2deg(drift.turn_sigma))
     assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.5
 
 
-def test_few_points_tell_nothing(rig: Rig, around: Array) -> None:
-    assert find_drift(*rays(rig, around[:29], rig)) is None
+def test_returns_none_for_too_few_points(rig: Rig, around: Array) -> None:
+    assert estimate_rig_drift(*rays(rig, around[:29], rig)) is None
 
 
 @pytest.mark.parametrize(("moved", "radius", "fits"), [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False),
                                                       ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)])
-def test_a_rim_that_has_moved_is_told(moved: tuple[float, float], radius: float, fits: bool) -> None:
+def test_detects_a_moved_rim(moved: tuple[float, float], radius: float, fits: bool) -> None:
     v, u = np.indices((260, 260))
     center = (130.0 + moved[0], 128.0 + moved[1])
     grey = np.random.default_rng(0).integers(120, 200, (260, 260))

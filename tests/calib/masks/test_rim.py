@@ -1,4 +1,4 @@
-"""The mirror's rim: drawn ones to a fraction of a pixel, real ones, and None for images that have none."""
+"""Detection of the mirror's rim: drawn and real ones, and None for images without a rim."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ R = np.hypot(U - CENTER[0], V - CENTER[1])
 
 
 def world(seed: int = 0) -> NDArray[np.float64]:
-    """A image with light and dark patches."""
+    """Return an image with light and dark patches."""
     coarse = np.random.default_rng(seed).uniform(40, 230, (24, 24))
     return np.asarray(cv2.resize(coarse, (768, 768), interpolation=cv2.INTER_LINEAR))
 
@@ -39,24 +39,24 @@ def assert_ring(mask: Mask | None, inner: float = 0.0, outer: float = RADIUS) ->
 
 
 @pytest.mark.parametrize("guess", [CENTER, (384.0, 384.0), (410.0, 350.0)])
-def test_a_drawn_rim_is_found_from_any_fair_guess(guess: tuple[float, float]) -> None:
+def test_finds_a_drawn_rim_from_different_guesses(guess: tuple[float, float]) -> None:
     assert_ring(find_rim(drawn(), guess))
 
 
-def test_a_hub_is_found_and_a_glint_on_it_does_no_harm() -> None:
+def test_finds_a_hub_with_and_without_a_glint() -> None:
     image = drawn(inner=60.0)
     assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
     cv2.circle(image, (391, 378), 20, 130, -1)
     assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
 
 
-def test_a_rim_that_the_image_cuts_off_above_and_below_is_found() -> None:
+def test_finds_a_rim_cut_off_by_the_image() -> None:
     mask = find_rim(drawn(outer=365.0)[90:-80], (384.0, 300.0))
     assert mask is not None
     assert (*mask.center, mask.outer_px) == pytest.approx((CENTER[0], CENTER[1] - 90, 363.5), abs=0.6)
 
 
-def test_a_dark_object_over_a_third_of_the_rim_does_no_harm() -> None:
+def test_finds_a_rim_with_a_third_covered() -> None:
     image = drawn()
     image[np.abs(np.arctan2(V - CENTER[1], U - CENTER[0])) < np.pi / 3.2] = 9
     assert_ring(find_rim(image, (384.0, 384.0)))
@@ -80,17 +80,17 @@ NOTHING = {
 
 
 @pytest.mark.parametrize("name", NOTHING)
-def test_none_rather_than_nonsense(name: str) -> None:
+def test_returns_none_for_images_without_a_rim(name: str) -> None:
     image = np.clip(NOTHING[name], 0, 255).astype(np.uint8)
     assert find_rim(image, (image.shape[1] / 2, image.shape[0] / 2)) is None
 
 
-def test_the_inside_of_a_mirror_alone_has_no_rim() -> None:
+def test_returns_none_inside_the_mirror() -> None:
     assert find_rim(drawn()[160:-160, 160:-160], (224.0, 224.0)) is None
 
 
-def test_real_mirrors(shared_data: Path) -> None:
-    """Ten images of one mirror whose rim the image cuts off above and below, with the lens in its middle."""
+def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
+    """Ten images of one mirror: the image cuts off its rim above and below, and the lens is in its middle."""
     images: list[Any] = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
                            for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
     found = [find_rim(image, (512.0, 384.0)) for image in images]

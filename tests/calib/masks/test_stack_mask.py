@@ -1,4 +1,4 @@
-"""Rim, hub and struts out of a stack of rendered frames."""
+"""Mask of rim, hub and struts from a stack of rendered frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def frames(count: int, sensor: Sensor = SENSOR) -> list[NDArray[np.uint8]]:
     return [exposure.expose(np.where(inside, world, 0).astype(np.float32), rng) for world in worlds]
 
 
-def test_what_never_shows_the_world_is_painted_out() -> None:
+def test_masks_rim_hub_and_struts() -> None:
     mask = find_mask(frames(10), (205.0, 200.0))
     assert mask.image is not None
     assert mask.center == pytest.approx(CENTER, abs=0.5) and mask.outer_px == pytest.approx(RIM - 1.5, abs=1.0)
@@ -39,15 +39,15 @@ def test_what_never_shows_the_world_is_painted_out() -> None:
     assert (mask.image[clear] > 0).mean() > 0.93
 
 
-def test_no_strut_is_seen_where_there_is_none() -> None:
+def test_masks_no_strut_without_struts() -> None:
     mask = find_mask(frames(10, Sensor()), (200.0, 198.0))
     assert mask.image is not None
     v, u = np.indices(SIZE[::-1])
     assert (mask.image[np.hypot(u - CENTER[0], v - CENTER[1]) < RIM - 4] > 0).mean() > 0.995
 
 
-def test_what_cannot_give_a_mask_is_refused() -> None:
-    with pytest.raises(CalibError, match="needs 5 frames at least, of different views, found 3"):
+def test_refuses_few_frames_and_frames_without_a_rim() -> None:
+    with pytest.raises(CalibError, match="expected at least 5 frames of different views, found 3"):
         find_mask(frames(3), CENTER)
-    with pytest.raises(CalibError, match="no rim of a mirror can be told"):
+    with pytest.raises(CalibError, match="no rim of a mirror is found"):
         find_mask([np.full((200, 200), 90, np.uint8)] * 6, (100.0, 100.0))

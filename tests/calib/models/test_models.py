@@ -1,4 +1,4 @@
-"""Both camera models on their own: round trips, plain numbers by hand, and NaN where there is nothing to see."""
+"""Both camera models: round trips, equations worked by hand, NaN for invalid points, masks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def pixels_of(camera: OmniCamera) -> Array:
     return np.column_stack([u.ravel(), v.ravel()])
 
 
-def test_pixels_come_back_from_their_rays_at_any_distance(camera: OmniCamera) -> None:
+def test_project_inverts_lift_at_any_distance(camera: OmniCamera) -> None:
     pixels = pixels_of(camera)
     rays = camera.lift(pixels)
     seen = np.isfinite(rays).all(axis=1)
@@ -46,7 +46,7 @@ def test_pixels_come_back_from_their_rays_at_any_distance(camera: OmniCamera) ->
     np.testing.assert_allclose(camera.project(rays * distance)[seen], pixels[seen], rtol=0, atol=1e-7)
 
 
-def test_rays_come_back_from_their_pixels(camera: OmniCamera) -> None:
+def test_lift_inverts_project(camera: OmniCamera) -> None:
     rays = np.random.default_rng(1).normal(size=(2000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     pixels = camera.project(rays)
@@ -56,7 +56,7 @@ def test_rays_come_back_from_their_pixels(camera: OmniCamera) -> None:
     np.testing.assert_allclose(camera.lift(pixels)[seen], rays[seen], rtol=0, atol=1e-8)
 
 
-def test_the_axis_is_seen_at_the_centre_and_nonsense_nowhere(camera: OmniCamera) -> None:
+def test_projects_the_axis_to_the_centre_and_invalid_points_to_nan(camera: OmniCamera) -> None:
     axis = camera.lift(np.array([camera.center]))
     assert abs(axis[0, 2]) == pytest.approx(1, abs=1e-6)
     np.testing.assert_allclose(camera.project(3 * axis), [camera.center], rtol=0, atol=1e-6)
@@ -65,7 +65,7 @@ def test_the_axis_is_seen_at_the_centre_and_nonsense_nowhere(camera: OmniCamera)
     assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
 
 
-def test_omni_by_hand() -> None:
+def test_omni_projection_equals_the_equations() -> None:
     camera = UnifiedCamera(0.5, (-200.0, 300.0), (100.0, 50.0), (640, 480), (0.1, 0.2, 0.01, 0.02))
     mx, my = (2 / 3) / (1 / 3 + 0.5), (-2 / 3) / (1 / 3 + 0.5)  # of the unit ray (2, -2, 1) / 3
     r2 = mx * mx + my * my
@@ -76,14 +76,14 @@ def test_omni_by_hand() -> None:
     np.testing.assert_allclose(pixel, [100 - 200 * x, 50 + 300 * y], rtol=0, atol=1e-9)
 
 
-def test_omni_without_xi_is_a_pinhole_and_a_half_sphere() -> None:
+def test_omni_with_xi_zero_is_a_pinhole() -> None:
     camera = UnifiedCamera(0.0, (100.0, 110.0), (50.0, 60.0), (640, 480))
     np.testing.assert_allclose(camera.project(np.array([[1.0, 2.0, 4.0]])), [[75.0, 115.0]])
     assert np.isnan(camera.project(np.array([[1.0, 2.0, -0.1]]))).all()
 
 
 @pytest.mark.parametrize(("view", "sign"), [("mirror", 1.0), ("direct", -1.0)])
-def test_ocam_by_hand(view: str, sign: float) -> None:
+def test_ocam_projection_equals_the_equations(view: str, sign: float) -> None:
     camera = OcamCamera((-100.0, 0.0, 0.002), (240.0, 320.0), (1.01, 0.02, -0.03), (640, 480),
                         "mirror" if view == "mirror" else "direct")
     x, y = 60.0, -80.0  # rho = 100, f = -100 + 20 = -80
@@ -94,7 +94,7 @@ def test_ocam_by_hand(view: str, sign: float) -> None:
     assert camera.center == (320.0, 240.0)
 
 
-def test_ocam_ends_where_two_radii_would_share_a_ray() -> None:
+def test_ocam_ends_at_the_radius_where_rays_repeat() -> None:
     camera = OcamCamera((-100.0, 0.0, 1e-3, 0.0, -1e-8), (300.0, 300.0), (1.0, 0.0, 0.0), (600, 600))
     low, high = 0.0, 600.0
     for _ in range(60):
@@ -107,8 +107,8 @@ def test_ocam_ends_where_two_radii_would_share_a_ray() -> None:
     assert np.isnan(camera.project(beyond[None])).all()
 
 
-def test_ocam_agrees_with_the_toolbox_on_its_own_corners(shared_data: Path) -> None:
-    """The reprojection error of a board that the toolbox itself has placed is the one it reports."""
+def test_ocam_reproduces_the_toolbox_reprojection_errors(shared_data: Path) -> None:
+    """The reprojection error of the toolbox's own board poses is the one that the toolbox reports."""
     found = json.loads((shared_data / "vmr_board" / "reference.json").read_text())["ocam_subpix"]
     camera = OcamCamera(tuple(found["ss"]), (found["xc_row_1based"] - 1, found["yc_col_1based"] - 1),
                         (found["c"], found["d"], found["e"]), (found["width"], found["height"]), "direct")
@@ -123,13 +123,13 @@ def test_ocam_agrees_with_the_toolbox_on_its_own_corners(shared_data: Path) -> N
 @pytest.mark.parametrize("change", [
     {"polynomial": ()}, {"polynomial": (1.0, 0.0)}, {"polynomial": (math.nan,)}, {"affine": (0.0, 0.0, 1.0)},
     {"size": (0, 4)}, {"view": "window"}])
-def test_ocam_refuses_what_is_no_camera(change: dict[str, object]) -> None:
+def test_ocam_refuses_invalid_parameters(change: dict[str, object]) -> None:
     values = {"polynomial": (-100.0,), "center_row_column": (1.0, 1.0), "affine": (1.0, 0.0, 0.0), "size": (4, 4)}
     with pytest.raises(CalibError):
         OcamCamera(**{**values, **change})  # type: ignore[arg-type]
 
 
-def test_a_mask_is_a_ring_without_what_its_image_blanks_out() -> None:
+def test_mask_is_a_ring_without_the_zero_pixels_of_its_image() -> None:
     image = np.full((40, 60), 255, np.uint8)
     image[:, 40] = 0
     mask = Mask((30.0, 20.0), 3.0, 15.0, image)
@@ -139,8 +139,8 @@ def test_a_mask_is_a_ring_without_what_its_image_blanks_out() -> None:
     assert inscribed_mask(CAMERAS["omni xi 1.0"]).outer_px == pytest.approx(379.0)
 
 
-def test_field_of_view_of_a_parabolic_mirror_by_hand() -> None:
-    """A ring of radius rho on a parabola of focal length f is seen at 2 atan(rho / f) from its axis."""
+def test_field_of_view_of_a_parabolic_mirror() -> None:
+    """A ring of radius rho of a parabolic mirror of focal length f lies at 2 atan(rho / f) from the axis."""
     camera = UnifiedCamera(1.0, (-200.0, 200.0), (400.0, 380.0), (800, 760))
     nearest, farthest = field_of_view(camera, Mask((400.0, 380.0), 60.0, 340.0))
     assert nearest == pytest.approx(2 * math.atan(60 / 200), abs=1e-9)

@@ -1,4 +1,4 @@
-"""`omnid calibrate`: files in, files out, one line printed, errors before work."""
+"""`omnid calibrate import` and `export`: files, printed line, errors before files are written."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def omnid(*words: object) -> int:
     return status
 
 
-def test_kalibr_in_and_out(omni_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_imports_and_exports_kalibr_files(omni_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "k.yaml").write_text(export_kalibr(omni_rig))
     assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
-    assert f"baseline {omni_rig.baseline_m * 1e3:.1f} mm" in line and "upper turned by 14.4" in line
+    assert f"baseline {omni_rig.baseline_m * 1e3:.1f} mm" in line and "upper rotated by 14.4" in line
     assert "lower omni 768x770, 0 to 117 deg from its axis (/front/lower/image_raw), upper omni 780x768, 0 to " in line
     assert omnid("export", tmp_path / "rig.toml", "--format", "kalibr", "-o", tmp_path / "again.yaml") == 0
     assert omnid("import", tmp_path / "again.yaml", "-o", tmp_path / "again.toml") == 0
@@ -39,10 +39,10 @@ def test_kalibr_in_and_out(omni_rig: Rig, tmp_path: Path, capsys: pytest.Capture
     assert read_rig(tmp_path / "swapped.toml").lower.camera == omni_rig.upper.camera
 
 
-def test_ocam_in_and_out(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_imports_and_exports_ocam_files(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_rig(tmp_path / "rig.toml", ocam_rig)
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "o") == 0
-    assert "left out, as the format has no place for it: T_base_rig" in capsys.readouterr().out
+    assert "left out, because the format does not support it: T_base_rig" in capsys.readouterr().out
     files = ["--lower", tmp_path / "o.lower.txt", "--upper", tmp_path / "o.upper.txt"]
     assert omnid("import", *files, "--transform", tmp_path / "o.transform.toml", "-o", tmp_path / "again.toml") == 0
     again = read_rig(tmp_path / "again.toml")
@@ -50,14 +50,14 @@ def test_ocam_in_and_out(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFi
     np.testing.assert_allclose(again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
                                ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig), atol=1e-11)
     assert omnid("import", *files, "--baseline", 0.2, "--view", "direct", "-o", tmp_path / "up.toml") == 0
-    assert "upper ocam direct 1000x780, 0 to 118 deg from its axis, baseline 200.0 mm, upper turned by 0.00 deg" in \
+    assert "upper ocam direct 1000x780, 0 to 118 deg from its axis, baseline 200.0 mm, upper rotated by 0.00 deg" in \
         capsys.readouterr().out
     (tmp_path / "folder").mkdir()
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
     assert (tmp_path / "folder" / "calib_results.upper.txt").read_text() == export_ocam(ocam_rig.upper.camera)
 
 
-def test_what_cannot_be_done_is_said_before_anything_is_written(omni_rig: Rig, ocam_rig: Rig, tmp_path: Path) -> None:
+def test_invalid_requests_fail_before_files_are_written(omni_rig: Rig, ocam_rig: Rig, tmp_path: Path) -> None:
     write_rig(tmp_path / "omni.toml", omni_rig)
     write_rig(tmp_path / "ocam.toml", ocam_rig)
     (tmp_path / "k.yaml").write_text(export_kalibr(omni_rig))

@@ -1,4 +1,4 @@
-"""`omnid calibrate camera`: from rendered images to camera.toml, report and mask; bad input is one clear line."""
+"""`omnid calibrate camera`: camera.toml, report and mask from rendered images; one-line errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from tests.simulation.boards import Studio, around
+from tests.simulation.boards import BoardRenderer, board_poses_around_camera
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-110.0, 110.5), (178.3, 181.1), (360, 362))
@@ -26,11 +26,11 @@ MASK = Mask(CAMERA.center, 30.0, 172.0)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight images of a board, all around."""
+    """Render eight images of a board on all sides."""
     made = tmp_path_factory.mktemp("images")
-    studio = Studio.of(BOARD, CAMERA, MASK)
-    for seed, T in enumerate(around(CAMERA, BOARD, MASK, 8, distance_m=(0.14, 0.25))):
-        cv2.imwrite(str(made / f"p{seed}.png"), studio.photograph(T, seed=seed).image)
+    renderer = BoardRenderer.of(BOARD, CAMERA, MASK)
+    for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, 8, distance_m=(0.14, 0.25))):
+        cv2.imwrite(str(made / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
     return made
 
 
@@ -38,7 +38,7 @@ def run(*words: object, corners: str = "6x5") -> int:
     return main(["calibrate", "camera", *map(str, words), "--corners", corners, "--square-mm", "30", "--quiet"])
 
 
-def test_images_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path,
+def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path,
                                                     capsys: pytest.CaptureFixture[str]) -> None:
     out, report, mask = (tmp_path / name for name in ("camera.toml", "report.html", "mask.png"))
     assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
@@ -55,7 +55,7 @@ def test_images_give_a_camera_a_report_and_a_mask(folder: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_patterns_and_the_omni_model_with_a_image_that_has_no_board(folder: Path, tmp_path: Path,
+def test_calibrates_an_omni_camera_by_a_pattern_with_a_blank_image(folder: Path, tmp_path: Path,
                                                                       capsys: pytest.CaptureFixture[str]) -> None:
     for path in folder.iterdir():
         shutil.copy(path, tmp_path)
@@ -67,7 +67,7 @@ def test_patterns_and_the_omni_model_with_a_image_that_has_no_board(folder: Path
 
 
 def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
-    """The images of a folder as PNG messages on every topic."""
+    """Write the images of a folder as PNG messages on every topic."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds = store.types
     with LogWriter(path) as writer:
@@ -81,18 +81,18 @@ def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
 
 
 @pytest.mark.slow
-def test_a_log_gives_the_same_camera_and_asks_for_the_topic(folder: Path, tmp_path: Path,
+def test_calibrates_by_a_log_and_requires_the_topic(folder: Path, tmp_path: Path,
                                                             capsys: pytest.CaptureFixture[str]) -> None:
     log_of(folder, tmp_path / "log.mcap", ("/lower", "/upper"))
     assert run(tmp_path / "log.mcap", "-o", tmp_path / "camera.toml") == 2
-    assert "expected --topic, to say which camera, found image topics /lower, /upper" in capsys.readouterr().err
+    assert "expected --topic, to select the camera, found image topics /lower, /upper" in capsys.readouterr().err
     assert run(tmp_path / "log.mcap", "--topic", "/upper", "--model", "omni", "-o", tmp_path / "camera.toml") == 0
     assert "of 8 views" in capsys.readouterr().out
     assert read_camera(tmp_path / "camera.toml").camera.center == pytest.approx(CAMERA.center, abs=0.3)
 
 
 def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
-    """Words that name bad input."""
+    """Return arguments with invalid input."""
     three = [folder / f"p{number}.png" for number in range(3)]
     blank, other, text = tmp_path / "blank.png", tmp_path / "other.png", tmp_path / "notes.png"
     cv2.imwrite(str(blank), np.full((362, 360), 90, np.uint8))
@@ -107,12 +107,12 @@ def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
 
 @pytest.mark.parametrize(("kind", "says"), [
     ("blank", "no board of 6x5 inner corners in any of 1 images; count the inner corners"),
-    ("three", "needs 4 views of the board at least, found 3; take more images"),
+    ("three", "expected at least 4 views of the board, found 3; take more images"),
     ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
-    ("text", "notes.png: expected a image"),
+    ("text", "notes.png: expected an image"),
     ("empty", "no image"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
 ])
-def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*bad_folder(tmp_path, folder, kind), "-o", tmp_path / "camera.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -120,14 +120,14 @@ def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kin
     assert not (tmp_path / "camera.toml").exists()
 
 
-def test_the_wrong_count_is_told_the_right_one(folder: Path, tmp_path: Path,
+def test_suggests_the_right_number_of_corners(folder: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     assert run(folder / "p0.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
-    assert "a grid of 5x6 was seen in 1: try --corners 5x6" in capsys.readouterr().err
+    assert "a grid of 5x6 was found in 1: try --corners 5x6" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"], ["--corners", "6x5"]])
-def test_bad_options_are_one_line_too(folder: Path, tmp_path: Path, words: list[str],
+def test_invalid_options_are_one_line(folder: Path, tmp_path: Path, words: list[str],
                                       capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["calibrate", "camera", str(folder), *words, "-o", str(tmp_path / "c.toml")])

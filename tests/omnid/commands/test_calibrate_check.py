@@ -1,4 +1,4 @@
-"""`omnid calibrate check` on rendered logs: a good rig is called good, a wrong one found out and put right."""
+"""`omnid calibrate check` on rendered logs: good, drifted and broken rigs, correction of the drift."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.log_rig_check import RigCheckResult, look, open_log, read_pairs_of
+from omnid.calibration.log_rig_check import RigCheckResult, check_rig, open_log, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
-from tests.simulation.rigs import misturned
+from tests.simulation.rigs import with_upper_rotated
 
 Turn = tuple[float, float, float]
 
@@ -24,59 +24,60 @@ Turn = tuple[float, float, float]
 @pytest.fixture(scope="module")
 def pairs(scene: Path) -> list[FramePair]:
     rig = read_rig(scene / "rig.toml")
-    return read_pairs_of(open_log(scene / "log.mcap", (None, None), rig), rig)
+    return read_rig_pairs(open_log(scene / "log.mcap", (None, None), rig), rig)
 
 
-def looked(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
-    return look(pairs, misturned(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
+def check_rotated(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
+    return check_rig(pairs, with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
 
 
-def test_a_good_rig_is_called_good(scene: Path, pairs: list[FramePair]) -> None:
-    found = looked(scene, pairs, (0, 0, 0))
+def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
+    found = check_rotated(scene, pairs, (0, 0, 0))
     assert found.good and found.finding.verdict == "good" and found.finding.turn_deg < 0.05
     assert abs(found.finding.offset_px) < 0.03 and found.finding.left_px < 0.15 and None not in found.rims
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0, 0, -0.5)])
-def test_half_a_degree_is_found_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
-    found = looked(scene, pairs, turn_deg).finding
+def test_measures_half_a_degree_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
+    found = check_rotated(scene, pairs, turn_deg).finding
     assert found.verdict == "drifted" and found.drift is not None
     assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05)
 
 
-def test_a_turn_about_the_vertical_shows_all_around_and_a_tilt_as_a_wave(scene: Path, pairs: list[FramePair]) -> None:
-    turned, tilted = (looked(scene, pairs, turn).finding for turn in ((0.0, 0.0, 2.0), (0.0, 2.0, 0.0)))
+def test_rotation_about_the_vertical_is_constant_and_a_tilt_a_wave(scene: Path, pairs: list[FramePair]) -> None:
+    turned, tilted = (check_rotated(scene, pairs, turn).finding for turn in ((0.0, 0.0, 2.0), (0.0, 2.0, 0.0)))
     medians = [np.array([median for _, median, count in found.by_azimuth if count > 10]) for found in (turned, tilted)]
     assert medians[0].min() > 1.5 and np.ptp(medians[0]) < 0.5
     assert medians[1].min() < -0.2 and medians[1].max() > 0.2
 
 
-def test_many_degrees_are_still_measured(scene: Path, pairs: list[FramePair]) -> None:
-    found = looked(scene, pairs, (0.0, 0.0, 11.0)).finding
+def test_measures_many_degrees(scene: Path, pairs: list[FramePair]) -> None:
+    found = check_rotated(scene, pairs, (0.0, 0.0, 11.0)).finding
     assert found.verdict == "broken" and found.turn_deg == pytest.approx(11.0, abs=0.1)
 
 
-def test_what_is_far_off_is_broken(scene: Path, pairs: list[FramePair]) -> None:
-    assert looked(scene, pairs, (0, 3.0, 0)).finding.verdict == "broken"
+def test_reports_large_errors_as_broken(scene: Path, pairs: list[FramePair]) -> None:
+    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.verdict == "broken"
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
-    assert not looked(scene, exchanged, (0, 0, 0)).good
+    assert not check_rotated(scene, exchanged, (0, 0, 0)).good
 
 
 def run(*words: object) -> int:
     return main(["calibrate", "check", *map(str, words)])
 
 
-def test_the_command_says_so_and_puts_it_right(scene: Path, tmp_path: Path,
+def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     log, wrong, right = scene / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
     truth = read_rig(scene / "rig.toml")
-    write_rig(wrong, misturned(truth, (0.6, -0.4, 1.5)))
+    write_rig(wrong, with_upper_rotated(truth, (0.6, -0.4, 1.5)))
     assert run(log, "--rig", scene / "rig.toml") == 0
     assert capsys.readouterr().out.startswith("good: ")
     assert run(log, "--rig", wrong, "--refine", "-o", right) == 1
-    said = capsys.readouterr().out
-    assert said.startswith("drifted: ") and "turned by 1.6" in said and "about z" in said and "lower rim: " in said
-    assert "not to be known without a board: the baseline's length" in said
+    output = capsys.readouterr().out
+    assert output.startswith("drifted: ") and "lower rim: " in output
+    assert "rotated by 1.6" in output and "about z" in output
+    assert "not observable without a board: the length of the baseline" in output
     again = read_rig(right)
     gap = again.upper.T_cam_rig @ se3.inverse(truth.upper.T_cam_rig)
     assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
@@ -84,7 +85,7 @@ def test_the_command_says_so_and_puts_it_right(scene: Path, tmp_path: Path,
     assert run(log, "--rig", right) == 0
 
 
-def test_a_camera_whose_centre_is_off_is_to_be_calibrated_anew(scene: Path, tmp_path: Path,
+def test_recommends_recalibration_for_a_shifted_centre(scene: Path, tmp_path: Path,
                                                                capsys: pytest.CaptureFixture[str]) -> None:
     rig = read_rig(scene / "rig.toml")
     camera = rig.upper.camera
@@ -92,18 +93,18 @@ def test_a_camera_whose_centre_is_off_is_to_be_calibrated_anew(scene: Path, tmp_
     off = replace(camera, center=(camera.center[0] + 2.0, camera.center[1]))
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, camera=off)))
     assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
-    assert "calibrate anew with a board" in capsys.readouterr().out
+    assert "calibrate again with a board" in capsys.readouterr().out
 
 
-def test_a_mask_beyond_the_rim_is_told(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = read_rig(scene / "rig.toml")
     assert rig.lower.mask is not None
     u, v = rig.lower.mask.center
     write_rig(tmp_path / "rig.toml", replace(rig, lower=replace(rig.lower, mask=Mask((u + 9, v), 0.0,
                                                                                    rig.lower.mask.outer_px))))
     assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
-    said = capsys.readouterr().out
-    assert said.startswith("drifted: ") and "lower rim: centre moved by -9.0" in said and "upper rim" in said
+    output = capsys.readouterr().out
+    assert output.startswith("drifted: ") and "lower rim: centre moved by -9.0" in output and "upper rim" in output
 
 
 @pytest.mark.parametrize(("words", "says"), [
@@ -111,13 +112,14 @@ def test_a_mask_beyond_the_rim_is_told(scene: Path, tmp_path: Path, capsys: pyte
     (["--refine"], "--refine and -o go together"), (["-o", "rig.toml"], "--refine and -o go together"),
     (["--lower", "/x"], "no topic '/x'"),
 ])
-def test_bad_input_is_one_line(scene: Path, words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_input_is_one_line(scene: Path, words: list[str], says: str,
+                                   capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scene / "log.mcap", *words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert says in line
 
 
-def test_images_of_another_size_are_one_line(scene: Path, tmp_path: Path,
+def test_images_of_another_size_are_a_one_line_error(scene: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     text = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
     (tmp_path / "rig.toml").write_text(text)
@@ -125,7 +127,7 @@ def test_images_of_another_size_are_one_line(scene: Path, tmp_path: Path,
     assert "images are 256x256 px, the rig's are 300x256" in capsys.readouterr().err
 
 
-def test_a_dark_log_tells_nothing(scene: Path, pairs: list[FramePair]) -> None:
+def test_dark_log_is_unknown(scene: Path, pairs: list[FramePair]) -> None:
     dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
-    found = looked(scene, dark, (0, 0, 0))
+    found = check_rotated(scene, dark, (0, 0, 0))
     assert found.finding.verdict == "unknown" and found.rims == (None, None)

@@ -1,4 +1,4 @@
-"""`omnid calibrate rig`: from rendered pairs of images to rig.toml and report; bad input is one clear line."""
+"""`omnid calibrate rig`: rig.toml and report from rendered pairs of images; one-line errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from tests.simulation.boards import Studio, around_both
+from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 from tests.simulation.sensor import Sensor
 
 BOARD = Board(7, 6, 0.03)
@@ -29,7 +29,7 @@ PAIRS = 7
 
 
 def rig_of(size: int) -> Rig:
-    """A rig whose upper camera is turned about every axis, with images of size x size."""
+    """Return a rig whose upper camera is rotated about every axis, with images of size x size."""
     scale, mounted = size / 768, []
     for xi, focal, center, T in ((0.93, (-205.0, 206.2), (384.2, 380.9), np.eye(4)),
                                  (0.97, (-208.0, 207.2), (381.2, 385.9), T_UPPER_LOWER)):
@@ -43,13 +43,13 @@ TRUTH = rig_of(480)
 LOWER, UPPER = TRUTH.lower.camera, TRUTH.upper.camera
 
 
-def photographed(rig: Rig, folder: Path, count: int) -> Path:
-    """Pairs of images of a board, all around, and the cameras' files."""
-    studios = {"lower": Studio(BOARD, rig.lower), "upper": Studio(BOARD, rig.upper)}
-    for seed, T in enumerate(around_both(rig, BOARD, count, distance_m=(0.2, 0.42))):
-        for name, studio in studios.items():
-            shot = studio.photograph(T, seed=seed, sensor=Sensor(noise_sigma=1.0))
-            cv2.imwrite(str(folder / f"{name}_{seed:02d}.png"), shot.image)
+def render_pairs(rig: Rig, folder: Path, count: int) -> Path:
+    """Render pairs of images of a board on all sides, and write the cameras' files."""
+    renderers = {"lower": BoardRenderer(BOARD, rig.lower), "upper": BoardRenderer(BOARD, rig.upper)}
+    for seed, T in enumerate(board_poses_around_rig(rig, BOARD, count, distance_m=(0.2, 0.42))):
+        for name, renderer in renderers.items():
+            rendered = renderer.render_board(T, seed=seed, sensor=Sensor(noise_sigma=1.0))
+            cv2.imwrite(str(folder / f"{name}_{seed:02d}.png"), rendered.image)
     for name, mounted in (("lower", rig.lower), ("upper", rig.upper)):
         (folder / f"{name}.toml").write_text(camera_toml(CameraFile(mounted.camera, mounted.mask)))
     return folder
@@ -57,14 +57,14 @@ def photographed(rig: Rig, folder: Path, count: int) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven pairs of small images."""
-    return photographed(TRUTH, tmp_path_factory.mktemp("pairs"), PAIRS)
+    """Render seven pairs of small images."""
+    return render_pairs(TRUTH, tmp_path_factory.mktemp("pairs"), PAIRS)
 
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sixteen pairs of larger ones."""
-    return photographed(rig_of(640), tmp_path_factory.mktemp("many"), 16)
+    """Render sixteen pairs of larger images."""
+    return render_pairs(rig_of(640), tmp_path_factory.mktemp("many"), 16)
 
 
 def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
@@ -73,7 +73,7 @@ def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
 
 @pytest.fixture(scope="module")
 def four(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first four pairs."""
+    """Return a folder with the first four pairs."""
     made = tmp_path_factory.mktemp("four")
     for path in folder.glob("*_0[0-3].png"):
         shutil.copy(path, made)
@@ -94,12 +94,12 @@ def turn_off_deg(rig: Rig) -> float:
 
 
 @pytest.mark.slow
-def test_images_alone_give_cameras_and_rig_as_they_are(many: Path, tmp_path: Path,
+def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path,
                                                          capsys: pytest.CaptureFixture[str]) -> None:
     out, report = tmp_path / "rig.toml", tmp_path / "report.html"
     assert run(many, "-o", out, "--model", "omni", "--report", report, "--expected-baseline-mm", "180") == 0
-    said = capsys.readouterr()
-    assert said.out.count("\n") == 1 and "16 pairs" in said.out and said.err == ""
+    output = capsys.readouterr()
+    assert output.out.count("\n") == 1 and "16 pairs" in output.out and output.err == ""
     found = read_rig(out)
     assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
     for mounted, truth in ((found.lower, rig_of(640).lower.camera), (found.upper, rig_of(640).upper.camera)):
@@ -112,7 +112,7 @@ def test_images_alone_give_cameras_and_rig_as_they_are(many: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_polynomial_model_gives_the_same_rig(many: Path, tmp_path: Path) -> None:
+def test_recovers_the_rig_with_the_polynomial_model(many: Path, tmp_path: Path) -> None:
     assert run(many, "-o", tmp_path / "rig.toml", "--mask") == 0
     found = read_rig(tmp_path / "rig.toml")
     assert found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
@@ -125,7 +125,7 @@ def test_the_polynomial_model_gives_the_same_rig(many: Path, tmp_path: Path) -> 
 
 @pytest.fixture
 def alone(folder: Path, tmp_path: Path) -> Path:
-    """The pairs, of which the lower camera saw one alone, as its image has no partner, and the upper another."""
+    """Return the pairs, without one upper image, and with a blank lower image of another pair."""
     for path in folder.glob("*.png"):
         shutil.copy(path, tmp_path)
     (tmp_path / "upper_05.png").unlink()
@@ -133,28 +133,28 @@ def alone(folder: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_what_one_camera_saw_alone_serves_its_own_fit(folder: Path, alone: Path,
+def test_views_of_one_camera_are_used_if_cameras_are_refined(folder: Path, alone: Path,
                                                       capsys: pytest.CaptureFixture[str]) -> None:
     words = [*given(folder), "--refine-cameras", "--report", alone / "report.html"]
     assert run(alone, "-o", alone / "rig.toml", *words) == 0
-    said = capsys.readouterr()
-    assert said.out.endswith("5 pairs, 2 views of one camera alone\n") and said.err == ""
+    output = capsys.readouterr()
+    assert output.out.endswith("5 pairs, 2 views of one camera alone\n") and output.err == ""
     assert "not seen" in (alone / "report.html").read_text() and turn_off_deg(read_rig(alone / "rig.toml")) < 0.05
 
 
-def test_given_cameras_are_taken_as_they_are_and_what_one_saw_alone_is_named(
+def test_given_cameras_are_kept_and_single_views_rejected(
         folder: Path, alone: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(alone, "-o", alone / "rig.toml", *given(folder)) == 0
-    found, said = read_rig(alone / "rig.toml"), capsys.readouterr()
+    found, output = read_rig(alone / "rig.toml"), capsys.readouterr()
     assert found.lower.camera == LOWER and found.upper.camera == UPPER and found.lower.mask == TRUTH.lower.mask
     assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
-    assert said.out.endswith("5 pairs\n")
-    assert [line[:45] for line in said.err.splitlines()] == ["warning: left out 05: only the lower camera s",
+    assert output.out.endswith("5 pairs\n")
+    assert [line[:45] for line in output.err.splitlines()] == ["warning: left out 05: only the lower camera s",
                                                              "warning: left out 06: only the upper camera s"]
 
 
 def log_of(folder: Path, path: Path) -> None:
-    """The pairs as PNG messages, the upper camera 2 ms late, with a lone image between."""
+    """Write the pairs as PNG messages, the upper camera 2 ms later, with an unpaired image between."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds, schema = store.types, "sensor_msgs/msg/CompressedImage"
     with LogWriter(path) as writer:
@@ -166,7 +166,7 @@ def log_of(folder: Path, path: Path) -> None:
                 writer.write(f"/{name}/image", schema, bytes(cdr), (k + 1) * 10**9 + late_ns)
 
 
-def test_a_log_is_paired_by_its_stamps(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_a_log_by_its_stamps(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log_of(folder, tmp_path / "log.mcap")
     assert run(tmp_path / "log.mcap", "-o", tmp_path / "rig.toml", *given(folder)) == 0
     assert re.search(r"[67] pairs\n", capsys.readouterr().out)
@@ -175,7 +175,7 @@ def test_a_log_is_paired_by_its_stamps(folder: Path, tmp_path: Path, capsys: pyt
 
 
 def bad(folder: Path, made: Path, kind: str) -> list[object]:
-    """Words that name bad input: a folder of three pairs, spoilt."""
+    """Return arguments with invalid input: a folder of three pairs with a fault."""
     blank = np.full((480, 480), 90, np.uint8)
     for name in ("lower", "upper"):
         for k in range(3):
@@ -208,15 +208,15 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
 
 
 @pytest.mark.parametrize(("kind", "says"), [
-    ("three", "needs 4 views of the board at least, found 3"),
+    ("three", "expected at least 4 views of the board, found 3"),
     ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
-    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected a image"),
-    ("one side", "no images upper_*"), ("unpaired", "no two images of one instant: 3 of the lower camera, 3 of"),
+    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected an image"),
+    ("one side", "no images upper_*"), ("unpaired", "no pair of images: found 3 of the lower camera, 3 of"),
     ("missing", "found nothing"), ("one camera", "expected both --lower-camera and --upper-camera"),
-    ("size of camera", "--lower-camera: it is of 640x480 px, the lower images are 480x480"),
+    ("size of camera", "--lower-camera: expected a camera of 480x480 px like the lower images, found 640x480 px"),
     ("topic", "only a log has topics"),
 ])
-def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*bad(folder, tmp_path, kind), "-o", tmp_path / "rig.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -224,12 +224,12 @@ def test_bad_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kin
 
 
 @pytest.mark.parametrize(("square_mm", "words", "says"), [
-    (25, ["--expected-baseline-mm", "180"], "with squares of 29.97 mm it would be so"),
-    (0.3, [], "a baseline of 1.802 mm came out, expected 10 to 3000 mm"),
+    (25, ["--expected-baseline-mm", "180"], "squares of 29.97 mm would explain it"),
+    (0.3, [], "expected a baseline of 10 to 3000 mm, found 1.802 mm"),
     (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
     (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),
 ])
-def test_a_wrong_square_is_told_by_the_baseline(folder: Path, four: Path, tmp_path: Path, square_mm: float,
+def test_detects_a_wrong_square_by_the_baseline(folder: Path, four: Path, tmp_path: Path, square_mm: float,
                                                 words: list[str], says: str,
                                                 capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rig.toml"
@@ -238,7 +238,7 @@ def test_a_wrong_square_is_told_by_the_baseline(folder: Path, four: Path, tmp_pa
     assert says in line and not out.exists()
 
 
-def test_the_wrong_count_is_told_the_right_one(folder: Path, four: Path, tmp_path: Path,
+def test_suggests_the_right_number_of_corners(folder: Path, four: Path, tmp_path: Path,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     for path in four.glob("*_0[0-3].png"):
         if path.name.endswith(("_00.png", "_01.png")):

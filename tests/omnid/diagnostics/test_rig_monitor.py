@@ -23,7 +23,7 @@ from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import Synchronise
 from tests.simulation import build, write_log
 from tests.simulation.logs import PERIOD_NS
-from tests.simulation.rigs import misturned
+from tests.simulation.rigs import with_upper_rotated
 
 SECONDS = 10**9
 LOOK_S = 5.0
@@ -82,7 +82,7 @@ def test_a_true_rig_is_good(true: tuple[RigMonitor, Kept]) -> None:
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
 def test_half_a_degree_is_a_warning(rooms: Path, turn_deg: tuple[float, float, float]) -> None:
-    watch, _ = watched(rooms, misturned(read_rig(rooms / "rig.toml"), turn_deg))
+    watch, _ = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), turn_deg))
     status = watch.status()
     assert status.level == 1 and status.message.startswith("drifted: ") and watch.finding and watch.finding.drift
     assert np.rad2deg(watch.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
@@ -90,7 +90,7 @@ def test_half_a_degree_is_a_warning(rooms: Path, turn_deg: tuple[float, float, f
 
 
 def test_three_degrees_are_an_error(rooms: Path) -> None:
-    status = watched(rooms, misturned(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0].status()
+    status = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0].status()
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
@@ -115,7 +115,7 @@ def test_it_looks_no_more_often_than_it_is_told_to(true: tuple[RigMonitor, Kept]
 
 
 def test_a_rig_that_was_knocked_on_the_way_is_noticed(rooms: Path, true: tuple[RigMonitor, Kept]) -> None:
-    _, after = watched(rooms, misturned(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
+    _, after = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
     watch = fed(true, [*true[1], *after, *after])  # on the same round, where every place has been seen
     assert watch.finding is not None and watch.status().level == 1
     assert watch.finding.turn_deg == pytest.approx(0.5, abs=0.05)

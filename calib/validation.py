@@ -1,4 +1,4 @@
-"""Values out of parsed TOML or YAML, checked: an error names the file, the dotted key, what was found and expected."""
+"""Validation of parsed TOML and YAML: errors name the file, the dotted key, the expected and the found value."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Array
 
-# Larger than any calibration with two embedded masks; what is larger is not one.
+# Larger than any calibration with two embedded masks.
 MAX_FILE_BYTES = 16_000_000
 SHOWN_CHARACTERS = 80
-# A rotation typed with few digits is made exactly one; what a program wrote is left bit for bit.
+MAX_SIDE_PX = 32767
+# Larger numbers would overflow in products.
+MAX_NUMBER = 1e300
+# A rotation typed with few digits is made orthonormal; one that a program wrote is not changed.
 ORTHONORMAL_TOLERANCE = 1e-9
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a calibration file of sane size."""
+    """Read a calibration file of at most MAX_FILE_BYTES."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)
@@ -34,7 +37,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def decode(data: bytes | str, name: str) -> str:
-    """The text of a calibration file, UTF-8."""
+    """Return the text of a calibration file, UTF-8."""
     try:
         return data if isinstance(data, str) else data.decode()
     except UnicodeDecodeError as error:
@@ -42,58 +45,58 @@ def decode(data: bytes | str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """The value on one short line."""
+    """Return the value's representation, shortened to one line."""
     text = repr(value)
     return text if len(text) <= SHOWN_CHARACTERS else text[:SHOWN_CHARACTERS] + " ..."
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """One table of a file: typed look-ups that raise CalibError; path is its dotted name, "" at the top."""
+class ValidatedTable:
+    """A table of a file with typed look-ups that raise CalibError; path is its dotted name, "" at the top."""
 
     values: Mapping[Any, Any]
     file: str
     path: str = ""
 
     def fail(self, key: str, expected: str) -> NoReturn:
-        """Refuse the value of a key."""
+        """Raise CalibError for the value of a key."""
         found = shown(self.values[key]) if key in self.values else "nothing"
         raise CalibError(f"{self.file}: {self._dotted(key)}: expected {expected}, found {found}")
 
-    def only(self, known: Collection[str]) -> None:
-        """Refuse keys that nobody reads: a misspelt one must not pass for its default."""
+    def allow_only(self, known: Collection[str]) -> None:
+        """Raise CalibError for unknown keys: a misspelt one must not stand for its default."""
         unknown = [str(key) for key in self.values if key not in known]
         if unknown:
             raise CalibError(f"{self.file}: {self._dotted(repr(unknown[0])[1:-1][:SHOWN_CHARACTERS])}: unknown key, "
                              f"expected one of {', '.join(sorted(known))}")
 
     def has(self, key: str) -> bool:
-        """Whether the key is there."""
+        """True if the table has the key."""
         return key in self.values
 
-    def table(self, key: str) -> Table:
-        """The table under a key."""
+    def table(self, key: str) -> ValidatedTable:
+        """Return the table under a key."""
         if not isinstance(self.values.get(key), Mapping):
             self.fail(key, "a table")
-        return Table(self.values[key], self.file, self._dotted(key))
+        return ValidatedTable(self.values[key], self.file, self._dotted(key))
 
     def text(self, key: str) -> str:
-        """The string under a key."""
+        """Return the string under a key."""
         value = self.values.get(key)
         return value if isinstance(value, str) else self.fail(key, "a string")
 
     def choice(self, key: str, options: Collection[str]) -> str:
-        """The string under a key, one of the options."""
+        """Return the string under a key, one of the options."""
         value = self.values.get(key)
         return value if isinstance(value, str) and value in options else self.fail(key, " or ".join(options))
 
     def number(self, key: str) -> float:
-        """The finite number under a key."""
+        """Return the finite number under a key."""
         value: Any = self.values.get(key)
         return float(value) if _is_number(value) else self.fail(key, "a finite number")
 
     def numbers(self, key: str, count: int = 0) -> tuple[float, ...]:
-        """The finite numbers under a key; count 0: at least one."""
+        """Return the finite numbers under a key; count 0: at least one."""
         value = self.values.get(key)
         sized = isinstance(value, list) and (len(value) == count if count else len(value) > 0)
         if not sized or not all(_is_number(item) for item in value or ()):
@@ -101,16 +104,16 @@ class Table:
         return tuple(float(item) for item in value or ())
 
     def size(self, key: str) -> tuple[int, int]:
-        """The image size (width, height) [px] under a key."""
+        """Return the image size (width, height) [px] under a key."""
         value = self.values.get(key)
         whole = isinstance(value, list) and [type(item) for item in value] == [int, int]
-        if not whole or not all(1 <= item <= 32767 for item in value or ()):
-            self.fail(key, "[width, height] in pixels, 1 to 32767")
+        if not whole or not all(1 <= item <= MAX_SIDE_PX for item in value or ()):
+            self.fail(key, f"[width, height] in pixels, 1 to {MAX_SIDE_PX}")
         width, height = value or (0, 0)
         return width, height
 
     def transform(self, key: str) -> Array:
-        """The rigid transform (4, 4) under a key."""
+        """Return the rigid transform (4, 4) under a key."""
         value = self.values.get(key)
         square = isinstance(value, list) and len(value) == 4
         if not square or not all(isinstance(row, list) and len(row) == 4 for row in value or ()):
@@ -125,7 +128,7 @@ class Table:
 
 
 def rigid(T: Array) -> Array:
-    """T (4, 4) with its rotation made orthonormal where it was written with few digits, else as it is."""
+    """Return T (4, 4) with an orthonormal rotation; T itself if its rotation is already orthonormal."""
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
         return T
@@ -134,19 +137,19 @@ def rigid(T: Array) -> Array:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
 
 
-def toml_table(text: str | bytes, name: str) -> Table:
-    """The top table of a TOML text; name stands for it in errors."""
+def toml_table(text: str | bytes, name: str) -> ValidatedTable:
+    """Parse a TOML text and return its top table; name is used in error messages."""
     try:
-        return Table(tomllib.loads(decode(text, name)), name)
+        return ValidatedTable(tomllib.loads(decode(text, name)), name)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise CalibError(f"{name}: not a TOML file: {error}") from error
 
 
-def require_schema(table: Table, version: int) -> None:
-    """Refuse a file of another version."""
+def require_schema(table: ValidatedTable, version: int) -> None:
+    """Raise CalibError for a file of another schema version."""
     found = table.values.get("schema")
     if type(found) is not int or found != version:
         table.fail("schema", f"version {version}")
