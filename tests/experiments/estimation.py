@@ -48,9 +48,13 @@ class PassThroughFilter(MotionFilter):
         return np.eye(4)
 
     def update(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> Array:
-        """Return the measured motion T_prev_curr (4, 4)."""
+        """Return the measured motion T_prev_curr (4, 4), with its rounding errors removed.
+
+        The filter makes an exact rotation of its state. Without that, a rotation that is composed and inverted by its
+        transpose would double its error with every pair.
+        """
         super().update(T_prev_curr, covariance, dt_s)
-        return T_prev_curr
+        return se3.exp(se3.log(T_prev_curr))
 
 
 class UnfilteredOdometry(VisualOdometry):

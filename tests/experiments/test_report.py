@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib import se3
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.tum import read_tum
 from omnid.runs.replay import ReplayOptions, run_log
@@ -100,9 +101,8 @@ def test_without_the_filter_the_trajectory_differs_a_little(overrides: tuple[str
 
 
 def test_the_pass_through_filter_returns_what_was_measured() -> None:
-    motion_filter, T = PassThroughFilter(), np.eye(4)
-    T[0, 3] = 0.3
-    np.testing.assert_array_equal(motion_filter.update(T, 1e-4 * np.eye(6), 0.1), T)
+    motion_filter, T = PassThroughFilter(), se3.exp([0.3, 0.0, 0.1, 0.0, 0.0, 0.2])
+    np.testing.assert_allclose(motion_filter.update(T, 1e-4 * np.eye(6), 0.1), T, atol=1e-12)
     np.testing.assert_array_equal(motion_filter.predict(0.1), np.eye(4))
 
 
