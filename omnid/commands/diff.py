@@ -1,4 +1,4 @@
-"""`omnid diff`: where two recorded runs part."""
+"""`omnid diff`: differences between two recorded runs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import logging
 import math
 from pathlib import Path
 
-AGREE, PART = 0, 1
+AGREE, DIFFER = 0, 1
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `diff` to the command line."""
-    parser = subparsers.add_parser("diff", help="where two recorded runs over the same images part; exit code 1 "
-                                   "where they do")
+    parser = subparsers.add_parser("diff", help="compare two recorded runs over the same images; exit code 1 where "
+                                   "they differ")
     parser.add_argument("a", type=Path, metavar="A.mcap", help="what `omnid run`, replay --record or listen --mcap "
                         "wrote, or any log with nav_msgs/msg/Odometry")
     parser.add_argument("b", type=Path, metavar="B.mcap", help="likewise; poses of the same stamp are compared")
@@ -25,19 +25,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "run's poses that the other must have; default %(default)s")
     parser.add_argument("--align", action="store_true", help="lay the first common pose of B on that of A: for runs "
                         "that began at different images")
-    parser.add_argument("--topic", help="that of the poses, where a recording has several")
+    parser.add_argument("--topic", metavar="TOPIC", help="the odometry topic of both, where there are several")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints what there is to say; 0 where the runs agree, 1 where they part."""
+    """Print the comparison; return 0 where the runs agree, 1 where they differ."""
     from omnid.engine.logging_setup import log_unlimited
     from omnid.monitor.robot_state import plain
     from omnid.recordings.comparison import RunComparison, Tolerance
-    from omnid.recordings.run_reader import read_run
+    from omnid.recordings.run_series import read_run_series
 
     limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
-    a, b = (read_run(path, args.topic) for path in (args.a, args.b))
+    a, b = (read_run_series(path, args.topic) for path in (args.a, args.b))
     if _identical(a.path, b.path):
         print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
         return AGREE
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in (*a.warnings, *b.warnings):
         log_unlimited(logging.WARNING, warning)
     print("\n".join(map(plain, comparison.lines())))
-    return PART if comparison.parted else AGREE
+    return DIFFER if comparison.differences else AGREE
 
 
 def _limit(args: argparse.Namespace, name: str) -> float:
@@ -59,7 +59,7 @@ def _limit(args: argparse.Namespace, name: str) -> float:
 
 
 def _identical(a: Path, b: Path) -> bool:
-    """Whether both files hold the same bytes."""
+    """True if both files hold the same bytes."""
     import filecmp
 
     from omnid.errors import OmnidError
@@ -67,4 +67,4 @@ def _identical(a: Path, b: Path) -> bool:
     try:
         return filecmp.cmp(a, b, shallow=False)
     except OSError as error:
-        raise OmnidError(f"{error.filename}: cannot be read any more: {error.strerror}") from error
+        raise OmnidError(f"{error.filename}: cannot be read: {error.strerror}") from error

@@ -9,30 +9,30 @@ from pathlib import Path
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `report` to the command line."""
-    parser = subparsers.add_parser("report", help="one HTML page about a recording: its path, what went wrong")
+    parser = subparsers.add_parser("report", help="one HTML page about a recording: path, events, statistics")
     parser.add_argument("log", type=Path, metavar="LOG", help="what `omnid replay --record` or `omnid run` with "
                         "record.enabled wrote, or any MCAP with nav_msgs/msg/Odometry")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"),
                         help="default: report.html")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
-    parser.add_argument("--topic", metavar="TOPIC", help="the odometry, where there are several")
+    parser.add_argument("--topic", metavar="TOPIC", help="the odometry topic, where there are several")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Writes the page."""
+    """Write the page."""
     from calib.rig_file import write_file
     from omnid.formats.tum import read_tum
     from omnid.report.report import report_html
-    from omnid.report.report_data import read_recording
+    from omnid.report.report_data import collect_report_data
     from omnid.sinks.files import check_outputs, on_stdout
 
     inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
     check_outputs([("--output", args.output)], inputs)
     truth = read_tum(args.truth) if args.truth else None
-    recording = read_recording(args.log, args.topic, keep_poses=truth is not None)
-    html = report_html(args.log, recording, truth)
+    data = collect_report_data(args.log, args.topic, keep_poses=truth is not None)
+    html = report_html(args.log, data, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
-    spoken = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
-    print(f"{args.output}: {recording.poses.poses} poses of {recording.topic}, {len(html) / 1e6:.2f} MB", file=spoken)
+    output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
+    print(f"{args.output}: {data.poses.poses} poses of {data.topic}, {len(html) / 1e6:.2f} MB", file=output)
     return 0

@@ -31,6 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _add_log(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a log")
+    group.add_argument("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several")
     group.add_argument("--replay", action="store_true", help="compute anew from the images of a recording")
     group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
     group.add_argument("--lower", metavar="TOPIC", help="the lower camera's images; default: by name")
@@ -53,12 +54,12 @@ def run(args: argparse.Namespace) -> int:
 
     _refuse_contradictions(args)
     _require_rerun()
-    from omnid.viewer.view import check_file, place_for
+    from omnid.viewer.view import check_file, target_for
 
     config = load_config(args.config, args.overrides)
     check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
                ("the configuration that is read", args.config))
-    place = place_for(args.output, args.web)
+    place = target_for(args.output, args.web)
     return _robot(args, config, place) if args.log is None else _log(args, config, place)
 
 
@@ -67,7 +68,7 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
 
     from omnid.viewer.view import Log, show_log
 
-    log = Log(args.log, args.robot, args.replay, args.rig, (args.lower, args.upper), args.config)
+    log = Log(args.log, args.robot, args.topic, args.replay, args.rig, (args.lower, args.upper), args.config)
     return show_log(log, config, place, partial(replay_and_print, quiet=args.quiet))
 
 
@@ -84,7 +85,8 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
     from omnid.errors import OmnidError
 
     live = {"--connect": args.connect, "--seconds": args.seconds}
-    of_log = {"--replay": args.replay, "--rig": args.rig, "--lower": args.lower, "--upper": args.upper}
+    of_log = {"--topic": args.topic, "--replay": args.replay, "--rig": args.rig, "--lower": args.lower,
+              "--upper": args.upper}
     wrong = [name for name, value in (of_log if args.log is None else live).items() if value]
     if wrong:
         instead = "name a LOG as well" if args.log is None else "leave out the LOG to listen to a robot"

@@ -18,10 +18,10 @@ from calib.panorama import Cylinder
 from omnid.core.rig.rig_check import Matches, RigFinding, Verdict, judge, match, together
 from omnid.messages import Panoramas
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.status_names import RIG
 
 Array = NDArray[np.float64]
 
-NAME = "omnid: rig"
 PAIRS = 16  # views that are remembered, and how many new ones make a new finding
 # Fewer different views are no verdict. Two thumbnails that are so alike show one place: some 15 cm of a corridor.
 MIN_PLACES, ALIKE = 6, 0.8
@@ -85,15 +85,15 @@ class RigMonitor:
 
     def status(self) -> DiagnosticStatus:
         """What the newest finding says of the rig; age_s is the time in stamps since then."""
-        values = {"views": f"{self._new} new of {PAIRS}"}
+        values = {"new_views": str(self._new), "needed_views": str(PAIRS)}
         if self._found is None:
-            return DiagnosticStatus(NAME, OK, "not looked yet: that takes some driving", values)
+            return DiagnosticStatus(RIG, OK, "not looked yet: that takes some driving", values)
         finding, stamp_ns = self._found
         values |= {"verdict": finding.verdict, "turn_deg": f"{finding.turn_deg:.3f}",
                    "offset_px": f"{finding.offset_px:+.2f}", "left_px": f"{finding.left_px:.2f}",
-                   "matches": f"{finding.matches} of {finding.tried}",
+                   "matches": str(finding.matches), "tried": str(finding.tried),
                    "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
-        return DiagnosticStatus(NAME, LEVELS[finding.verdict], ADVICE[finding.verdict], values)
+        return DiagnosticStatus(RIG, LEVELS[finding.verdict], ADVICE[finding.verdict], values)
 
 
 def _thumbnail(panoramas: Panoramas) -> Array:

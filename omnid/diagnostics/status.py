@@ -1,30 +1,35 @@
-"""The state of a live daemon as diagnostics: stages, cameras, pairing, odometry, wheels; rates, drops, latencies."""
+"""Status of a live daemon as diagnostic entries: odometry, pairing, cameras, wheels and stages."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.stages.synchronise import Synchronise
+from omnid.tracking_state import TrackingState
+from omnid.transport import status_names
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.status_names import Key, time_key
 
-WANDERED_NS = 3_000_000  # of the skew of the cameras: their clocks do not run alike
-SILENT_S = 1.0  # a camera without a image, or an odometry without a pose, for longer is told
-CALM = ("", IDLE, ASKED, COMMAND_STALE)  # why wheels stand that are as they should be
-STATES = {"tracking": OK, "degraded": WARN, "lost": ERROR}
+MAX_SKEW_DRIFT_NS: Final = 3_000_000  # of the skew between the cameras: their clocks do not run alike
+TIMEOUT_S: Final = 1.0  # without an image of a camera, or without a pose
+EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons to stand that are no fault
+LEVELS: Final = {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}
+_CAMERA_COUNTERS: Final = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
+_WHEEL_COUNTERS: Final = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports")
 
 
 class Rates:
-    """Counts per second since the last time of asking."""
+    """Counts per second since the previous report."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
@@ -32,141 +37,166 @@ class Rates:
         self._span_s = math.nan
 
     def begin(self) -> None:
-        """A new time of asking."""
+        """Begin a new report."""
         now_s = time.monotonic()
         self._span_s, self._before_s = now_s - self._before_s, now_s
 
     def __call__(self, name: str, count: int) -> float:
-        """How much the count of that name has grown per second."""
+        """Return by how much the counter of that name has grown per second."""
         before, self._before[name] = self._before.get(name, 0), count
         return (count - before) / self._span_s if self._span_s > 0 else math.nan
 
 
 class StatusSources(NamedTuple):
-    """What a live run is asked about."""
+    """The parts of a live run that the report is made of."""
 
     telemetry: Telemetry
     cameras: Mapping[Camera, CameraState]
     pair: Synchronise
-    tally: RunStatistics
-    to_pose: Histogram
+    statistics: RunStatistics
+    to_pose: Histogram  # s, from the capture of images to their pose
     controller: ControllerStatistics | None
     commands: CommandReceiver | None
-    tickers: frozenset[str]  # their `dropped` are missed deadlines
-    others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that speak for themselves
+    tickers: frozenset[str]  # stages whose `dropped` are missed deadlines
+    others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that make their own entries
 
 
-class StatusReport:
-    """Asks everybody and says it in the words of diagnostic_msgs."""
+class StatusCollector:
+    """Makes the entries of all parts."""
 
-    def __init__(self, watched: StatusSources) -> None:
-        self._watched = watched
+    def __init__(self, sources: StatusSources) -> None:
+        self._sources = sources
         self._rates = Rates()
 
     def __call__(self) -> list[DiagnosticStatus]:
-        """One status for each part."""
+        """Return one entry for each part."""
         self._rates.begin()
-        w = self._watched
-        wheels = [] if w.controller is None else [self._wheels(w.controller, w.commands)]
-        others = [status() for status in w.others]
-        return [self._odometry(), self._pairing(), *self._cameras(), *wheels, *others,
-                *map(self._stage, w.telemetry.stages)]
+        sources = self._sources
+        entries = [self._odometry(), self._pairing(), *self._cameras()]
+        if sources.controller is not None:
+            entries.append(self._wheels(sources.controller, sources.commands))
+        entries += [status() for status in sources.others]
+        return entries + [self._stage(stage) for stage in sources.telemetry.stages]
 
     def _odometry(self) -> DiagnosticStatus:
-        tally, newest = self._watched.tally, self._watched.tally.newest
+        statistics, newest = self._sources.statistics, self._sources.statistics.newest
         if newest is None:
-            return DiagnosticStatus("omnid: odometry", STALE, "no pose yet", {})
+            return DiagnosticStatus(status_names.ODOMETRY, STALE, "no pose yet", {})
         age_s = (time.monotonic_ns() - newest.stamp_ns) * 1e-9
-        stale = age_s > SILENT_S
-        values = {"rate_hz": f"{self._rates('poses', tally.poses):.1f}", "age_s": f"{age_s:.3f}",
-                  "landmarks": f"{newest.inliers} of {newest.tracks}", "resets": str(newest.reset_counter),
-                  "length_m": f"{tally.length_m:.2f}", **_times("capture_to_pose", self._watched.to_pose)}
-        said = f"no pose for {age_s:.1f} s" if stale else newest.state
-        return DiagnosticStatus("omnid: odometry", STALE if stale else STATES[newest.state], said, values)
+        values = {Key.RATE_HZ: f"{self._rates('poses', statistics.poses):.1f}", Key.AGE_S: f"{age_s:.3f}",
+                  Key.INLIERS: str(newest.inliers), Key.TRACKED: str(newest.tracks),
+                  Key.RESETS: str(newest.reset_counter), Key.LENGTH_M: f"{statistics.length_m:.2f}",
+                  **_times(status_names.CAPTURE_TO_POSE, self._sources.to_pose)}
+        if age_s > TIMEOUT_S:
+            return DiagnosticStatus(status_names.ODOMETRY, STALE, "no new pose", values)
+        return DiagnosticStatus(status_names.ODOMETRY, LEVELS[newest.state], newest.state, values)
 
     def _pairing(self) -> DiagnosticStatus:
-        pair = self._watched.pair
+        pair = self._sources.pair
         skew, counts = pair.skew, pair.counts
-        fault = self._fault(pair)
+        fault = self._pairing_fault(pair)
         values = {name: str(count) for name, count in counts.items()} | {
-            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "most_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
-            "wandered_ms": f"{skew.drift_ns * 1e-6:.3f}"}
-        return DiagnosticStatus("omnid: pairing", WARN if fault else OK, fault or "in step", values)
+            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "max_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
+            "skew_drift_ms": f"{skew.drift_ns * 1e-6:.3f}"}
+        return DiagnosticStatus(status_names.PAIRING, WARN if fault else OK, fault or "synchronised", values)
 
-    def _fault(self, pair: Synchronise) -> str:
-        """What is wrong with the pairing, in the order of what explains the rest; empty where it goes well."""
+    def _pairing_fault(self, pair: Synchronise) -> str:
+        """Return the fault that explains all others first; empty without a fault."""
         rate_hz, broken_hz = self._rates("pairs", pair.counts["pairs"]), self._rates("broken", pair.counts["broken"])
-        silent = [name for name in self._watched.cameras if self._silent_s(name) > SILENT_S]
-        if silent:
-            return f"no images of the {' and the '.join(silent)} camera"
+        missing = [name for name in self._sources.cameras if self._image_age_s(name) > TIMEOUT_S]
+        if missing:
+            return f"no images of the {' and the '.join(missing)} camera"
         if broken_hz > 0:
-            return f"images that cannot be decoded, the first: {pair.fault}"
+            return f"images cannot be decoded; the first: {pair.fault}"
         if rate_hz == 0:
             return "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
-        return "the cameras drift apart in time: synchronise them" if abs(pair.skew.drift_ns) > WANDERED_NS else ""
+        if abs(pair.skew.drift_ns) > MAX_SKEW_DRIFT_NS:
+            return "the cameras drift apart in time: synchronise them"
+        return ""
 
-    def _silent_s(self, camera: Camera) -> float:
-        """How long ago the camera's newest image was taken; inf before the first."""
-        newest_ns = self._watched.pair.newest_ns[camera]
+    def _image_age_s(self, camera: Camera) -> float:
+        """Return the age of the camera's newest image; inf before the first."""
+        newest_ns = self._sources.pair.newest_ns[camera]
         return (time.monotonic_ns() - newest_ns) * 1e-9 if newest_ns else math.inf
 
     def _cameras(self) -> Iterable[DiagnosticStatus]:
-        for name, state in self._watched.cameras.items():
-            counts = {key: str(getattr(state, key)) for key in
-                      ("frames", "drops", "errors", "restamped", "restarts", "losses", "reopens")}
-            rate = f"{self._rates(f'{name} frames', state.frames):.1f}"
-            silent_s = self._silent_s(name)
-            said = state.problem if state.status == "lost" else state.status
-            if state.status == "streaming" and silent_s > SILENT_S:
-                said = f"no image for {silent_s:.1f} s"
-            yield DiagnosticStatus(f"omnid: {name} camera", OK if said == state.status else ERROR, said,
-                         {"mode": state.mode, "rate_hz": rate, **counts})
+        for name, state in self._sources.cameras.items():
+            rate_hz, age_s = self._rates(f"{name} frames", state.frames), self._image_age_s(name)
+            values = {"mode": state.mode, Key.RATE_HZ: f"{rate_hz:.1f}"}
+            if math.isfinite(age_s):
+                values[Key.AGE_S] = f"{age_s:.3f}"
+            values |= {key: str(getattr(state, key)) for key in _CAMERA_COUNTERS}
+            level, message = OK, str(state.status)
+            if state.status == "lost":
+                level, message = ERROR, state.problem
+            elif state.status == "streaming" and age_s > TIMEOUT_S:
+                level, message = ERROR, "no new image"
+            yield DiagnosticStatus(status_names.camera_name(name), level, message, values)
 
     def _wheels(self, controller: ControllerStatistics, commands: CommandReceiver | None) -> DiagnosticStatus:
-        state = controller.state  # once, for another thread replaces it
-        counts = ("sent", "late", "errors", "expiries", "fault", "lost_reports")
-        values = {name: str(getattr(state, name)) for name in counts}
-        values |= {f"stopped, {why}": str(count) for why, count in state.stops.items()}
-        values |= _times("capture_to_wheel", controller.to_wheel) | _times("tick_late", controller.lateness)
-        values["tick_late_p999_ms"] = f"{1e3 * controller.lateness.p(0.999):.2f}"
+        state = controller.state  # read once, for another thread replaces it
+        values = {key: str(getattr(state, key)) for key in _WHEEL_COUNTERS}
+        values |= {f"{status_names.STOPPED_PREFIX}{reason}": str(count) for reason, count in state.stops.items()}
+        values |= _times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel)
+        values |= _times(status_names.TICK_LATE, controller.lateness)
+        values[time_key(status_names.TICK_LATE, "p999")] = f"{1e3 * controller.lateness.p(0.999):.2f}"
         if commands is not None:
-            values |= {"commands": str(commands.accepted), "stops": str(commands.stops)}
-            values |= {f"refused, {why}": str(count) for why, count in dict(commands.refused).items()}
-        reason, bad = state.reason, state.reason == FAILED or state.failed or state.fault
-        return DiagnosticStatus(
-            "omnid: wheels", ERROR if bad else OK if reason in CALM else WARN, reason or "driving", values
-        )
+            refused = dict(commands.refused)  # a copy, for another thread adds to it
+            values |= {Key.COMMANDS: str(commands.accepted), Key.STOPS: str(commands.stops)}
+            values |= {f"{status_names.REFUSED_PREFIX}{reason}": str(count) for reason, count in refused.items()}
+        return DiagnosticStatus(status_names.WHEELS, self._wheels_level(controller), state.reason or "driving", values)
+
+    @staticmethod
+    def _wheels_level(controller: ControllerStatistics) -> int:
+        state = controller.state
+        if state.reason == FAILED or state.failed or state.fault:
+            return ERROR
+        return OK if state.reason in EXPECTED_STOPS else WARN
 
     def _stage(self, stage: StageStats) -> DiagnosticStatus:
-        missed = "missed" if stage.name in self._watched.tickers else "dropped"
-        return stage_status(stage, missed, rate_hz=f"{self._rates(stage.name, stage.processed):.1f}")
+        lost = Key.MISSED if stage.name in self._sources.tickers else Key.DROPPED
+        return stage_status(stage, lost, rate_hz=self._rates(stage.name, stage.processed))
 
 
-def stage_status(stage: StageStats, dropped: str = "dropped", **more: str) -> DiagnosticStatus:
-    """What the counters of a stage say: work is what a message took, cpu what of it was its own; dropped: the name of
-    what is lost there.
+def stage_status(stage: StageStats, lost: Key = Key.DROPPED, rate_hz: float | None = None) -> DiagnosticStatus:
+    """Return the entry of a stage: work is the time for a message, cpu the processor time in it.
+
+    lost: key of the counter of lost messages, or of missed deadlines.
     """
-    values = {**more, "processed": str(stage.processed), dropped: str(stage.dropped), **_times("work", stage.wall),
-              **_times("cpu", stage.cpu)}
-    return DiagnosticStatus(f"omnid: stage {stage.name}", OK, "", values)
+    values = {} if rate_hz is None else {str(Key.RATE_HZ): f"{rate_hz:.1f}"}
+    values |= {Key.PROCESSED: str(stage.processed), lost: str(stage.dropped), **_times(status_names.WORK, stage.wall),
+               **_times(status_names.CPU, stage.cpu)}
+    return DiagnosticStatus(status_names.stage_name(stage.name), OK, "", values)
+
+
+def summary_status(counters: RunCounters) -> DiagnosticStatus:
+    """Return the entry of a finished replay: its counters, one number per key."""
+    values = {"pairs": str(counters.pairs), "poses": str(counters.poses), str(Key.LENGTH_M): f"{counters.length_m:.4f}",
+              **{f"poses_{state}": str(count) for state, count in counters.states.items()},
+              Key.RESETS: str(counters.resets)}
+    for prefix, counts in (("dropped", counters.drops), ("map", counters.map), ("motor", counters.motor)):
+        values |= {f"{prefix}_{name}": str(count) for name, count in counts.items()}
+    return DiagnosticStatus(status_names.SUMMARY, OK, "the run has ended", values)
 
 
 def _times(name: str, histogram: Histogram) -> dict[str, str]:
-    """Median, 99th percentile and maximum in ms, once there is one."""
+    """Return median, 99th percentile and maximum in ms; nothing before the first measurement."""
     if not histogram.count:
         return {}
     found = (("p50", histogram.p(0.5)), ("p99", histogram.p(0.99)), ("max", histogram.max_s))
-    return {f"{name}_{which}_ms": f"{1e3 * value_s:.2f}" for which, value_s in found}
+    return {time_key(name, statistic): f"{1e3 * value_s:.2f}" for statistic, value_s in found}
 
 
 class StatusTick:
-    """The action of a ticker: makes the report and hands it to whoever wants it."""
+    """Action of a ticker: makes a report and passes it to the consumers."""
 
-    def __init__(self, report: StatusReport, *wants: Callable[[list[DiagnosticStatus]], None]) -> None:
-        self._report, self._wants = report, wants
+    def __init__(
+        self, report: Callable[[], list[DiagnosticStatus]], *consumers: Callable[[list[DiagnosticStatus]], None]
+    ) -> None:
+        self._report, self._consumers = report, consumers
 
     def __call__(self) -> None:
-        """One report."""
+        """Make and pass one report."""
         statuses = self._report()
-        for want in self._wants:
-            want(statuses)
+        for consume in self._consumers:
+            consume(statuses)

@@ -1,1 +1,1 @@
-"""Recorded runs: read, compared with each other, evaluated against the truth."""
+"""Recorded runs: reading them, comparing two of them, evaluating a trajectory against the truth."""

@@ -1,4 +1,4 @@
-"""What two recorded runs have in common and where they part, as lines for a terminal and a verdict."""
+"""Comparison of two recorded runs, as lines for a terminal and a list of differences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from calib.errors import CalibError
 from calib.validation import toml_table
 from omnid.errors import OmnidError
-from omnid.recordings.run_reader import STATES, Run
+from omnid.recordings.run_series import STATES, RunSeries
 from omnid.recordings.series_differences import (
     Gaps,
     Series,
@@ -26,112 +26,124 @@ from omnid.recordings.series_differences import (
 )
 from omnid.recordings.settings_differences import table_differences
 
-MOST_KEYS: Final = 40  # lines about settings
-ATTACHED: Final = (("settings", "omnid.toml"), ("rig", "rig.toml"))
+MAX_KEYS: Final = 40  # lines about settings
+ATTACHMENTS: Final = (("settings", "omnid.toml"), ("rig", "rig.toml"))
 NS_PER_S: Final = 1_000_000_000
 
-Rows: TypeAlias = Iterator[tuple[str, str]]  # what a line is about and what it says
+Rows: TypeAlias = Iterator[tuple[str, str]]  # subject and text of a line
 
 
 class Tolerance(NamedTuple):
-    """What still is the same run; of commands, so much per second."""
+    """Limits within which two runs agree; for commands they are per second."""
 
     distance_m: float
     angle_rad: float
-    shared: float  # least share of the longer run's poses that the other has as well, 0..1
+    shared: float  # minimum share of the longer run's poses that are in both, 0..1
 
     @property
     def text(self) -> str:
-        """In the units of the command line."""
+        """The limits in the units of the command line."""
         return f"{1e3 * self.distance_m:g} mm or {math.degrees(self.angle_rad):g} deg"
 
 
 class RunComparison:
-    """Two runs side by side; OmnidError where no stamp is in both. align: B's first common pose is laid on A's."""
+    """Comparison of poses, states and commands of the same stamps.
 
-    def __init__(self, a: Run, b: Run, tolerance: Tolerance, *, align: bool = False) -> None:
+    align: move B so that the first common poses coincide. Raise OmnidError where no stamp is in both.
+    """
+
+    def __init__(self, a: RunSeries, b: RunSeries, tolerance: Tolerance, *, align: bool = False) -> None:
         self._a, self._b, self._tolerance = a, b, tolerance
         common_a, common_b = in_both(a.poses, b.poses)
-        self._refuse_strangers(common_a)
+        self._require_common(common_a)
         if align:
             common_b = aligned(common_b, first_transform(common_a, common_b))
         self._common, self._aligned = common_a, align
         self._poses = pose_excess(common_a, common_b, tolerance.distance_m, tolerance.angle_rad)
         self._states = [held(run.states, common_a.stamps_ns) for run in (a, b)]
-        self._told = excess(self._states[0], self._states[1], (0.0, 0.0))
+        self._state_excess = excess(self._states[0], self._states[1], (0.0, 0.0))
         drive_a, drive_b = in_both(a.drive, b.drive)
-        self._drive = excess(drive_a, drive_b, (tolerance.distance_m, tolerance.angle_rad))
+        self._drive_excess = excess(drive_a, drive_b, (tolerance.distance_m, tolerance.angle_rad))
 
     @property
-    def parted(self) -> list[str]:
-        """In what they part, empty where they agree."""
-        found = {"poses": self._poses.first, "states": self._told.first, "commands": self._drive.first}
-        few = [f"less than {self._tolerance.shared:.0%} of the poses are in both"]
-        return [name for name, row in found.items() if row is not None] + few * (self._share < self._tolerance.shared)
+    def differences(self) -> list[str]:
+        """Subjects in which the runs differ by more than the tolerance."""
+        first_rows = {"poses": self._poses.first, "states": self._state_excess.first,
+                      "commands": self._drive_excess.first}
+        subjects = [name for name, row in first_rows.items() if row is not None]
+        if self._share < self._tolerance.shared:
+            subjects.append(f"less than {self._tolerance.shared:.0%} of the poses are in both")
+        return subjects
 
     def lines(self) -> Iterator[str]:
-        """All there is to say."""
+        """Yield the comparison line by line; the last one is the result."""
         for name, text in self._rows():
             yield f"{name:<10} {text}"
-        parted = self.parted
-        agreed = f"they agree: nothing differs by more than {self._tolerance.text}"
-        yield f"they part: {', '.join(parted)}" if parted else agreed
+        if self.differences:
+            yield f"the runs differ: {', '.join(self.differences)}"
+        else:
+            yield f"the runs agree: no difference is larger than {self._tolerance.text}"
 
     @property
     def _share(self) -> float:
-        return self._common.stamps_ns.size / max(run.poses.stamps_ns.size for run in (self._a, self._b))
+        longest = max(int(run.poses.stamps_ns.size) for run in (self._a, self._b))
+        return int(self._common.stamps_ns.size) / longest
 
-    def _refuse_strangers(self, common: Series) -> None:
+    def _require_common(self, common: Series) -> None:
         if not common.stamps_ns.size:
             raise OmnidError(f"no pose of {self._a.path} ({_span(self._a)}) and {self._b.path} ({_span(self._b)}) has "
-                             "the same stamp, so they saw other images: compare a recording with a replay of it, "
-                             f"`omnid replay {self._a.path} --record again.mcap`")
+                             "the same stamp: the runs used different images; compare a recording with a replay of "
+                             f"it, `omnid replay {self._a.path} --record again.mcap`")
 
     def _rows(self) -> Rows:
         for name, run in (("A", self._a), ("B", self._b)):
             yield name, f"{run.path}, {run.topic}: {run.poses.stamps_ns.size} poses, {_span(run)}"
         only_a, only_b = gaps(self._a.poses, self._b.poses), gaps(self._b.poses, self._a.poses)
         yield "in both", f"{self._common.stamps_ns.size} poses ({self._share:.1%} of the longer run)"
-        yield "only in A", self._gaps(only_a)
-        yield "only in B", self._gaps(only_b)
+        yield "only in A", self._gaps_text(only_a)
+        yield "only in B", self._gaps_text(only_b)
         yield from self._pose_rows()
         yield from self._state_rows()
         yield from self._drive_rows()
-        for name, file in ATTACHED:
-            yield from _table_rows(name, self._a.attached.get(file), self._b.attached.get(file))
+        for name, file in ATTACHMENTS:
+            yield from _table_rows(name, self._a.attachments.get(file), self._b.attachments.get(file))
 
-    def _gaps(self, found: Gaps) -> str:
+    def _gaps_text(self, found: Gaps) -> str:
         if not found.missing:
             return "none"
-        return (f"{found.missing} poses in {found.stretches} stretches, the longest of {found.longest} from "
+        return (f"{found.missing} poses in {found.stretches} gaps, the longest of {found.longest} from "
                 f"{self._at(found.longest_ns)} on")
 
     def _pose_rows(self) -> Rows:
         poses = self._poses
-        yield "apart", f"at most {_pose_text(poses.amounts.max(axis=0))}; at the end {_pose_text(poses.amounts[-1])}"
-        trace = poses.first_trace
-        yield "", "to the last bit the same" if trace is None else f"the same to the last bit before {self._row(trace)}"
+        largest, last = _pose_text(poses.amounts.max(axis=0)), _pose_text(poses.amounts[-1])
+        yield "distance", f"at most {largest}; at the end {last}"
+        different = poses.first_different
+        if different is None:
+            yield "", "bit-identical"
+        else:
+            yield "", f"bit-identical before {self._row(different)}"
         if poses.first is None:
             yield "", f"never more than {self._tolerance.text}"
             return
         yield "", (f"more than {self._tolerance.text} first at {self._row(poses.first)}: "
                    f"{_pose_text(poses.amounts[poses.first])}; at {poses.beyond} poses in all")
         if poses.first == 0 and not self._aligned:
-            yield "", "they start apart: with --align the first pose of B is laid on that of A"
+            yield "", "the first poses differ: --align moves B so that they coincide"
 
     def _state_rows(self) -> Rows:
         a, b = self._states
         yield "states", f"A {_changes_text(self._a.states)}; B {_changes_text(self._b.states)}"
-        if self._told.first is not None:
-            row = self._told.first
-            yield "", (f"others at {self._told.beyond} poses, first at {self._row(row)}: A {_state(a, row)}, "
-                       f"B {_state(b, row)}")
+        if self._state_excess.first is not None:
+            row = self._state_excess.first
+            yield "", (f"different at {self._state_excess.beyond} poses, first at {self._row(row)}: "
+                       f"A {_state(a, row)}, B {_state(b, row)}")
 
     def _drive_rows(self) -> Rows:
-        drive, counts = self._drive, [run.drive.stamps_ns.size for run in (self._a, self._b)]
+        drive, counts = self._drive_excess, [run.drive.stamps_ns.size for run in (self._a, self._b)]
         yield "commands", f"A {counts[0]}, B {counts[1]}, {drive.stamps_ns.size} of the same stamps"
         if drive.stamps_ns.size:
-            yield "", f"apart at most {_drive_text(drive.amounts.max(axis=0))}"
+            yield "", f"difference at most {_drive_text(drive.amounts.max(axis=0))}"
         if drive.first is not None:
             yield "", (f"more than {self._tolerance.text} per second first at "
                        f"{self._at(int(drive.stamps_ns[drive.first]))}: {_drive_text(drive.amounts[drive.first])}; "
@@ -141,13 +153,13 @@ class RunComparison:
         return self._at(int(self._common.stamps_ns[row]))
 
     def _at(self, stamp_ns: int) -> str:
-        """A stamp as the recordings have it, and how far into the first run it is."""
-        into_s = (stamp_ns - int(self._a.poses.stamps_ns[0])) / NS_PER_S
-        return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d} ({into_s:.3f} s)"
+        """Return a stamp and the time since the start of run A."""
+        since_start_s = (stamp_ns - int(self._a.poses.stamps_ns[0])) / NS_PER_S
+        return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d} ({since_start_s:.3f} s)"
 
 
 def _table_rows(name: str, a: bytes | None, b: bytes | None) -> Rows:
-    """Which keys of an attached file differ; they explain a difference and are none."""
+    """Yield the keys of an attached file that differ; they explain differences of the runs and do not count as such."""
     if a is None or b is None:
         missing = " and ".join(run for run, text in (("A", a), ("B", b)) if text is None)
         yield name, f"not attached to {missing}"
@@ -158,12 +170,12 @@ def _table_rows(name: str, a: bytes | None, b: bytes | None) -> Rows:
         yield name, f"cannot be compared: {error}"
         return
     yield name, f"{len(found)} keys differ" if found else "the same"
-    yield from (("", f"{key.path}: A {key.a}, B {key.b}") for key in found[:MOST_KEYS])
-    if len(found) > MOST_KEYS:
-        yield "", f"and {len(found) - MOST_KEYS} more"
+    yield from (("", f"{key.path}: A {key.a}, B {key.b}") for key in found[:MAX_KEYS])
+    if len(found) > MAX_KEYS:
+        yield "", f"and {len(found) - MAX_KEYS} more"
 
 
-def _span(run: Run) -> str:
+def _span(run: RunSeries) -> str:
     first_ns, last_ns = int(run.poses.stamps_ns[0]), int(run.poses.stamps_ns[-1])
     return f"{first_ns / NS_PER_S:.3f} to {last_ns / NS_PER_S:.3f} s"
 
@@ -178,7 +190,7 @@ def _drive_text(amounts: np.ndarray) -> str:
 
 def _changes_text(states: Series) -> str:
     if not states.stamps_ns.size:
-        return "tells none"
+        return "reports none"
     return f"{changes(states.values)} changes, {states.values[-1, 1]:.0f} resets"
 
 

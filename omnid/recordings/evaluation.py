@@ -1,4 +1,5 @@
-"""How far an estimated trajectory is from the truth: what `evo_ape --align_origin` and `evo_rpe -d 1 -u f` measure."""
+"""Errors of an estimated trajectory against the truth, as `evo_ape --align_origin` and `evo_rpe -d 1 -u f` define them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from omnid.formats.tum import Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Metrics:
-    """Errors over the associated poses; the first of them is aligned and nothing else. NaN: undefined."""
+    """Errors over the associated poses, of which only the first is aligned. NaN: undefined."""
 
     pairs: int  # associated poses
     coverage: float  # share of the truth's poses that have an estimate, 0..1
@@ -29,14 +30,14 @@ class Metrics:
     rpe_rotation_rmse_rad: float
     heading_rmse_rad: float  # yaw of R_truth^T R_estimate
     heading_max_rad: float
-    heading_end_rad: float  # signed, positive: the estimate looks too far left
+    heading_end_rad: float  # signed, positive: the estimate is rotated too far left
 
 
 def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> Metrics:
-    """Metrics of an estimate against the truth, both T_world_rig of the same rig frame in any two worlds.
+    """Compare an estimate with the truth, both T_world_rig of the same rig frame in any two worlds.
 
-    Each estimate takes the truth nearest in time within the tolerance; where two take the same, the nearer keeps it.
-    Raises OmnidError for fewer than two associated poses.
+    Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
+    truth, the nearer one. Raise OmnidError for fewer than two associated poses.
     """
     of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
     if of_estimate.size < 2:
@@ -50,7 +51,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01)
 
 
 def format_metrics(metrics: Metrics) -> str:
-    """The metrics as a few aligned lines for a terminal: metres, per cent and degrees."""
+    """Return the metrics as aligned lines for a terminal, in metres, per cent and degrees."""
     m = metrics
     length = f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"
     heading = f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"
@@ -65,7 +66,7 @@ def format_metrics(metrics: Metrics) -> str:
 
 
 def _percent(ratio: float) -> str:
-    return "no truth to compare" if math.isnan(ratio) else f"{100.0 * ratio:+.2f} %"
+    return "undefined" if math.isnan(ratio) else f"{100.0 * ratio:+.2f} %"
 
 
 def _deg(angle_rad: float) -> str:
@@ -81,7 +82,7 @@ def _tolerance_ns(tolerance_s: float) -> int:
 def _associate(
     stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64], tolerance_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (of the estimate, of the truth) of the associated poses, in time order; each at most once."""
+    """Return indices (of the estimate, of the truth) of the associated poses, in time order, each at most once."""
     if not stamps_ns.size or not true_ns.size:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     after = np.clip(np.searchsorted(true_ns, stamps_ns), 0, true_ns.size - 1)
@@ -101,7 +102,7 @@ def _span(trajectory: Trajectory) -> str:
 
 
 def _metrics(T_est: NDArray[np.float64], T_true: NDArray[np.float64], coverage: float) -> Metrics:
-    """Metrics of poses (N, 4, 4), row by row at the same time and in the same world."""
+    """Return metrics of poses (N, 4, 4), row by row at the same time and in the same world."""
     position_m = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
     heading_rad = se3.yaw(se3.inverse(T_true) @ T_est)
     steps = se3.inverse(_steps(T_true)) @ _steps(T_est)
@@ -124,7 +125,7 @@ def _metrics(T_est: NDArray[np.float64], T_true: NDArray[np.float64], coverage: 
 
 
 def _steps(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The motions T_i_next (N-1, 4, 4) between poses that follow one another."""
+    """Return the motions T_i_next (N-1, 4, 4) between consecutive poses."""
     return se3.inverse(T[:-1]) @ T[1:]
 
 

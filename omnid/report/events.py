@@ -1,69 +1,74 @@
-"""What happened, in the order of time and in bounded memory."""
+"""Events of a run in the order of time, in bounded memory."""
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from dataclasses import dataclass
 from typing import Final
 
 GOOD, WARNING, ERROR = range(3)
-MOST_OF_ONE: Final = 40
-MOST_SOURCES: Final = 32
-_APART_S: Final = 2.5  # a counter that rises again within so long is one event: statuses come once a second
-_MOST_DOUBLINGS: Final = 30  # of that time
-_LONGEST: Final = 160  # characters
+MAX_PER_SOURCE: Final = 40
+MAX_SOURCES: Final = 32
+_MERGE_S: Final = 2.5  # a counter that rises again within this time is one event: status comes once a second
+_MAX_DOUBLINGS: Final = 30  # of that time
+_MAX_TEXT: Final = 160  # characters
+_DIGITS: Final = str.maketrans("0123456789", "#" * 10)
+
+
+def without_digits(text: str) -> str:
+    """Return a text with a # for each group of digits, for comparisons in which numbers do not count."""
+    return "#".join(part for part in text.translate(_DIGITS).split("#") if part)
 
 
 @dataclass(slots=True)
 class Event:
-    """Something that happened, perhaps several times."""
+    """Something that happened once or several times."""
 
     start_s: float
     end_s: float
     level: int
     source: str
     text: str
-    count: int = 0  # of a counter that rose, or how often it happened; 0: once
+    count: int = 0  # by which a counter rose, or number of merged events; 0: one event
 
     @property
     def kind(self) -> tuple[int, str]:
-        """The same for what only differs in a figure."""
-        return self.level, re.sub(r"\d+", "#", self.text)
+        """Level and text without digits: the same for events that differ in numbers only."""
+        return self.level, without_digits(self.text)
 
-    def take(self, later: Event) -> None:
-        """Becomes both events."""
+    def merge(self, later: Event) -> None:
+        """Become one with a later event of the same kind."""
         self.end_s = max(self.end_s, later.end_s)
         self.count = max(self.count, 1) + max(later.count, 1)
 
 
-class _Story:
-    """What happened to one: more than MOST_OF_ONE events and those of a kind are put together, the nearest first."""
+class _SourceEvents:
+    """Events of one source. Beyond MAX_PER_SOURCE, those of a kind are merged, the nearest in time first."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
         self._newest: dict[tuple[int, str], Event] = {}
-        self._apart_s = _APART_S
+        self._merge_s = _MERGE_S
         self._full = False
 
     def add(self, event: Event) -> bool:
-        """Whether it is told now."""
-        if self._joined(event):
+        """Add an event; False where there is no room for it."""
+        if self._merged(event):
             return True
         if self._full:
             return False
         self._append(event)
-        if len(self.events) > MOST_OF_ONE:
+        if len(self.events) > MAX_PER_SOURCE:
             self._shorten()
         return True
 
-    def _joined(self, event: Event) -> bool:
-        """Whether it is now part of the newest one of its kind."""
+    def _merged(self, event: Event) -> bool:
+        """Merge an event into the newest one of its kind; False where they are too far apart."""
         same = self._newest.get(event.kind)
-        joins = event.count > 0 or self._apart_s > _APART_S
-        if same is None or not joins or event.start_s - same.end_s > self._apart_s:
+        mergeable = event.count > 0 or self._merge_s > _MERGE_S
+        if same is None or not mergeable or event.start_s - same.end_s > self._merge_s:
             return False
-        same.take(event)
+        same.merge(event)
         return True
 
     def _append(self, event: Event) -> None:
@@ -71,34 +76,34 @@ class _Story:
         self._newest[event.kind] = event
 
     def _shorten(self) -> None:
-        for _ in range(_MOST_DOUBLINGS):
-            self._apart_s *= 2
+        for _ in range(_MAX_DOUBLINGS):
+            self._merge_s *= 2
             events, self.events, self._newest = self.events, [], {}
             for event in events:
-                if not self._joined(event):
+                if not self._merged(event):
                     self._append(event)
-            if len(self.events) <= MOST_OF_ONE // 2:
+            if len(self.events) <= MAX_PER_SOURCE // 2:
                 return
         self._full = True
 
 
 class Events:
-    """All that happened; what is one too many is counted by its source."""
+    """Events of all sources; those that find no room are counted by source."""
 
     def __init__(self) -> None:
-        self._stories: dict[str, _Story] = {}
-        self.beyond: Counter[str] = Counter()
+        self._sources: dict[str, _SourceEvents] = {}
+        self.left_out: Counter[str] = Counter()
 
     def add(self, event: Event) -> None:
-        """Takes an event."""
-        event.source, event.text = event.source[:_LONGEST], event.text[:_LONGEST]
-        if event.source not in self._stories and len(self._stories) >= MOST_SOURCES:
-            self.beyond["others"] += 1
+        """Add an event."""
+        event.source, event.text = event.source[:_MAX_TEXT], event.text[:_MAX_TEXT]
+        if event.source not in self._sources and len(self._sources) >= MAX_SOURCES:
+            self.left_out["others"] += 1
             return
-        if not self._stories.setdefault(event.source, _Story()).add(event):
-            self.beyond[event.source] += 1
+        if not self._sources.setdefault(event.source, _SourceEvents()).add(event):
+            self.left_out[event.source] += 1
 
     def in_order(self) -> list[Event]:
-        """The events by their start."""
-        return sorted((event for story in self._stories.values() for event in story.events),
+        """Return the events in the order of their start."""
+        return sorted((event for source in self._sources.values() for event in source.events),
                       key=lambda event: event.start_s)

@@ -1,4 +1,4 @@
-"""What the cameras saw: panoramas out of a recording that holds images and a rig."""
+"""Panoramas from a recording that holds images and a rig."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from omnid.report.page import Image
 from omnid.stages.decoder import Decoder
 
 WIDTH_PX: Final = 1200
-MOST_HEIGHT_PX: Final = 500
-MOST_FRAMES: Final = 40_000  # that are gone through for a image: the loss of a long log may be hours away
+MAX_HEIGHT_PX: Final = 500
+MAX_FRAMES: Final = 40_000  # that are read: the first loss in a long log may be hours away
 
 
 class WantedImages(NamedTuple):
-    """A image that would be good to have: the lower camera's first one from a time on."""
+    """An image to show: the lower camera's first one from a time on."""
 
     stamp_ns: int
     caption: str
 
 
 def panoramas(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[tuple[Image, str]]:
-    """Panoramas and their captions, as far as they are found; OmnidError where none can be had."""
+    """Yield panoramas and their captions, as far as there are images. Raise OmnidError where none can be made."""
     try:
         cylinder = fit_cylinder(rig, WIDTH_PX)
         maps = remap_tables(rig, rig.lower, cylinder)
         for caption, image in _found(path, rig, wanted):
-            panorama = cv2.remap(image, *maps, cv2.INTER_LINEAR)[:MOST_HEIGHT_PX]
+            panorama = cv2.remap(image, *maps, cv2.INTER_LINEAR)[:MAX_HEIGHT_PX]
             yield np.asarray(panorama, np.uint8), caption
     except (CalibError, DriverError, cv2.error) as error:
         raise OmnidError(" ".join(str(error).split())) from error
@@ -48,7 +48,7 @@ def panoramas(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[
 def _found(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[tuple[str, Image]]:
     decode, left = Decoder(rig), sorted(wanted)
     with closing(LogReader(path)) as reader:
-        for frame in islice(reader.frames(), MOST_FRAMES):
+        for frame in islice(reader.frames(), MAX_FRAMES):
             if not left:
                 return
             if _fits(frame, left[0]) and (image := decode(frame)) is not None:

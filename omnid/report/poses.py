@@ -1,4 +1,4 @@
-"""What a recording's poses come to: the path, its states, speeds and deviations, and where poses are missing."""
+"""The poses of a recording: path, states, speeds, standard deviations and gaps."""
 
 from __future__ import annotations
 
@@ -14,42 +14,44 @@ from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
 from omnid.report.downsampling import Corner, Downsampled, PathTrace
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
+from omnid.tracking_state import TrackingState
 from omnid.transport.codec import OdometryRecord
 
-STATES: Final = ("tracking", "degraded", "lost")
-UNKNOWN: Final = -1  # rank of a state that nobody told
-GAP_S: Final = 0.5  # without a pose; where poses are seldom, GAP_TIMES of their usual distance
-GAP_TIMES: Final = 5.0
-MOST_KEPT: Final = 500_000  # whole poses, for the comparison with a truth: 4.6 h at 30 Hz, 32 MB
-_SETTLING: Final = 0.1  # share of a new distance in time in the usual one
-_COURSES: Final = ("speed", "yaw_rate", "sigma_position", "sigma_heading", "state", "height")
+STATES: Final = tuple(TrackingState)
+UNKNOWN: Final = -1  # rank of a state that is not recorded
+GAP_S: Final = 0.5  # without a pose; where poses are rare, GAP_PERIODS times their mean period
+GAP_PERIODS: Final = 5.0
+MAX_KEPT: Final = 500_000  # whole poses, for the comparison with a truth: 4.6 h at 30 Hz, 32 MB
+_MAX_GAPS: Final = 200
+_PERIOD_GAIN: Final = 0.1  # of the running mean of the period
+_SERIES: Final = ("speed", "yaw_rate", "sigma_position", "sigma_heading", "state", "height")
 
 Array = NDArray[np.float64]
 
 
 class PoseHistory:
-    """Takes the poses one after the other; times are in s since the first one."""
+    """Collects the poses in their order; times are in s since the first one."""
 
     def __init__(self, events: Events, keep: bool) -> None:
         self._events, self._keep = events, keep
         self._kept = (array("q"), array("d"))
         self._position: Array | None = None
-        self._usual_s = math.nan
+        self._period_s = math.nan
         self._rank = UNKNOWN
-        self.start_ns = 0  # stamp of the first one
+        self.start_ns = 0  # stamp of the first pose
         self.end_s = 0.0
         self.first = np.eye(4)
         self.path = PathTrace()
-        self.course = {name: Downsampled() for name in _COURSES}
+        self.series = {name: Downsampled() for name in _SERIES}
         self.gaps: list[tuple[float, float]] = []
         self.states: Counter[int] = Counter()
-        self.poses = self.late = self.absurd = 0
+        self.poses = self.late = self.out_of_range = 0
         self.length_m = 0.0
 
-    def process(self, record: OdometryRecord, rank: int) -> None:
-        """Takes a pose and the rank of its state in STATES."""
+    def add(self, record: OdometryRecord, rank: int) -> None:
+        """Add a pose; rank: of its state in STATES."""
         if not (np.abs(record.T_odom_base[:3, 3]) <= POSITION_LIMIT_M).all():
-            self.absurd += 1
+            self.out_of_range += 1
             return
         if not self.poses:
             self.first = record.T_odom_base
@@ -57,63 +59,63 @@ class PoseHistory:
         if self.poses and t_s <= self.end_s:
             self.late += 1
             return
-        self._note_gap(t_s)
-        self._note_state(t_s, rank)
-        self._move(record, t_s)
-        self._measure(record, t_s)
+        self._add_gap(t_s)
+        self._add_state(t_s, rank)
+        self._add_position(record, t_s)
+        self._add_measurements(record, t_s)
         self.end_s, self.poses = t_s, self.poses + 1
 
     def seconds(self, stamp_ns: int) -> float:
-        """Time since the first pose."""
+        """Return the time since the first pose."""
         return (stamp_ns - self.start_ns) * 1e-9
 
     @property
     def trajectory(self) -> Trajectory:
-        """The first MOST_KEPT poses, T_odom_base; none unless they are kept."""
+        """The first MAX_KEPT poses, T_odom_base; empty unless they are kept."""
         stamps_ns, numbers = np.array(self._kept[0], np.int64), np.array(self._kept[1]).reshape(-1, 7)
         return Trajectory(stamps_ns, se3.transform(se3.rotation(numbers[:, 3:]), numbers[:, :3]))
 
-    def _note_gap(self, t_s: float) -> None:
+    def _add_gap(self, t_s: float) -> None:
         step_s = t_s - self.end_s
         if not self.poses or step_s <= 0:
             return
-        if step_s > max(GAP_S, GAP_TIMES * (self._usual_s if self.poses > 2 else step_s)):
-            self.gaps = [*self.gaps, (self.end_s, t_s)][-200:]
+        if step_s > max(GAP_S, GAP_PERIODS * (self._period_s if self.poses > 2 else step_s)):
+            self.gaps = [*self.gaps, (self.end_s, t_s)][-_MAX_GAPS:]
             self._events.add(Event(self.end_s, t_s, WARNING, "poses", f"none for {step_s:.2f} s"))
-        elif math.isnan(self._usual_s):
-            self._usual_s = step_s
+        elif math.isnan(self._period_s):
+            self._period_s = step_s
         else:
-            self._usual_s += _SETTLING * (step_s - self._usual_s)
+            self._period_s += _PERIOD_GAIN * (step_s - self._period_s)
 
-    def _note_state(self, t_s: float, rank: int) -> None:
+    def _add_state(self, t_s: float, rank: int) -> None:
         self.states[rank] += 1
         if rank != self._rank and not (self._rank == UNKNOWN and rank == 0):
             level = (GOOD, WARNING, ERROR)[max(rank, 0)]
             self._events.add(Event(t_s, t_s, level, "state", STATES[rank] if rank >= 0 else "unknown"))
         self._rank = rank
         if rank != UNKNOWN:
-            self.course["state"].add(t_s, rank)
+            self.series["state"].add(t_s, rank)
 
-    def _move(self, record: OdometryRecord, t_s: float) -> None:
+    def _add_position(self, record: OdometryRecord, t_s: float) -> None:
         position = record.T_odom_base[:3, 3]
         if self._position is not None:
             self.length_m += float(np.linalg.norm(position - self._position))
         self._position = position
         self.path.add(Corner(float(position[0]), float(position[1]), t_s, self._rank))
-        if self._keep and self.poses < MOST_KEPT:
+        if self._keep and self.poses < MAX_KEPT:
             self._kept[0].append(record.stamp_ns)
             self._kept[1].extend([*position, *se3.quaternion(record.T_odom_base[:3, :3])])
 
-    def _measure(self, record: OdometryRecord, t_s: float) -> None:
+    def _add_measurements(self, record: OdometryRecord, t_s: float) -> None:
         variances = np.diag(record.covariance)
         measured = {"speed": record.velocity[0], "yaw_rate": math.degrees(record.velocity[5]),
                     "sigma_position": _root(float(variances[:3].sum())),
                     "sigma_heading": math.degrees(_root(float(variances[5]))),
                     "height": record.T_odom_base[2, 3]}
         for name, value in measured.items():
-            self.course[name].add(t_s, float(value))
+            self.series[name].add(t_s, float(value))
 
 
 def _root(variance: float) -> float:
-    """The deviation; NaN for what is no variance, or one that nobody has set."""
+    """Return the standard deviation; NaN for a variance that is not positive, which means that it was not set."""
     return math.sqrt(variance) if variance > 0 else math.nan

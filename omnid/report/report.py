@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file with everything in it."""
+"""The report of a recorded run: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from omnid.report.chart import Clock
 from omnid.report.downsampling import Corner
 from omnid.report.page import figure, note, page
 from omnid.report.panorama_images import WantedImages, panoramas
-from omnid.report.poses import MOST_KEPT
+from omnid.report.poses import MAX_KEPT
 from omnid.report.report_data import ReportData
 from omnid.report.timeline import timeline
-from omnid.report.truth_comparison import TruthComparison, compare
+from omnid.report.truth_comparison import TruthComparison, compare_with_truth
 
 _MOST_CROSSES: Final = 40
-_BEFORE_S: Final = 30.0  # that are shown of the time before the first pose, where something happened
+_MAX_BEFORE_S: Final = 30.0  # time before the first pose that is shown, where there are events in it
 _JPEG_QUALITY: Final = 70
 _STYLE: Final = """body{max-width:1060px;font-family:system-ui,sans-serif}h1{margin-bottom:.1em;overflow-wrap:anywhere}
 h2{margin:1.6em 0 .4em;border-bottom:2px solid #222}.sub{color:#444;overflow-wrap:anywhere;margin-top:0}
@@ -48,104 +48,104 @@ h2{break-after:avoid}tr{break-inside:avoid}.grid2{grid-template-columns:1fr 1fr}
 .scroll{break-inside:avoid}.scroll,.events{overflow:visible;max-height:none;border:0}td,th{padding:.1em .5em}}"""
 
 
-def report_html(path: Path, recording: ReportData, true: Trajectory | None = None) -> str:
-    """The whole page; true: T_world_rig of the rig."""
-    events = recording.events.in_order()
-    before_s = min((event.start_s for event in events if event.start_s >= -_BEFORE_S), default=0.0)
-    clock = Clock(min(0.0, before_s), max(recording.poses.end_s, 1e-2))
-    spans = chart.spans_of(recording.poses.course["state"].points(), recording.poses.end_s)
-    comparison = None if true is None else compare(recording.poses, recording.T_base_rig, true)
-    top = [svg.hidden(svg.PATTERNS), chart.shades(spans, clock), *_head(path, recording),
-           sections.key_figures(recording), *_warnings(recording, true),
-           plan.plan_figure(_plan(recording, comparison), clock)]
-    story = ["<h2>What happened</h2>", timeline(spans, recording.poses.gaps, events, clock),
-             *_states_missing(recording), *sections.events_table(recording.events, clock)]
-    measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(recording, clock),
-                *sections.sureness(recording, clock), *health.timing(recording, clock),
-                *health.parts(recording, clock)]
-    rest = [*_images(path, recording), *setup.setup(recording), *setup.contents(recording),
+def report_html(path: Path, data: ReportData, true: Trajectory | None = None) -> str:
+    """Return the page; true: T_world_rig of the rig."""
+    events = data.events.in_order()
+    before_s = min((event.start_s for event in events if event.start_s >= -_MAX_BEFORE_S), default=0.0)
+    clock = Clock(min(0.0, before_s), max(data.poses.end_s, 1e-2))
+    spans = chart.spans_of(data.poses.series["state"].points(), data.poses.end_s)
+    comparison = None if true is None else compare_with_truth(data.poses, data.T_base_rig, true)
+    top = [svg.hidden(svg.PATTERNS), chart.shades(spans, clock), *_head(path, data),
+           sections.key_figures(data), *_warnings(data, true),
+           plan.plan_figure(_plan(data, comparison), clock)]
+    story = ["<h2>Events</h2>", timeline(spans, data.poses.gaps, events, clock),
+             *_states_missing(data), *sections.events_table(data.events, clock)]
+    measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(data, clock),
+                *sections.uncertainty(data, clock), *health.timing(data, clock),
+                *health.parts(data, clock)]
+    rest = [*_images(path, data), *setup.setup(data), *setup.contents(data),
             f"<p><small>Made by omnid {__version__}.</small></p>"]
     parts = [*top, *story, *measured, *rest]
-    return page(f"{recording.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE)
+    return page(f"{data.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE)
 
 
-def _head(path: Path, recording: ReportData) -> list[str]:
-    found, frames = recording.survey, recording.frames
-    told = (f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
-            f"{recording.topic}, from {_utc(recording.poses.start_ns)}.")
-    return [f"<h1>Run of {escape(recording.robot)}</h1><p class='sub'>{escape(told)}</p>"]
+def _head(path: Path, data: ReportData) -> list[str]:
+    found, frames = data.info, data.frames
+    facts = (f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
+             f"{data.topic}, from {_utc(data.poses.start_ns)}.")
+    return [f"<h1>Run of {escape(data.robot)}</h1><p class='sub'>{escape(facts)}</p>"]
 
 
 def _utc(stamp_ns: int) -> str:
-    """The time of day; bare seconds where a stamp is no Unix time of this age."""
+    """Return date and time; seconds where a stamp is not a Unix time after 2001."""
     seconds, rest_ns = divmod(stamp_ns, 10**9)
     if not 10**9 <= seconds < 2**33:
         return f"{seconds}.{rest_ns // 10**6:03} s"
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S}.{rest_ns // 10**6:03} UTC"
 
 
-def _warnings(recording: ReportData, true: Trajectory | None) -> list[str]:
-    """What makes the rest of the page worth less."""
-    found, poses = recording.survey, recording.poses
+def _warnings(data: ReportData, true: Trajectory | None) -> list[str]:
+    """Return what is missing or doubtful in the log."""
+    found, poses = data.info, data.poses
     lines = []
     if found.state is LogState.BROKEN:
         lines.append(f"The log is cut or corrupt after byte {found.readable_bytes} of {found.size_bytes}; "
                      "this is what could be read.")
     if found.broken:
         lines.append(f"{found.broken} corrupt chunks or records were skipped.")
-    if recording.unread or poses.absurd:
-        lines.append(f"{recording.unread + poses.absurd} messages were left out: not what their type says, a stamp far "
-                     "from the time of logging, or a pose beyond all measure.")
+    if data.unreadable or poses.out_of_range:
+        lines.append(f"{data.unreadable + poses.out_of_range} messages were left out: not of their type, with a stamp "
+                     "far from the time of logging, or with a pose out of range.")
     if poses.late:
         lines.append(f"{poses.late} poses were left out: not later than the one before.")
-    if true is not None and recording.rig is None:
-        lines.append(f"The truth is compared as if the rig were the robot's own frame: {recording.rig_fault}.")
-    if true is not None and poses.poses > MOST_KEPT:
-        lines.append(f"The truth is compared for the first {MOST_KEPT} of {poses.poses} poses.")
+    if true is not None and data.rig is None:
+        lines.append(f"The truth is compared as if the rig's frame were base_link: {data.rig_fault}.")
+    if true is not None and poses.poses > MAX_KEPT:
+        lines.append(f"The truth is compared for the first {MAX_KEPT} of {poses.poses} poses.")
     return [f"<p class='warn'>{escape(line)}</p>" for line in lines]
 
 
-def _states_missing(recording: ReportData) -> list[str]:
-    if recording.poses.states[-1] < recording.poses.poses:
+def _states_missing(data: ReportData) -> list[str]:
+    if data.poses.states[-1] < data.poses.poses:
         return []
-    return [note("The log does not tell the state of the odometry (…/status of omnid).")]
+    return [note("The log does not hold the state of the odometry (…/status of omnid).")]
 
 
-def _plan(recording: ReportData, comparison: TruthComparison | None) -> plan.Plan:
-    corners, cloud = recording.poses.path.corners, recording.cloud
-    drawn = cloud is not None and cloud.frame == recording.frames[0]
+def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
+    corners, cloud = data.poses.path.corners, data.cloud
+    drawn = cloud is not None and cloud.frame == data.frames[0]
     points = cloud.points if cloud and drawn else np.empty((0, 3), np.float32)
     finite = np.isfinite(points).all(axis=1)
     confidence = cloud.confidence if cloud and drawn else np.empty(0, np.float32)
-    height_m = float((recording.poses.first @ recording.T_base_rig)[2, 3])
+    height_m = float((data.poses.first @ data.T_base_rig)[2, 3])
     return plan.Plan(corners, points[finite], confidence[finite], height_m, comparison.path if comparison else (),
-                     _losses(recording, corners))
+                     _losses(data, corners))
 
 
-def _losses(recording: ReportData, corners: list[Corner]) -> list[tuple[float, float]]:
-    """Where the path was when the pose was lost."""
+def _losses(data: ReportData, corners: list[Corner]) -> list[tuple[float, float]]:
+    """Return the positions on the path at which the pose was lost."""
     times = np.array([corner.t_s for corner in corners])
     places = [corners[max(0, int(np.searchsorted(times, t_s, "right")) - 1)]
-              for t_s in _lost_s(recording)[:_MOST_CROSSES]]
+              for t_s in _lost_s(data)[:_MOST_CROSSES]]
     return [(corner.x_m, corner.y_m) for corner in places]
 
 
-def _lost_s(recording: ReportData) -> list[float]:
-    """When the pose was lost."""
-    return [event.start_s for event in recording.events.in_order() if (event.source, event.text) == ("state", "lost")]
+def _lost_s(data: ReportData) -> list[float]:
+    """Return the times at which the pose was lost."""
+    return [event.start_s for event in data.events.in_order() if (event.source, event.text) == ("state", "lost")]
 
 
-def _images(path: Path, recording: ReportData) -> list[str]:
-    if not recording.images:
-        return ["<h2>What the cameras saw</h2>", note("The log holds no images.")]
-    if recording.rig is None:
-        return ["<h2>What the cameras saw</h2>", note(f"Images, but {recording.rig_fault}.")]
-    start_ns = recording.poses.start_ns
+def _images(path: Path, data: ReportData) -> list[str]:
+    if not data.has_images:
+        return ["<h2>Images</h2>", note("The log holds no images.")]
+    if data.rig is None:
+        return ["<h2>Images</h2>", note(f"Images, but {data.rig_fault}.")]
+    start_ns = data.poses.start_ns
     wanted = [WantedImages(start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
     wanted += [WantedImages(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
-               for t_s in _lost_s(recording)[:1]]
+               for t_s in _lost_s(data)[:1]]
     try:
-        shown = [figure(image, caption, _JPEG_QUALITY) for image, caption in panoramas(path, recording.rig, wanted)]
+        shown = [figure(image, caption, _JPEG_QUALITY) for image, caption in panoramas(path, data.rig, wanted)]
     except OmnidError as error:
         shown = [note(f"The images in the log cannot be shown: {error}")]
-    return ["<h2>What the cameras saw</h2>", *(shown or [note("No image could be decoded.")])]
+    return ["<h2>Images</h2>", *(shown or [note("No image could be decoded.")])]

@@ -1,11 +1,10 @@
-"""A recording, read once from its beginning to its end into what a report needs."""
+"""Content of a recording for the report, collected in one pass and in bounded memory."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
-from contextlib import closing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -16,36 +15,25 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.mcap_catalog import Catalog, LogTopic
-from drivers.logs.mcap_index import read_attachments, read_summary
 from drivers.logs.mcap_info import LogInfo, read_log_info
-from drivers.logs.mcap_messages import DataSection, LogMessage
-from drivers.logs.mcap_records import LogFile, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
+from omnid.recordings.odometry_topic import choose_odometry_topic
+from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import Events
 from omnid.report.poses import PoseHistory
-from omnid.report.statuses import StatusHistory
-from omnid.transport.codec import (
-    DIAGNOSTICS_SCHEMA,
-    ODOMETRY_SCHEMA,
-    POINT_CLOUD_SCHEMA,
-    TWIST_SCHEMA,
-    OdometryRecord,
-    odometry_from_cdr,
-    twist_from_cdr,
-)
-from omnid.transport.decode import Cloud, Diagnostics, decode_cloud, decode_diagnostics
+from omnid.report.status_history import StatusHistory
+from omnid.transport.codec import OdometryRecord, Twist
+from omnid.transport.decode import Cloud, Diagnostics
 
-LARGEST_MESSAGE: Final = 64 * 2**20  # bytes
-EARLY: Final = 64  # reports
-STRAY_S: Final = 3600.0  # by which a stamp may leave the time of logging, once both started together
+MAX_EARLY: Final = 64  # status messages before the first pose
+MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
 
 
 @dataclass(slots=True)
-class DriveCommand:
-    """Speeds that the wheels were told, or asked for."""
+class DriveHistory:
+    """Course of velocity commands."""
 
     speed: Downsampled = field(default_factory=Downsampled)  # m/s
     yaw_rate: Downsampled = field(default_factory=Downsampled)  # deg/s
@@ -53,84 +41,49 @@ class DriveCommand:
 
 @dataclass(slots=True)
 class ReportData:
-    """What a log holds, in bounded memory."""
+    """Everything that the report shows of a recording."""
 
-    survey: LogInfo
+    info: LogInfo
     topic: str  # of the odometry
+    robot: str
     attachments: Mapping[str, bytes]
     rig: Rig | None
-    rig_fault: str  # why there is none
+    rig_fault: str  # why there is no rig
     events: Events
     poses: PoseHistory
     statuses: StatusHistory
-    drives: dict[str, DriveCommand] = field(default_factory=dict)  # "told" to the wheels, "asked" of the robot
+    drives: dict[str, DriveHistory] = field(default_factory=dict)  # by topic: DRIVE, TWIST_COMMAND
     frames: tuple[str, str] = ("odom", "base_link")  # of the odometry
-    cloud: Cloud | None = None
-    unread: int = 0  # messages that are not what their type says, or of a senseless time
-
-    @property
-    def robot(self) -> str:
-        """The first part of the topic, as omnid names them; the whole topic otherwise."""
-        parts = self.topic.strip("/").split("/")
-        return parts[0] if len(parts) > 1 else self.topic
+    cloud: Cloud | None = None  # the newest
+    unreadable: int = 0  # messages left out: not of their type, or with an invalid stamp
 
     @property
     def T_base_rig(self) -> NDArray[np.float64]:
-        """Where the rig stands on the robot; the identity where nobody says so."""
+        """Pose of the rig on the robot; the identity where it is unknown."""
         return np.eye(4) if self.rig is None else self.rig.T_base_rig
 
     @property
-    def images(self) -> bool:
-        """Whether the cameras' images are there as well."""
-        return any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in self.survey.topics.values())
+    def has_images(self) -> bool:
+        """True if the recording holds images."""
+        return any(schema in (IMAGE, COMPRESSED_IMAGE) for schema, _ in self.info.topics.values())
 
 
-def read_recording(path: Path, topic: str | None = None, keep_poses: bool = False) -> ReportData:
-    """All of a log; topic: the odometry where there are several; keep_poses: each of them, to compare with a truth.
+def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool = False) -> ReportData:
+    """Read a recording; topic: of the odometry, see choose_odometry_topic; keep_poses: all of them, for a truth.
 
-    OmnidError where there is no odometry in it, DriverError where there is no log.
+    Raise OmnidError where there is no odometry in it, DriverError where there is no log.
     """
     found = read_log_info(path)
-    with closing(LogFile(path)) as file:
-        summary = read_summary(file)
-        attachments = read_attachments(file, summary)
-        rig, fault = _rig(attachments)
-        events = Events()
-        recording = ReportData(found, choose_odometry(found, topic), attachments, rig, fault, events,
-                              PoseHistory(events, keep_poses), StatusHistory(events))
-        reading = _Reading(recording)
-        section = DataSection(file, summary.catalog if summary else Catalog())
-        reading.take(section.messages(), section.catalog)
-    if not recording.poses.poses:
-        raise OmnidError(f"{path}: {recording.topic} holds not one pose that can be read: is the log whole? "
-                         f"`omnid log info {path}` tells")
-    return recording
-
-
-def choose_odometry(found: LogInfo, topic: str | None) -> str:
-    """The topic of the poses; OmnidError where there is none, or it is not clear which."""
-    known = [name for name, (kind, count) in found.topics.items() if kind == ODOMETRY_SCHEMA and count]
-    if topic is not None and topic not in known:
-        raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}; there is {_listed(known)}")
-    own = [name for name in known if name.endswith("/odom")] if topic is None else [topic]
-    if len(own) == 1 or len(known) == 1:
-        return (own or known)[0]
-    if known:
-        raise OmnidError(f"{found.path}: several odometries, {_listed(known)}: choose one with --topic")
-    raise OmnidError(_no_odometry(found))
-
-
-def _no_odometry(found: LogInfo) -> str:
-    if any(kind in (IMAGE, COMPRESSED_IMAGE) for kind, _ in found.topics.values()):
-        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        return (f"{found.path}: images but no poses: first `omnid replay {found.path}{rig} --record out.mcap`, then "
-                "`omnid report out.mcap`")
-    return f"{found.path}: no {ODOMETRY_SCHEMA} in it; there is {_listed(list(found.topics))}"
-
-
-def _listed(topics: list[str]) -> str:
-    names = ", ".join(ascii(name) for name in topics[:8])
-    return f"{names} and {len(topics) - 8} more" if len(topics) > 8 else names or "nothing"
+    reader = RecordingReader(found, choose_odometry_topic(found, topic))
+    rig, fault = _rig(reader.attachments)
+    events = Events()
+    data = ReportData(found, reader.topic, reader.robot, reader.attachments, rig, fault, events,
+                      PoseHistory(events, keep_poses), StatusHistory(events))
+    _Collector(data).collect(reader)
+    if not data.poses.poses:
+        raise OmnidError(f"{path}: topic {data.topic!r} has no readable pose; `omnid log info {path}` tells whether "
+                         "the log is complete")
+    return data
 
 
 def _rig(attachments: Mapping[str, bytes]) -> tuple[Rig | None, str]:
@@ -142,81 +95,58 @@ def _rig(attachments: Mapping[str, bytes]) -> tuple[Rig | None, str]:
         return None, f"the attached rig.toml cannot be read: {error}"
 
 
-class _Reading:
-    """One way through the messages."""
+class _Collector:
+    """One pass over the messages of a recording."""
 
-    def __init__(self, recording: ReportData) -> None:
-        self._to = recording
-        self._waiting: OdometryRecord | None = None  # the report of a new state comes right after its first pose
-        self._offset_ns: int | None = None  # from the stamps of the poses to the time of logging
-        self._early: deque[Diagnostics] = deque(maxlen=EARLY)  # that came before the first pose
-        self._cloud: bytes | None = None
+    def __init__(self, data: ReportData) -> None:
+        self._data = data
+        self._pending: OdometryRecord | None = None  # a new state is recorded right after its first pose
+        self._offset_ns: int | None = None  # from the stamps of the poses to the times of logging
+        self._early: deque[Diagnostics] = deque(maxlen=MAX_EARLY)  # before the first pose
 
-    def take(self, messages: Iterable[LogMessage], catalog: Catalog) -> None:
-        """All messages."""
-        for message in messages:
-            topic = catalog.topic(message.channel_id)
-            if topic is not None and topic.type in (ODOMETRY_SCHEMA, DIAGNOSTICS_SCHEMA, POINT_CLOUD_SCHEMA,
-                                                    TWIST_SCHEMA):
-                try:
-                    self._message(topic, message)
-                except (OmnidError, RecordError):
-                    self._to.unread += 1
-        self._settle()
-        self._to.cloud = self._last_cloud()
+    def collect(self, reader: RecordingReader) -> None:
+        """Read all messages."""
+        for message in reader.messages((ODOMETRY, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
+            match message.content:
+                case OdometryRecord():
+                    self._add_pose(message.content, message.log_time_ns)
+                case Diagnostics():
+                    self._add_diagnostics(message.content)
+                case Cloud():
+                    self._data.cloud = message.content
+                case Twist():
+                    self._add_twist(message.name, message.content)
+        self._add_pending()
+        self._data.unreadable += reader.unreadable.total()
 
-    def _message(self, topic: LogTopic, message: LogMessage) -> None:
-        if message.record.size > LARGEST_MESSAGE:
-            raise OmnidError(f"{message.record.size} bytes")
-        if topic.name == self._to.topic:
-            self._pose(odometry_from_cdr(bytes(message.data())), message.log_time_ns)
-        elif topic.type == DIAGNOSTICS_SCHEMA and self._of_robot(topic.name):
-            self._status(bytes(message.data()))
-        elif topic.type == POINT_CLOUD_SCHEMA and self._of_robot(topic.name):
-            self._cloud = bytes(message.data())
-        elif topic.type == TWIST_SCHEMA:
-            self._twist(topic.name, bytes(message.data()))
-
-    def _of_robot(self, topic: str) -> bool:
-        """Whether a topic is of the robot whose odometry it is, where their names tell."""
-        return "/" not in self._to.topic.strip("/") or topic.startswith(f"/{self._to.robot}/")
-
-    def _pose(self, record: OdometryRecord, log_time_ns: int) -> None:
-        offset_ns = log_time_ns - record.stamp_ns
+    def _add_pose(self, record: OdometryRecord, log_time_ns: int) -> None:
+        data, offset_ns = self._data, log_time_ns - record.stamp_ns
         if self._offset_ns is None:
-            self._offset_ns, self._to.frames, self._to.poses.start_ns = offset_ns, record.frames, record.stamp_ns
-            for report in self._early:
-                self._to.statuses.process(report, self._to.poses.seconds)
-        if abs(offset_ns - self._offset_ns) > STRAY_S * 1e9:
-            self._to.unread += 1
+            self._offset_ns, data.frames, data.poses.start_ns = offset_ns, record.frames, record.stamp_ns
+            for diagnostics in self._early:
+                data.statuses.add(diagnostics, data.poses.seconds)
+        if abs(offset_ns - self._offset_ns) > MAX_CLOCK_OFFSET_S * 1e9:
+            data.unreadable += 1
             return
-        self._settle()
-        self._waiting = record
+        self._add_pending()
+        self._pending = record
 
-    def _settle(self) -> None:
-        if self._waiting is not None:
-            self._to.poses.process(self._waiting, self._to.statuses.rank)
-            self._waiting = None
+    def _add_pending(self) -> None:
+        """Add the pose that waits, in the state reported by now."""
+        if self._pending is not None:
+            self._data.poses.add(self._pending, self._data.statuses.rank)
+            self._pending = None
 
-    def _status(self, payload: bytes) -> None:
-        report = decode_diagnostics(payload)
+    def _add_diagnostics(self, diagnostics: Diagnostics) -> None:
         if self._offset_ns is None:
-            self._early.append(report)
+            self._early.append(diagnostics)
         else:
-            self._to.statuses.process(report, self._to.poses.seconds)
+            self._data.statuses.add(diagnostics, self._data.poses.seconds)
 
-    def _twist(self, topic: str, payload: bytes) -> None:
-        kind = "told" if topic.endswith("/drive") else "asked" if topic.endswith("/cmd/twist") else ""
-        if kind and self._offset_ns is not None:
-            stamp_ns, _, speed_mps, yaw_rate_radps = twist_from_cdr(payload)
-            drive = self._to.drives.setdefault(kind, DriveCommand())
-            t_s = self._to.poses.seconds(stamp_ns)
-            drive.speed.add(t_s, speed_mps)
-            drive.yaw_rate.add(t_s, math.degrees(yaw_rate_radps))
-
-    def _last_cloud(self) -> Cloud | None:
-        try:
-            return None if self._cloud is None else decode_cloud(self._cloud)
-        except OmnidError:
-            self._to.unread += 1
-            return None
+    def _add_twist(self, name: str, twist: Twist) -> None:
+        if self._offset_ns is None:
+            return
+        drive = self._data.drives.setdefault(name, DriveHistory())
+        t_s = self._data.poses.seconds(twist.stamp_ns)
+        drive.speed.add(t_s, twist.velocity_mps)
+        drive.yaw_rate.add(t_s, math.degrees(twist.yaw_rate_radps))

@@ -1,4 +1,4 @@
-"""The sections about what the robot did, each a list of HTML; what comes from the log is escaped here."""
+"""Report sections about the robot, each a list of HTML. Text from the log is escaped here."""
 
 from __future__ import annotations
 
@@ -7,50 +7,54 @@ from collections.abc import Iterator
 from html import escape
 from typing import Final
 
+from omnid.recordings.recording_reader import DRIVE, TWIST_COMMAND
 from omnid.report.chart import ChartLine, Clock, chart, line
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import Event, Events
-from omnid.report.health import number
+from omnid.report.health import rounded
 from omnid.report.page import facts, grid, note, table
-from omnid.report.poses import STATES
+from omnid.report.poses import STATES, UNKNOWN
 from omnid.report.report_data import ReportData
-from omnid.report.statuses import ODOMETRY
 from omnid.report.svg import label
 from omnid.report.truth_comparison import TruthComparison
+from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, Key, time_key
 
 _LEVELS: Final = ("", "warning", "error")
+_MAX_SOURCES: Final = 20  # of events that were left out
+_MAX_LANDMARK_COUNTS: Final = 12
 
 
-def key_figures(recording: ReportData) -> str:
-    """The run in a few numbers."""
-    poses, statuses = recording.poses, recording.statuses
+def key_figures(data: ReportData) -> str:
+    """Return the key figures of the run."""
+    poses, statuses = data.poses, data.statuses
     rate_hz = (poses.poses - 1) / poses.end_s if poses.end_s > 0 else math.nan
     tiles = [("duration", _duration(poses.end_s)), ("path", f"{poses.length_m:.2f} m"),
              ("poses", f"{poses.poses}, {rate_hz:.1f}/s" if rate_hz > 0 else str(poses.poses)),
-             *_shares(recording)]
-    p50, p99 = (number(statuses.values(ODOMETRY).get(f"capture_to_pose_{p}_ms", "")) for p in ("p50", "p99"))
+             *_shares(data)]
+    p50, p99 = (rounded(statuses.values(ODOMETRY).get(time_key(CAPTURE_TO_POSE, p), "")) for p in ("p50", "p99"))
     if p50:
         tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in tiles)
     return f"<div class='tiles'>{cells}</div>"
 
 
-def _shares(recording: ReportData) -> Iterator[tuple[str, str]]:
-    poses = recording.poses
-    if poses.states[-1] < poses.poses:
-        told = poses.poses - poses.states[-1]
+def _shares(data: ReportData) -> Iterator[tuple[str, str]]:
+    poses = data.poses
+    if poses.states[UNKNOWN] < poses.poses:
+        known = poses.poses - poses.states[UNKNOWN]
         for rank, name in enumerate(STATES):
-            count = poses.states[rank]
-            yield name, _share(count, told)
-        yield "resets", str(recording.statuses.resets)
+            yield name, _share(poses.states[rank], known)
+        yield "resets", str(data.statuses.resets)
 
 
-def _share(count: int, of: int) -> str:
-    """Per cent, such that what happened at all does not look like never."""
-    if count in (0, of):
+def _share(count: int, total: int) -> str:
+    """Return the share in per cent; a small one is not rounded to 0, a large one not to 100."""
+    if count in (0, total):
         return "always" if count else "never"
-    percent = 100 * count / of
-    return f"{percent:.1f} %" if 0.1 <= percent <= 99.9 else "< 0.1 %" if percent < 0.1 else "> 99.9 %"
+    percent = 100 * count / total
+    if percent < 0.1:
+        return "< 0.1 %"
+    return f"{percent:.1f} %" if percent <= 99.9 else "> 99.9 %"
 
 
 def _duration(seconds: float) -> str:
@@ -60,23 +64,24 @@ def _duration(seconds: float) -> str:
 
 
 def events_table(events: Events, clock: Clock) -> list[str]:
-    """What happened, in the order of time."""
+    """Return the table of events in the order of time."""
     found = events.in_order()
     if not found:
-        return ["<p>Nothing: no change of state, no gap, no loss.</p>"]
-    rows = [(_when(event, clock), _LEVELS[event.level], escape(event.source), escape(_what(event))) for event in found]
-    beyond = sum(events.beyond.values())
-    said = ", ".join(f"{source}: {count}" for source, count in events.beyond.most_common(20))
-    more = [note(f"and {beyond} more: {said}")] if beyond else []
-    return ["<div class='events'>", table(("when", "", "who", "what (how often)"), rows), "</div>", *more]
+        return ["<p>No events: no change of state, no gap, no loss.</p>"]
+    rows = [(_time_text(event, clock), _LEVELS[event.level], escape(event.source), escape(_event_text(event)))
+            for event in found]
+    count = events.left_out.total()
+    by_source = ", ".join(f"{source}: {count}" for source, count in events.left_out.most_common(_MAX_SOURCES))
+    more = [note(f"and {count} more: {by_source}")] if count else []
+    return ["<div class='events'>", table(("time", "", "part", "event (count)"), rows), "</div>", *more]
 
 
-def _when(event: Event, clock: Clock) -> str:
-    """In seconds, or as h:mm:ss where the charts are in minutes or hours."""
-    short = clock.unit[1] == "s"
-    start, end = (f"{at:.2f}" if short else _hms(at) for at in (event.start_s, event.end_s))
-    said = start if start == end else f"{start} to {end}"
-    return f"{said} s" if short else said
+def _time_text(event: Event, clock: Clock) -> str:
+    """Return the time in seconds, or as h:mm:ss where the charts are in minutes or hours."""
+    in_seconds = clock.unit[1] == "s"
+    start, end = (f"{at_s:.2f}" if in_seconds else _hms(at_s) for at_s in (event.start_s, event.end_s))
+    span = start if start == end else f"{start} to {end}"
+    return f"{span} s" if in_seconds else span
 
 
 def _hms(seconds: float) -> str:
@@ -84,57 +89,58 @@ def _hms(seconds: float) -> str:
     return f"{sign}{int(whole // 3600)}:{int(whole // 60) % 60:02}:{whole % 60:04.1f}"
 
 
-def _what(event: Event) -> str:
+def _event_text(event: Event) -> str:
     return f"{event.text} ({event.count})" if event.count else event.text
 
 
-def motion(recording: ReportData, clock: Clock) -> list[str]:
-    """Speed, yaw rate and height; what the wheels were told along with it."""
-    course, drives = recording.poses.course, recording.drives
-    speed, yaw_rate = [line("measured", course["speed"])], [line("measured", course["yaw_rate"])]
-    for kind, name in (("told", "told to the wheels"), ("asked", "asked of the robot")):
-        if kind in drives:
-            speed.append(line(name, drives[kind].speed))
-            yaw_rate.append(line(name, drives[kind].yaw_rate))
+def motion(data: ReportData, clock: Clock) -> list[str]:
+    """Return the section with speed, yaw rate and height, beside the commands."""
+    series, drives = data.poses.series, data.drives
+    speed, yaw_rate = [line("measured", series["speed"])], [line("measured", series["yaw_rate"])]
+    for topic, name in ((DRIVE, "sent to the wheels"), (TWIST_COMMAND, "commanded")):
+        if topic in drives:
+            speed.append(line(name, drives[topic].speed))
+            yaw_rate.append(line(name, drives[topic].yaw_rate))
     figures = [chart("Forward speed", speed, clock, unit="m/s", zero=True),
                chart("Yaw rate, to the left", yaw_rate, clock, unit="deg/s", zero=True),
-               chart("Height of the robot", [line("", course["height"])], clock, unit="m")]
+               chart("Height of the robot", [line("", series["height"])], clock, unit="m")]
     missing = [] if drives else [note("The log holds no commands to the wheels (…/drive, …/cmd/twist).")]
     return ["<h2>Motion</h2>", grid(figures), *missing]
 
 
-def sureness(recording: ReportData, clock: Clock) -> list[str]:
-    """Deviations out of the covariances, and the landmarks."""
-    course, statuses = recording.poses.course, recording.statuses
-    found, agree = (statuses.series(ODOMETRY, name) for name in ("found", "agree"))
-    position, heading = [line("", course["sigma_position"])], [line("", course["sigma_heading"])]
+def uncertainty(data: ReportData, clock: Clock) -> list[str]:
+    """Return the section with the standard deviations of the covariances, and the landmarks."""
+    series, statuses = data.poses.series, data.statuses
+    tracked, inliers = (statuses.series(ODOMETRY, key) for key in (Key.TRACKED, Key.INLIERS))
+    position, heading = [line("", series["sigma_position"])], [line("", series["sigma_heading"])]
     figures = [chart("Standard deviation of the position, all axes", position, clock, unit="m", log=True),
                chart("Standard deviation of the heading", heading, clock, unit="deg", log=True)]
-    missing = [] if any(figures) else [note("The covariances in the log are zero or negative: nobody set them.")]
-    if found.count > 2 and statuses.reports:
-        figures.append(chart("Landmarks", [line("found", found), line("that agree with the pose", agree)], clock,
-                             zero=True, note="Once for each report, not for each pose."))
+    missing = [] if any(figures) else [note("The covariances in the log are zero or negative: they were not set.")]
+    if tracked.count > 2 and statuses.reports:
+        figures.append(chart("Landmarks", [line("tracked", tracked), line("inliers of the pose", inliers)], clock,
+                             zero=True, note="One value per report, not per pose."))
     else:
-        missing.append(note(_few_landmarks(found, agree)))
-    return ["<h2>How sure it is</h2>", grid(figures), *missing]
+        missing.append(note(_few_landmarks(tracked, inliers)))
+    return ["<h2>Uncertainty</h2>", grid(figures), *missing]
 
 
-def _few_landmarks(found: Downsampled, agree: Downsampled) -> str:
-    if not found.count:
+def _few_landmarks(tracked: Downsampled, inliers: Downsampled) -> str:
+    if not tracked.count:
         return "The log holds no numbers of landmarks."
-    told = ", ".join(f"{a:.0f} of {f:.0f} at {label(round(t, 2))} s" for (t, a), (_, f) in
-                     list(zip(agree.points(), found.points(), strict=False))[:12])
-    return f"Landmarks that agree with the pose are told only where the state changes: {told}."
+    points = list(zip(inliers.points(), tracked.points(), strict=False))[:_MAX_LANDMARK_COUNTS]
+    counts = ", ".join(f"{count:.0f} of {total:.0f} at {label(round(t_s, 2))} s" for (t_s, count), (_, total) in points)
+    return f"Landmarks are reported only where the state changes; inliers of the pose: {counts}."
 
 
 def truth(comparison: TruthComparison, clock: Clock) -> list[str]:
-    """How far the path is from the true one."""
+    """Return the section with the errors of the path."""
     m = comparison.metrics
     ratio = "" if math.isnan(m.length_error_ratio) else f" ({100 * m.length_error_ratio:+.3f} %)"
     rows = [("compared poses", f"{m.pairs}, {m.coverage:.1%} of the truth"),
             ("length", f"{m.length_estimate_m:.4f} m, true {m.length_truth_m:.4f} m{ratio}"),
-            ("position (ATE)", f"rmse {_mm(m.ate_rmse_m)}, most {_mm(m.ate_max_m)}, at the end {_mm(m.end_error_m)}"),
-            ("heading", f"rmse {_deg(m.heading_rmse_rad)}, most {_deg(m.heading_max_rad)}, at the end "
+            ("position (ATE)", f"rmse {_mm(m.ate_rmse_m)}, maximum {_mm(m.ate_max_m)}, at the end "
+             f"{_mm(m.end_error_m)}"),
+            ("heading", f"rmse {_deg(m.heading_rmse_rad)}, maximum {_deg(m.heading_max_rad)}, at the end "
              f"{_deg(m.heading_end_rad)}"),
             ("from pose to pose (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}")]
     heading = [(t, math.degrees(rad)) for t, rad in comparison.heading_rad.points()]

@@ -1,4 +1,4 @@
-"""The states of the odometry as a band, and below it what happened to whom."""
+"""A figure with the states of the odometry as a band, and a lane of events for each part below it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MISSING: Final = "class='none'"
 
 
 def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock: Clock) -> str:
-    """The figure; a lane of marks for everyone that something happened to."""
+    """Return the figure; parts without events have no lane."""
     sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda s: ("stage" in s, s))[:_LANES]
     x, height = clock.axis(_LEFT, _RIGHT), 42 + _LANE * len(sources)
     parts = [*_band(spans, gaps, (x, clock.unit[0])),
@@ -30,7 +30,7 @@ def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock
 
 
 def _band(spans: Spans, gaps: Sequence[Point], axis: tuple[Axis, float]) -> Iterator[str]:
-    """What is told of each moment lies above the frame that says that nothing is told."""
+    """Yield the band; the states cover the style that means unknown."""
     x, seconds = axis
     yield text((_LEFT - 8, 27), "state", "text-anchor='end'")
     for style, found in ((_MISSING, [(x.low * seconds, x.high * seconds)]), *zip(_FILLS, spans, strict=True),
@@ -41,9 +41,9 @@ def _band(spans: Spans, gaps: Sequence[Point], axis: tuple[Axis, float]) -> Iter
 
 def _keys(events: Sequence[Event], lanes: bool) -> str:
     keys = [area_key(style, name) for style, name in zip(
-        (*_FILLS, _MISSING), ("tracking", "degraded", "lost", "no pose, or its state is not told"), strict=True)]
+        (*_FILLS, _MISSING), ("tracking", "degraded", "lost", "no pose, or its state is unknown"), strict=True)]
     if lanes:
-        keys += [mark_key(_mark(level, 17, 6), name) for level, name in enumerate(("news", "warning", "error"))]
+        keys += [mark_key(_mark(level, 17, 6), name) for level, name in enumerate(("change", "warning", "error"))]
     if any(map(_is_reset, events)):
         keys.append(mark_key(_reset(17, 12), "reset"))
     return "".join(keys)
@@ -54,7 +54,7 @@ def _is_reset(event: Event) -> bool:
 
 
 def _reset(x: float, bottom: float) -> str:
-    """A black arrow that points down."""
+    """Return a black arrow that points down."""
     return f"<path d='M{number(x)} {number(bottom)}l-5.5 -11h11z' fill='#000'/>"
 
 
@@ -71,7 +71,7 @@ def _lane(source: str, top: float, events: Sequence[Event], axis: tuple[Axis, fl
 
 
 def _mark(level: int, x: float, y: float) -> str:
-    """A ring for news that are good, a triangle for a warning, a black square for an error."""
+    """Return a ring for a good event, a triangle for a warning, a black square for an error."""
     if level == GOOD:
         return f"<circle cx='{number(x)}' cy='{number(y)}' r='4' fill='#fff' stroke='#111'/>"
     if level == ERROR:

@@ -20,7 +20,7 @@ from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.rig_monitor import RigMonitor
-from omnid.diagnostics.status import StatusReport, StatusSources, StatusTick
+from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.realtime import ThreadStart, prepare, priorities
@@ -138,9 +138,9 @@ class LiveRun:
             TICKERS,
             tuple(part.status for part in (bus, recorder, rig_monitor) if part),
         )
-        self._add_tickers(session, StatusReport(sources), bus, recorder)
+        self._add_tickers(session, StatusCollector(sources), bus, recorder)
 
-    def _add_tickers(self, session: Session, report: StatusReport, bus: Bus, recorder: Recorder | None) -> None:
+    def _add_tickers(self, session: Session, report: StatusCollector, bus: Bus, recorder: Recorder | None) -> None:
         publishers = [_status_on_bus(bus)]
         if recorder is not None:
             publishers.append(_status_in_recording(recorder, session.offset_ns))

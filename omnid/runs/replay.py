@@ -18,8 +18,7 @@ from drivers.logs.mcap_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.input_warnings import input_warnings
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
-from omnid.diagnostics.run_summary import summary_entries
-from omnid.diagnostics.status import stage_status
+from omnid.diagnostics.status import stage_status, summary_status
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import PlaybackClock
@@ -40,7 +39,7 @@ from omnid.sinks.pose_collector import PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
@@ -257,8 +256,7 @@ class _Results:
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        summary = summary_entries(self.counters(statistics))
-        return [DiagnosticStatus("omnid: summary", OK, "the run has ended", summary), *map(stage_status, stages)]
+        return [summary_status(self.counters(statistics)), *map(stage_status, stages)]
 
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""

@@ -14,7 +14,9 @@ from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.stages.odometry import of_base
+from omnid.tracking_state import TrackingState
 from omnid.transport import codec
+from omnid.transport.status_names import ODOMETRY, Key
 
 Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate
 
@@ -100,10 +102,10 @@ class StateReports:
         now = (odometry.state, odometry.reset_counter)
         if now != self._last:
             self._last = now
-            level = ("tracking", "degraded", "lost").index(odometry.state)
-            values = {"state": odometry.state, "resets": str(odometry.reset_counter),
-                      "landmarks": f"{odometry.inliers} of {odometry.tracks}"}
-            said = codec.DiagnosticStatus("omnid: odometry", level, odometry.state, values)
+            level = list(TrackingState).index(odometry.state)
+            values: dict[str, str] = {Key.STATE: odometry.state, Key.RESETS: str(odometry.reset_counter),
+                      Key.INLIERS: str(odometry.inliers), Key.TRACKED: str(odometry.tracks)}
+            said = codec.DiagnosticStatus(ODOMETRY, level, odometry.state, values)
             yield status_report(odometry.stamp_ns + self._offset_ns, [said])
 
 

@@ -17,6 +17,7 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
+from omnid.transport.status_names import RECORDING
 
 Recorded: TypeAlias = Frame | Outgoing
 FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
@@ -103,7 +104,7 @@ class Recorder:
                   ("messages", "lost", "refused", "files", "deleted", "stops")}
         values = {"file": state.file, **counts, "invalid": str(self.invalid)}
         level = ERROR if state.status == "stopped" else OK
-        return DiagnosticStatus("omnid: recording", level, state.problem or state.status, values)
+        return DiagnosticStatus(RECORDING, level, state.problem or state.status, values)
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, the state of the odometry where it has changed."""

@@ -14,7 +14,7 @@ from typing import Final
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.transport import ros2
+from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.session import open_session, reason
@@ -62,9 +62,8 @@ class Bus:
         """Return whether the bus is open, and the number of messages lost before that."""
         waiting = self._session is None
         message = f"no router yet at {', '.join(self._config.connect)}" if waiting else "open"
-        return DiagnosticStatus(
-            "omnid: bus", WARN if waiting else OK, message, {"mode": self._config.mode, "lost": str(self.lost)}
-        )
+        values = {"mode": self._config.mode, "lost": str(self.lost)}
+        return DiagnosticStatus(status_names.BUS, WARN if waiting else OK, message, values)
 
     def publish(self, topic: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Send CDR bytes as `<robot>/<topic>`, and under the key that ROS 2 expects; dropped in congestion.

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, NamedTuple
 
+from omnid.tracking_state import TrackingState
+
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"
 PAIRING: Final = f"{PREFIX}pairing"
@@ -116,3 +118,9 @@ def landmark_counts(values: Mapping[str, str]) -> tuple[int, int] | None:
     """Return inliers and tracked landmarks of the odometry's values; None in recordings of earlier versions."""
     inliers, tracked = count(values.get(Key.INLIERS, "")), count(values.get(Key.TRACKED, ""))
     return (inliers, tracked) if inliers is not None and tracked is not None else None
+
+
+def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | None:
+    """Return the tracking state in an entry of the odometry: its key `state`, else its message; None without one."""
+    text = values.get(Key.STATE, message)
+    return TrackingState(text) if text in list(TrackingState) else None

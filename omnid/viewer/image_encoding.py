@@ -1,4 +1,4 @@
-"""Images as they can be put on the board: compressed."""
+"""Compression of images for the viewer."""
 
 from __future__ import annotations
 
@@ -16,15 +16,12 @@ QUALITY: Final = 85
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """A image (H, W) as JPEG."""
+    """Encode an image (H, W) as JPEG."""
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
 
 
 def compressed(image: RosImage) -> tuple[bytes, str]:
-    """Return the bytes of an image message and their kind; a raw image becomes grey JPEG.
-
-    Raises FrameDecodeError for a broken image.
-    """
+    """Return compressed bytes and their kind; raw images become grey JPEG. Raise FrameDecodeError where damaged."""
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding
     return jpeg(gray(Frame(0, image.stamp_ns, "lower", image.encoding, image.data, image.width, image.height,

@@ -1,93 +1,82 @@
-"""What can be drawn of the reports that the parts of a robot give."""
+"""Plots and log lines from the status entries of a robot."""
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Iterator
 from typing import Final, Protocol
 
 from omnid.monitor.robot_state import plain
+from omnid.tracking_state import TrackingState
+from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
-from omnid.viewer.style import STATES
+from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 
 STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")
-ODOMETRY: Final = "omnid: odometry"
-LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")
-_TIME: Final = re.compile(r"(?P<what>\w+?)_(?P<which>p50|p99)_ms")
-_LANDMARKS: Final = re.compile(r"(\d{1,9}) of (\d{1,9})")
+LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of rerun, by level of an entry
+STATISTICS: Final = ("p50", "p99")  # of times that are plotted
 
 
-def latencies(report: Diagnostics) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Names and ms of what took its time: of the stages that make a pose the medians, of all that is no stage p99 too.
-    """
-    for status in report.statuses:
-        part = status.name.removeprefix("omnid: ")
-        for key, value in status.values.items():
-            found, value_ms = _TIME.fullmatch(key), _number(value)
-            if found is None or value_ms is None:
+def latencies(diagnostics: Diagnostics) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Yield names and ms: medians of the stages that make a pose, medians and 99th percentiles of all other times."""
+    for status in diagnostics.statuses:
+        for key, text in status.values.items():
+            time, value_ms = parsed_time_key(key), status_names.number(text)
+            if time is None or value_ms is None or time.statistic not in STATISTICS:
                 continue
-            if not part.startswith("stage "):
-                yield (plain(part), f"{found['what']} {found['which']}"), value_ms
-            elif part.removeprefix("stage ") in STAGES and found["which"] == "p50":
-                yield (part.removeprefix("stage "),), value_ms
+            if not status.name.startswith(STAGE_PREFIX):
+                yield (plain(short_name(status.name)), f"{time.name} {time.statistic}"), value_ms
+            elif status.name.removeprefix(STAGE_PREFIX) in STAGES and time.statistic == "p50":
+                yield (status.name.removeprefix(STAGE_PREFIX),), value_ms
 
 
-def state(report: Diagnostics) -> str | None:
-    """The state of the odometry, where the report tells one."""
-    found = (status.message for status in report.statuses if status.name == ODOMETRY)
-    return next((message for message in found if message in STATES), None)
+def tracking_state(diagnostics: Diagnostics) -> TrackingState | None:
+    """Return the tracking state; None where the message has none."""
+    found = (status_names.tracking_state(status.message, status.values) for status in diagnostics.statuses
+             if status.name == ODOMETRY)
+    return next((state for state in found if state is not None), None)
 
 
-def landmarks(report: Diagnostics) -> tuple[int, int] | None:
-    """How many landmarks agree, and how many were found."""
-    found = _LANDMARKS.fullmatch(report.value(ODOMETRY, "landmarks"))
-    return (int(found[1]), int(found[2])) if found else None
+def landmark_counts(diagnostics: Diagnostics) -> tuple[int, int] | None:
+    """Return inliers and tracked landmarks; None where the message has none."""
+    found = (status_names.landmark_counts(status.values) for status in diagnostics.statuses if status.name == ODOMETRY)
+    return next((counts for counts in found if counts is not None), None)
 
 
 class StatusChanges:
-    """What parts say of themselves, where it is not what they said before; in constant memory."""
+    """Detects entries whose level or message changes, in constant memory."""
 
-    def __init__(self, most_parts: int = 100) -> None:
-        self._most_parts = most_parts
-        self._said: dict[str, tuple[int, str]] = {}
+    def __init__(self, max_entries: int = 100) -> None:
+        self._max_entries = max_entries
+        self._last: dict[str, tuple[int, str]] = {}
 
-    def __call__(self, report: Diagnostics) -> Iterator[tuple[str, str]]:
-        """Lines and their levels; the odometry's state is told elsewhere."""
-        for status in report.statuses:
-            if status.name != ODOMETRY and self._is_new(status):
-                told = f"{status.name.removeprefix('omnid: ')}: {status.message or 'no message'}"
-                yield plain(told), LEVELS[status.level % len(LEVELS)]
+    def __call__(self, diagnostics: Diagnostics) -> Iterator[tuple[str, str]]:
+        """Yield log lines and their levels; the state of the odometry is logged with the poses."""
+        for status in diagnostics.statuses:
+            if status.name != ODOMETRY and self._changed(status):
+                text = f"{short_name(status.name)}: {status.message or 'no message'}"
+                yield plain(text), LEVELS[status.level % len(LEVELS)]
 
-    def _is_new(self, status: DiagnosticStatus) -> bool:
-        before, now = self._said.get(status.name, (0, "")), (status.level, status.message)
-        if status.name in self._said or len(self._said) < self._most_parts:
-            self._said[status.name] = now
+    def _changed(self, status: DiagnosticStatus) -> bool:
+        before, now = self._last.get(status.name, (0, "")), (status.level, status.message)
+        if status.name in self._last or len(self._last) < self._max_entries:
+            self._last[status.name] = now
         return now != before
 
 
 class Canvas(Protocol):
-    """What reports are drawn on."""
+    """Target of the plots and log lines."""
 
     def latency(self, stamp_ns: int, name: tuple[str, ...], value_ms: float) -> None:
-        """How long something took, ms."""
+        """Plot a time in ms."""
 
     def line(self, stamp_ns: int, text: str, level: str) -> None:
-        """A line of the log."""
+        """Add a line to the log."""
 
 
-def draw(report: Diagnostics, changes: StatusChanges, canvas: Canvas) -> None:
-    """Draws how long things took, and what has changed."""
-    for name, value_ms in latencies(report):
-        canvas.latency(report.stamp_ns, name, value_ms)
-    for text, level in changes(report):
-        canvas.line(report.stamp_ns, text, level)
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+def draw(diagnostics: Diagnostics, changes: StatusChanges, canvas: Canvas) -> None:
+    """Draw the latencies, and a log line for each entry that has changed."""
+    for name, value_ms in latencies(diagnostics):
+        canvas.latency(diagnostics.stamp_ns, name, value_ms)
+    for text, level in changes(diagnostics):
+        canvas.line(diagnostics.stamp_ns, text, level)

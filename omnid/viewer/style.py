@@ -1,6 +1,6 @@
-"""How things look: colours, sizes and shapes that can be told apart in grey too. Numbers in, numbers out.
+"""Colours, sizes and shapes of the viewer, as arrays; they differ in grey, too.
 
-Colours (r, g, b) are those of Okabe and Ito, which the colour-blind tell apart.
+Colours (r, g, b) are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SIGMAS: Final = 3.0  # of the ellipsoid
 VISIBLE_M: Final = 0.05  # a smaller ellipsoid is magnified
 MOST_MAGNIFIED: Final = 1000
 FARTHEST_MM: Final = 65535
-SPOT_PX: Final = 3  # side of what a located pixel becomes in the depth image
+SPOT_PX: Final = 3  # side of the square for a located pixel in the depth image
 
 
 class Style(NamedTuple):
@@ -35,19 +35,19 @@ STATES: Final = {  # the worse, the thicker
     "degraded": Style((230, 159, 0), 3.0),
     "lost": Style((213, 94, 0), 5.0),
 }
-AGREEING: Final = Style((86, 180, 233), 2.5)  # dots
+INLIER: Final = Style((86, 180, 233), 2.5)  # dots
 REJECTED: Final = Style((213, 94, 0), 5.0)  # crosses
 NEW: Final = Style((240, 228, 66), 4.0)  # squares
 AXES: Final[tuple[Colour, ...]] = ((213, 94, 0), (0, 158, 115), (0, 114, 178))  # x, y, z
 
 
-def state_look(state: str) -> Style:
-    """The look of a way in that state."""
+def state_style(state: str) -> Style:
+    """Return the style of the path in a state."""
     return STATES.get(state, UNKNOWN)
 
 
 class Ellipsoid(NamedTuple):
-    """Where a position is in nearly all cases, about the estimate; magnified so that it can be seen."""
+    """Confidence ellipsoid of a position, magnified so that it is visible."""
 
     half_m: Array  # (3,) half axes as they are drawn
     R: Array  # (3, 3) whose columns are the axes; right-handed
@@ -55,14 +55,14 @@ class Ellipsoid(NamedTuple):
 
     @property
     def largest_m(self) -> float:
-        """The longest half axis as it is."""
+        """Longest half axis, without the magnification."""
         return float(self.half_m.max()) / self.magnified
 
 
 def ellipsoid(covariance: Array) -> Ellipsoid | None:
-    """The ellipsoid of SIGMAS deviations for a covariance (3, 3) [m^2]; None unless that is finite.
+    """Return the ellipsoid of SIGMAS standard deviations for a covariance (3, 3) [m^2]; None unless it is finite.
 
-    Its axes are the eigenvectors. What is too small to be seen is drawn 10, 100 or 1000 times as large.
+    Its axes are the eigenvectors. A small ellipsoid is drawn 10, 100 or 1000 times as large.
     """
     if not np.isfinite(covariance).all():
         return None
@@ -74,7 +74,7 @@ def ellipsoid(covariance: Array) -> Ellipsoid | None:
 
 
 def magnification(size_m: float) -> int:
-    """By how many times, a power of ten, something must be drawn larger to be seen."""
+    """Return the power of ten by which an object of that size must be magnified to be visible."""
     if size_m <= 0:
         return 1
     wanted = 10 ** max(0, math.ceil(math.log10(VISIBLE_M / size_m)))
@@ -82,19 +82,19 @@ def magnification(size_m: float) -> int:
 
 
 def crosses(pixels: Array, half_px: float) -> NDArray[np.float32]:
-    """Lines (2N, 2, 2) that cross at pixels (N, 2)."""
+    """Return lines (2N, 2, 2) that cross at pixels (N, 2)."""
     corners = np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]], float) * half_px
     return (pixels[:, None, None, :] + corners).reshape(-1, 2, 2).astype(np.float32)
 
 
 def squares(pixels: Array, half_px: float) -> NDArray[np.float32]:
-    """Closed lines (N, 5, 2) around pixels (N, 2)."""
+    """Return closed lines (N, 5, 2) around pixels (N, 2)."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float) * half_px
     return (pixels[:, None, :] + corners).astype(np.float32)
 
 
 def depth_image(disparity: NDArray[np.float32], focal_baseline: float) -> NDArray[np.uint16]:
-    """Distances [mm] from the rig's axis (H, W), 0 unknown, each located pixel as a spot; the nearest covers others.
+    """Return distances [mm] from the rig's axis (H, W), 0 unknown; located pixels are squares, the nearest on top.
 
     disparity: (H, W) px, NaN unknown; focal_baseline: of the panorama, px times m.
     """
@@ -105,19 +105,19 @@ def depth_image(disparity: NDArray[np.float32], focal_baseline: float) -> NDArra
 
 
 def depth_range(distance_mm: NDArray[np.uint16]) -> tuple[float, float]:
-    """Nearest and farthest of the known distances [mm], but for the few that are far out."""
+    """Return the 1st and 95th percentile of the known distances [mm]."""
     known = distance_mm[distance_mm > 0]
     return tuple(np.percentile(known, (1, 95)).tolist()) if known.size else (0.0, 1.0)
 
 
 def evenly(most: int, *rows: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """At most so many of the rows of each array, evenly chosen, the same of all."""
+    """Return at most so many rows of each array, evenly chosen, the same rows of all."""
     step = max(1, -(-len(rows[0]) // most))
     return tuple(each[::step] for each in rows)
 
 
 def by_height(points: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours (N, 3) of points (N, 3): dark below, light above, but for the few that are far out."""
+    """Return colours (N, 3) of points (N, 3), dark below and light above, between percentiles of the heights."""
     if not len(points):
         return np.zeros((0, 3), np.uint8)
     low, high = np.percentile(points[:, 2], (2, 98))

@@ -1,4 +1,4 @@
-"""Where the board stands: a file, a window, or a browser of this machine; nothing listens to other machines."""
+"""Targets of the viewer: a file, a window, or a browser of this machine; nothing is served to other machines."""
 
 from __future__ import annotations
 
@@ -21,43 +21,43 @@ import rerun as rr
 from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 
-INSTEAD: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
-NAME: Final = "omnid"
-HERE: Final = "127.0.0.1"
-LIMIT: Final = "2GB"  # of the viewer's memory; it forgets the oldest
-STARTS_S: Final = 30.0
-TICK_S: Final = 10.0
-SPARE_BYTES: Final = 64 << 20  # on a disk
-_PATIENCE_S: Final = 0.05
-_WHOLE_LOG: Final = 2**14  # bytes of what the viewer says that are looked at
+ALTERNATIVES: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
+APPLICATION: Final = "omnid"
+LOCALHOST: Final = "127.0.0.1"
+MEMORY_LIMIT: Final = "2GB"  # of the viewer's memory; it forgets the oldest
+TIMEOUT_S: Final = 30.0
+FLUSH_PERIOD_S: Final = 10.0
+MIN_FREE_BYTES: Final = 64 << 20  # on the disk
+_POLL_S: Final = 0.05
+_MAX_LOG_BYTES: Final = 2**14  # of the viewer's output, of which the last line is reported
 
 
 class ClosedError(OmnidError):
-    """Whoever looked has closed the viewer."""
+    """The user has closed the viewer."""
 
 
 class ViewerTarget(Protocol):
-    """Where a board stands: started once, left once."""
+    """Destination of a scene: started once, finished once."""
 
     def start(self, layout: Any) -> rr.RecordingStream:
-        """What the board draws on, with what lies where in it; OmnidError where there is none to be had."""
+        """Open the destination with a blueprint and return its stream. Raise OmnidError where that fails."""
 
-    def keep(self) -> None:
-        """Waits until all that is drawn has arrived, so that little is in hand; OmnidError where it cannot."""
+    def flush(self) -> None:
+        """Wait until everything drawn has arrived. Raise OmnidError where it cannot."""
 
     @property
     def closed(self) -> bool:
-        """Whether nobody looks any more."""
+        """True if the user has closed the viewer."""
 
-    def leave(self) -> str:
-        """Ends it, once everything is drawn; a line that tells where to find it."""
+    def finish(self) -> str:
+        """End it once everything is drawn. Return a line for the user that tells where to find it."""
 
     def abandon(self) -> None:
-        """Ends it after an error, so that nothing is left running."""
+        """End it after an error, so that no process is left running."""
 
 
 class RrdFile:
-    """A file that `rerun` opens."""
+    """An .rrd file, to be opened with `rerun`."""
 
     closed = False
 
@@ -65,14 +65,14 @@ class RrdFile:
         self._path = path
         self._stream: rr.RecordingStream | None = None
         if path.exists() and not path.is_file():
-            raise OmnidError(f"-o {path}: expected a file that can be written anew, found a device or a pipe")
+            raise OmnidError(f"-o {path}: expected a regular file, found a device or a pipe")
 
     def start(self, layout: Any) -> rr.RecordingStream:
-        """Opens the file."""
+        """Open the file."""
         self._require_room()
         batches = rr.ChunkBatcherConfig.DEFAULT()
-        batches.flush_tick = timedelta(seconds=TICK_S)  # nobody waits for it, and fewer pieces make a smaller file
-        stream = rr.RecordingStream(NAME, batcher_config=batches)
+        batches.flush_tick = timedelta(seconds=FLUSH_PERIOD_S)  # fewer pieces make a smaller file
+        stream = rr.RecordingStream(APPLICATION, batcher_config=batches)
         try:
             stream.save(self._path, layout)
         except (OSError, RuntimeError) as error:
@@ -80,84 +80,85 @@ class RrdFile:
         self._stream = stream
         return stream
 
-    def keep(self) -> None:
-        """Has everything written."""
+    def flush(self) -> None:
+        """Write everything."""
         self._require_room()
         if self._stream is not None:
-            _flush(self._stream, f"-o {self._path}: cannot be written any more")
+            _flush(self._stream, f"-o {self._path}: cannot be written")
 
     def _require_room(self) -> None:
-        """OmnidError where the disk is nearly full: on one that is, rerun 0.41 waits for ever and not even ends."""
+        """Raise OmnidError where the disk is nearly full: rerun 0.41 blocks for ever on a full one, at exit, too."""
         free = shutil.disk_usage(self._path.resolve().parent).free
-        if free < SPARE_BYTES:
-            raise OmnidError(f"-o {self._path}: the disk has {free >> 20} MB left, expected {SPARE_BYTES >> 20} MB to "
-                             "spare: make room, or name a file on another one")
+        if free < MIN_FREE_BYTES:
+            raise OmnidError(f"-o {self._path}: the disk has {free >> 20} MB left, expected {MIN_FREE_BYTES >> 20} MB "
+                             "or more: free some space, or name a file on another disk")
 
-    def leave(self) -> str:
-        """Where the file is."""
-        return f"{self._path}: look at it with `rerun {self._path}`, here or on another machine"
+    def finish(self) -> str:
+        """Return how to open the file."""
+        return f"{self._path}: open it with `rerun {self._path}`, here or on another machine"
 
     def abandon(self) -> None:
-        """What has been written stays."""
+        """Keep what has been written."""
 
 
 class Viewer:
-    """rerun's own viewer in a process of its own; a window outlives us, the server of a browser's does not."""
+    """rerun's viewer in a process of its own; a window outlives this program, the server for a browser does not."""
 
     def __init__(self, web: bool) -> None:
         self._web = web
         self._process: subprocess.Popen[bytes] | None = None
         self._stream: rr.RecordingStream | None = None
-        self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the viewer
+        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the viewer
         if not web:
             _require_display()
 
     def start(self, layout: Any) -> rr.RecordingStream:
-        """Starts the viewer and waits until it listens."""
+        """Start the viewer and wait until it accepts connections."""
         opt_out()
         port, web_port = _free_port(), _free_port()
-        url = f"rerun+http://{HERE}:{port}/proxy"
+        url = f"rerun+http://{LOCALHOST}:{port}/proxy"
         served = ["--serve-web", "--web-viewer-port", str(web_port)] if self._web else ["--expect-data-soon"]
-        self._process = _started(self._said, ["--bind", HERE, "--port", str(port), "--memory-limit", LIMIT,
-                                              "--server-memory-limit", LIMIT, "--hide-welcome-screen", *served])
-        _wait_for(port, self._process, self._said)
-        stream = rr.RecordingStream(NAME)
+        self._process = _started(self._output, ["--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen",
+                                                "--memory-limit", MEMORY_LIMIT, "--server-memory-limit", MEMORY_LIMIT,
+                                                *served])
+        _wait_for(port, self._process, self._output)
+        stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(url, default_blueprint=layout)
         self._stream = stream
         if self._web:
-            page = f"http://{HERE}:{web_port}/?url={quote(url, safe='')}"
-            print(f"omnid: look at {page} on this machine", file=sys.stderr, flush=True)
+            page = f"http://{LOCALHOST}:{web_port}/?url={quote(url, safe='')}"
+            print(f"omnid: open {page} on this machine", file=sys.stderr, flush=True)
         return stream
 
-    def keep(self) -> None:
-        """Has everything arrive."""
+    def flush(self) -> None:
+        """Wait until everything has arrived."""
         if self._stream is not None:
             self._require_viewer()
-            _flush(self._stream, "rerun's viewer takes nothing any more")
+            _flush(self._stream, "rerun's viewer does not accept data any more")
 
     @property
     def closed(self) -> bool:
-        """Whether the viewer has ended."""
+        """True if the viewer has ended."""
         return self._process is not None and self._process.poll() is not None
 
-    def leave(self) -> str:
-        """A window stays; what a browser looks at is served until Ctrl-C."""
+    def finish(self) -> str:
+        """Leave a window open; serve a browser until Ctrl-C."""
         if not self._web or self._process is None:
-            return "the window stays until it is closed"
+            return "the window stays open until it is closed"
         with handle_stop_signals(lambda *_: self.abandon()):
-            print("omnid: that is all; Ctrl-C ends it", file=sys.stderr, flush=True)
+            print("omnid: complete; Ctrl-C ends the server", file=sys.stderr, flush=True)
             self._process.wait()
         return "no longer served"
 
     def _require_viewer(self) -> None:
-        """ClosedError where it was closed, OmnidError where it failed: without a screen some do so after a while."""
+        """Raise ClosedError where it was closed, OmnidError where it failed, as some do later without a screen."""
         if self._process is not None and self.closed:
             if self._process.returncode:
-                raise OmnidError(f"rerun's viewer has failed ({_last_line(self._said)}): {INSTEAD}")
+                raise OmnidError(f"rerun's viewer has failed ({_last_line(self._output)}): {ALTERNATIVES}")
             raise ClosedError("rerun's viewer was closed")
 
     def abandon(self) -> None:
-        """Ends what serves a browser; a window stays."""
+        """End the server for a browser; leave a window open."""
         if self._web and self._process is not None:
             with suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGTERM)
@@ -165,53 +166,53 @@ class Viewer:
 
 def _flush(stream: rr.RecordingStream, fault: str) -> None:
     try:
-        stream.flush(timeout_sec=STARTS_S)
+        stream.flush(timeout_sec=TIMEOUT_S)
     except RuntimeError as error:
         raise OmnidError(f"{fault}: {error}") from error
 
 
 def opt_out() -> None:
-    """Has rerun send nothing about its use, for this user; `rerun analytics enable` takes it back."""
+    """Turn rerun's usage statistics off for this user; `rerun analytics enable` turns them on again."""
     with suppress(OSError, subprocess.SubprocessError):
-        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=STARTS_S, check=False)
+        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=TIMEOUT_S, check=False)
 
 
 def _require_display() -> None:
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise OmnidError(f"there is no display here to open a window on: {INSTEAD}")
+        raise OmnidError(f"there is no display to open a window on: {ALTERNATIVES}")
 
 
-def _rerun(words: list[str]) -> list[str]:
-    """The program that comes with rerun's package; `python -m rerun_cli` would keep its exit code to itself."""
-    return [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())", *words]
+def _rerun(arguments: list[str]) -> list[str]:
+    """Return the command line of rerun's viewer; `python -m rerun_cli` does not return its exit code."""
+    return [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())", *arguments]
 
 
-def _started(said: IO[bytes], words: list[str]) -> subprocess.Popen[bytes]:
-    """The viewer in a session of its own, that no Ctrl-C of ours ends; said: takes what it says."""
-    return subprocess.Popen(_rerun(words), stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True,
-                            env=os.environ | {"RUST_LOG": "warn"})
+def _started(output: IO[bytes], arguments: list[str]) -> subprocess.Popen[bytes]:
+    """Start the viewer in a session of its own, which Ctrl-C does not end."""
+    return subprocess.Popen(_rerun(arguments), stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                            start_new_session=True, env=os.environ | {"RUST_LOG": "warn"})
 
 
-def _wait_for(port: int, process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
-    deadline_s = time.monotonic() + STARTS_S
-    while not _answers(port):
+def _wait_for(port: int, process: subprocess.Popen[bytes], output: IO[bytes]) -> None:
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while not _accepts_connections(port):
         if process.poll() is not None or time.monotonic() > deadline_s:
-            raise OmnidError(f"rerun's viewer does not start ({_last_line(said)}): {INSTEAD}")
-        time.sleep(_PATIENCE_S)
+            raise OmnidError(f"rerun's viewer does not start ({_last_line(output)}): {ALTERNATIVES}")
+        time.sleep(_POLL_S)
 
 
-def _answers(port: int) -> bool:
+def _accepts_connections(port: int) -> bool:
     with socket.socket() as probe:
-        return probe.connect_ex((HERE, port)) == 0
+        return probe.connect_ex((LOCALHOST, port)) == 0
 
 
 def _free_port() -> int:
     with socket.socket() as probe:
-        probe.bind((HERE, 0))
+        probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])
 
 
-def _last_line(said: IO[bytes]) -> str:
-    said.seek(max(0, said.seek(0, os.SEEK_END) - _WHOLE_LOG))
-    lines = said.read().decode("utf-8", "replace").split("\n")
-    return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+def _last_line(output: IO[bytes]) -> str:
+    output.seek(max(0, output.seek(0, os.SEEK_END) - _MAX_LOG_BYTES))
+    lines = output.read().decode("utf-8", "replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "no output")

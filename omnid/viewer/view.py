@@ -1,4 +1,4 @@
-"""From what is to be shown to where it is shown."""
+"""Shows a log or a live robot in a file, a window or a browser."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from typing import Final, TypeAlias
 from drivers.logs.mcap_info import LogInfo, read_log_info
 from omnid.config import Config
 from omnid.errors import OmnidError
+from omnid.recordings.odometry_topic import choose_odometry_topic, odometry_topics
+from omnid.recordings.recording_reader import RecordingReader
 from omnid.runs.replay import ReplayOptions, Topics
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.viewer.layout import layout
-from omnid.viewer.live_robot import LiveRobotView
-from omnid.viewer.recorded_run import RecordedRunView, poses_topic
-from omnid.viewer.replayed_run import MAP_EVERY_S, ReplayedRunView
+from omnid.viewer.recording_view import RecordingView
+from omnid.viewer.replay_view import MAP_EVERY_S, ReplayView
 from omnid.viewer.rerun_scene import RerunScene
+from omnid.viewer.robot_view import RobotView
 from omnid.viewer.targets import ClosedError, RrdFile, Viewer, ViewerTarget
 
 PANORAMA: Final = "Panorama"
@@ -28,96 +30,110 @@ Replay: TypeAlias = Callable[[Path, Config, ReplayOptions], int]  # runs a log a
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """A log, and how to look at it."""
+    """A log and the options for its view."""
 
     path: Path
     robot: str | None = None
-    replay: bool = False  # from its images, though it has poses
+    topic: str | None = None  # of the poses
+    replay: bool = False  # compute from its images, although it has poses
     rig: Path | None = None
     topics: Topics = (None, None)
     settings: Path | None = None  # file of the configuration
 
 
-def place_for(out: Path | None, web: bool) -> ViewerTarget:
-    """The file that is named, else a viewer."""
+def target_for(out: Path | None, web: bool) -> ViewerTarget:
+    """Return the named file as target, else a viewer."""
     return RrdFile(out) if out is not None else Viewer(web)
 
 
-def check_file(out: Path | None, *read: tuple[str, Path | None]) -> None:
-    """OmnidError where the file cannot be written, or is one of those (what, path) that are read."""
+def check_file(out: Path | None, *inputs: tuple[str, Path | None]) -> None:
+    """Raise OmnidError where the file cannot be written, or is one of the inputs (description, path)."""
     if out is not None:
-        check_outputs([("-o", out)], [(what, path) for what, path in read if path is not None])
+        check_outputs([("-o", out)], [(what, path) for what, path in inputs if path is not None])
 
 
-def show_log(log: Log, config: Config, place: ViewerTarget, replay: Replay) -> int:
-    """Shows a log: the poses that are recorded in it, else what can be computed from its images; the exit code."""
+def show_log(log: Log, config: Config, target: ViewerTarget, replay: Replay) -> int:
+    """Show the recorded poses of a log, else what is computed from its images. Return the exit code."""
     found = read_log_info(log.path)
-    topic = None if log.replay else poses_topic(found, log.robot)
-    image = PANORAMA if topic is None else _title(RecordedRunView.images(found, topic))
-    board = RerunScene(place, layout(image, depth=topic is None), _most_messages(found, topic))
+    reader = _reader(found, log)
+    image = PANORAMA if reader is None else _image_title(reader)
+    scene = RerunScene(target, layout(image, depth=reader is None), _max_poses(found, reader))
     code = 0
-    with _closing(board, place):
-        code = _recorded(found, topic, board) if topic else _computed(log, config, board, replay)
-    return _ended(board, place, code)
+    with _closing(scene, target):
+        code = _replayed(log, config, scene, replay) if reader is None else _recorded(reader, scene)
+    return _finish(scene, target, code)
 
 
-def show_robot(bus: BusConfig, seconds: float | None, place: ViewerTarget) -> int:
-    """Shows a robot; the exit code, 1 where not one pose came."""
-    board = RerunScene(place, layout(PANORAMA, depth=False))
-    with _closing(board, place):
-        LiveRobotView(board).follow(bus, place, seconds)
-    return _ended(board, place, int(not board.poses))
+def show_robot(bus: BusConfig, seconds: float | None, target: ViewerTarget) -> int:
+    """Show a live robot. Return the exit code, 1 where no pose arrived."""
+    scene = RerunScene(target, layout(PANORAMA, depth=False))
+    with _closing(scene, target):
+        RobotView(scene).follow(bus, target, seconds)
+    return _finish(scene, target, int(not scene.poses))
 
 
-def _title(topic: str) -> str:
-    """Of the images of a topic."""
-    return "" if not topic else PANORAMA if topic.endswith("panorama") else "Lower camera"
+def _reader(found: LogInfo, log: Log) -> RecordingReader | None:
+    """Return a reader of the recorded run; None where the log is to be replayed."""
+    named = log.topic is not None or log.robot is not None
+    if log.replay or not (named or odometry_topics(found)):
+        return None
+    return RecordingReader(found, choose_odometry_topic(found, log.topic, log.robot))
+
+
+def _image_title(reader: RecordingReader) -> str:
+    """Return the title of the recorded images, "" where there are none."""
+    name = reader.image_name()
+    if not name:
+        return ""
+    return PANORAMA if name == "panorama" else "Lower camera"
 
 
 @contextmanager
-def _closing(board: RerunScene, place: ViewerTarget) -> Iterator[None]:
-    """Has all arrive that was drawn, whatever ends it; that somebody closes the window is an end like others."""
+def _closing(scene: RerunScene, target: ViewerTarget) -> Iterator[None]:
+    """Flush and close the scene at the end. A viewer that the user closes is a normal end."""
     try:
         yield
-        board.close()
+        scene.close()
     except ClosedError as closed:
         print(f"omnid: {closed}", file=sys.stderr)
     except BaseException:
-        place.abandon()
+        target.abandon()
         raise
     finally:
-        with suppress(OmnidError):  # it was told already, or is not what ended it
-            board.close()
+        with suppress(OmnidError):  # reported already, or not the cause of the end
+            scene.close()
 
 
-def _computed(log: Log, config: Config, board: RerunScene, replay: Replay) -> int:
+def _replayed(log: Log, config: Config, scene: RerunScene, replay: Replay) -> int:
     options = ReplayOptions(rig=log.rig, topics=log.topics, settings=log.settings, map_every_s=MAP_EVERY_S,
-                            observer=lambda place, telemetry: ReplayedRunView(board, place, telemetry))
+                            observer=lambda geometry, telemetry: ReplayView(scene, geometry, telemetry))
     return replay(log.path, config, options)
 
 
-def _recorded(found: LogInfo, topic: str, board: RerunScene) -> int:
-    recorded = RecordedRunView(found, topic, board)
-    recorded.show()
-    if recorded.broken or recorded.damaged:
-        print(f"omnid: warning: {found.path}: {recorded.broken} messages and {recorded.damaged} pieces of the file "
-              "cannot be read and are left out", file=sys.stderr)
-    if not board.poses:
-        raise OmnidError(f"{found.path}: topic {topic!r} has no message that is a pose: is the recording cut?")
+def _recorded(reader: RecordingReader, scene: RerunScene) -> int:
+    path = reader.info.path
+    RecordingView(reader, scene).show()
+    unreadable = reader.unreadable.total()
+    if unreadable or reader.damaged:
+        print(f"omnid: warning: {path}: {unreadable} messages and {reader.damaged} pieces of the file cannot be read "
+              "and are left out", file=sys.stderr)
+    if not scene.poses:
+        raise OmnidError(f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
+                         "the log is complete")
     return 0
 
 
-def _most_messages(found: LogInfo, topic: str | None) -> int:
-    """How many poses there will be at the most."""
-    if topic is not None:
-        return found.topics[topic][1]
-    return max((count for kind, count in found.topics.values() if kind.startswith("sensor_msgs/msg/")), default=0)
+def _max_poses(found: LogInfo, reader: RecordingReader | None) -> int:
+    """Return an upper bound of the number of poses."""
+    if reader is not None:
+        return found.topics[reader.topic][1]
+    return max((count for schema, count in found.topics.values() if schema.startswith("sensor_msgs/msg/")), default=0)
 
 
-def _ended(board: RerunScene, place: ViewerTarget, code: int) -> int:
-    if board.poses:
-        of_all = f" of {board.offered}" if board.offered > board.poses else ""
-        print(f"{board.poses} poses{of_all} and {board.images} images shown")
-    if board.poses and not place.closed:
-        print(place.leave(), flush=True)
+def _finish(scene: RerunScene, target: ViewerTarget, code: int) -> int:
+    if scene.poses:
+        total = f" of {scene.offered}" if scene.offered > scene.poses else ""
+        print(f"{scene.poses} poses{total} and {scene.images} images shown")
+    if scene.poses and not target.closed:
+        print(target.finish(), flush=True)
     return code

@@ -17,6 +17,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
 from omnid.transport.image_codec import image_cdr, image_topic
+from omnid.transport.status_names import ODOMETRY, Key
 
 START_NS = 1_700_000_000 * 10**9 + 123_456_789
 PERIOD_NS = 33_333_333
@@ -84,10 +85,10 @@ def _said(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, str, b
 
 
 def _status(stamp_ns: int) -> tuple[str, str, bytes, dict[str, Any]]:
-    status = codec.DiagnosticStatus("omnid: odometry", 1, "über 90 °C", {"landmarks": "3 of 4"})
+    status = codec.DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
     message = {"header": _header(stamp_ns, ""),
-               "status": [{"level": 1, "name": "omnid: odometry", "message": "über 90 °C", "hardware_id": "",
-                           "values": [{"key": "landmarks", "value": "3 of 4"}]}]}
+               "status": [{"level": 1, "name": ODOMETRY, "message": "über 90 °C", "hardware_id": "",
+                           "values": [{"key": "inliers", "value": "3"}]}]}
     return "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]), message
 
 

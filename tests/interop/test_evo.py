@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omnid.formats.tum import read_tum
-from omnid.recordings.run_reader import read_run
+from omnid.recordings.run_series import read_run_series
 from tests.interop.conftest import Known
 from tests.interop.programs import program, run
 
@@ -29,7 +29,7 @@ def test_poses_are_those_that_were_written(known: Known, tmp_path: Path, topic: 
 
 
 def test_poses_of_a_live_run_are_those_that_omnid_reads(live: Path, tmp_path: Path) -> None:
-    found, own = trajectory(live, tmp_path, "odom"), read_run(live).poses
+    found, own = trajectory(live, tmp_path, "odom"), read_run_series(live).poses
     assert (np.abs(read_tum(tmp_path / "omnid_odom.tum").stamps_ns - own.stamps_ns) < MICROSECOND_NS).all()
     np.testing.assert_allclose(found[:, 1:], own.values, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""What a live daemon says of itself, part by part."""
+"""Status entries of a live daemon."""
 
 from __future__ import annotations
 
@@ -22,65 +22,65 @@ from omnid.core.control.control_law import ControllerSettings, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.diagnostics.status import SILENT_S, StatusReport, StatusSources, StatusTick
+from omnid.diagnostics.status import TIMEOUT_S, StatusCollector, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name
 from tests.simulation import build
 
 SIZE = 256
 JPEG = cv2.imencode(".jpg", np.full((SIZE, SIZE), 90, np.uint8))[1].tobytes()
 
 
-class Wheels:
-    """A controller that takes everything."""
+class AcceptingMotor:
+    """A motor driver that accepts all commands."""
 
     fault = 0
 
     def send(self, command: VelocityCommand) -> MotorStatus:
-        """Taken."""
+        """Accept a command."""
         return MotorStatus(0.0, 0.0, 0.0, False, self.fault, 12.0)
 
     def close(self) -> None:
-        """Done."""
+        """Do nothing."""
 
 
 class Daemon:
-    """The parts that are asked."""
+    """The parts of a daemon whose status is collected."""
 
     def __init__(self, rig: Rig) -> None:
-        self.telemetry, self.tally, self.latency = Telemetry(), RunStatistics(), Latency()
+        self.telemetry, self.statistics, self.latency = Telemetry(), RunStatistics(), Latency()
         self.stages = [self.telemetry.add(StageStats(name)) for name in ("stereo", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
-        self.wheels = Wheels()
-        self.controller = Controller(self.wheels, ControllerSettings(), 0.05)
-        self.logbook = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(self._take, lambda: self.controller.stop(time.monotonic_ns()), 0.5)
-        self.report = StatusReport(
+        self.motor = AcceptingMotor()
+        self.controller = Controller(self.motor, ControllerSettings(), 0.05)
+        self.controller_statistics = ControllerStatistics(self.stages[1])
+        self.commands = CommandReceiver(
+            lambda setpoint, arrival_ns: self.controller.set_command(TimedSetpoint(arrival_ns, setpoint)),
+            lambda: self.controller.stop(time.monotonic_ns()), 0.5)
+        self.report = StatusCollector(
             StatusSources(
                 self.telemetry,
                 self.cameras,
                 self.pair,
-                self.tally,
+                self.statistics,
                 self.latency.to_pose,
-                self.logbook,
+                self.controller_statistics,
                 self.commands,
                 frozenset({"motor"}),
             )
         )
 
-    def _take(self, setpoint: Setpoint, arrival_ns: int) -> None:
-        self.controller.set_command(TimedSetpoint(arrival_ns, setpoint))
-
-    def asked(self) -> dict[str, DiagnosticStatus]:
-        """All that is said, by name, after it has proved fit for the wire."""
+    def collected(self) -> dict[str, DiagnosticStatus]:
+        """Return all entries by short name, after encoding them."""
         statuses = self.report()
         diagnostics_cdr(time.time_ns(), statuses)
-        return {status.name.removeprefix("omnid: "): status for status in statuses}
+        return {short_name(status.name): status for status in statuses}
 
     def shoot(self, *cameras: Camera, age_s: float = 0.0, data: bytes = JPEG) -> None:
         for camera in cameras:
@@ -92,12 +92,12 @@ class Daemon:
         depth: Any = None
         odometry = OdometryUpdate(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
                             np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
-        self.tally.process(odometry)
+        self.statistics.process(odometry)
         self.latency.process(odometry)
         self.controller.set_pose(controller_pose(odometry, np.eye(4)))
 
     def tick(self) -> None:
-        self.logbook.add(self.controller.tick())
+        self.controller_statistics.add(self.controller.tick())
 
 
 @pytest.fixture(scope="module")
@@ -110,99 +110,102 @@ def daemon(rig: Rig) -> Daemon:
     return Daemon(rig)
 
 
-def test_a_daemon_that_has_seen_nothing(daemon: Daemon) -> None:
-    said = daemon.asked()
-    assert (said["odometry"].level, said["odometry"].message) == (STALE, "no pose yet")
-    assert said["pairing"].message == "no images of the lower and the upper camera"
-    assert said["wheels"].message == "no command" and said["wheels"].level == OK
-    assert said["stage stereo"].values["dropped"] == "0" and said["stage motor"].values["missed"] == "0"
+def test_daemon_without_images(daemon: Daemon) -> None:
+    entries = daemon.collected()
+    assert (entries["odometry"].level, entries["odometry"].message) == (STALE, "no pose yet")
+    assert entries["pairing"].message == "no images of the lower and the upper camera"
+    assert entries["wheels"].message == "no command" and entries["wheels"].level == OK
+    assert entries["stage stereo"].values["dropped"] == "0" and entries["stage motor"].values["missed"] == "0"
 
 
 @pytest.mark.parametrize(("state", "level"), [("tracking", OK), ("degraded", WARN), ("lost", ERROR)])
-def test_states_of_the_odometry(daemon: Daemon, state: str, level: int) -> None:
+def test_level_follows_the_tracking_state(daemon: Daemon, state: str, level: int) -> None:
     daemon.pose(state)
-    said = daemon.asked()["odometry"]
-    assert (said.level, said.message) == (level, state) and said.values["landmarks"] == "80 of 99"
-    assert 0.0 <= float(said.values["capture_to_pose_max_ms"]) < 1e5
+    status = daemon.collected()["odometry"]
+    assert (status.level, status.message) == (level, state) and landmark_counts(status.values) == (80, 99)
+    assert 0.0 <= float(status.values["capture_to_pose_max_ms"]) < 1e5
 
 
-def test_an_old_pose_is_stale_whatever_its_state(daemon: Daemon) -> None:
-    daemon.pose(age_s=SILENT_S + 0.5)
-    said = daemon.asked()["odometry"]
-    assert said.level == STALE and said.message.startswith("no pose for 1.5")
+def test_an_old_pose_is_stale_in_every_state(daemon: Daemon) -> None:
+    daemon.pose(age_s=TIMEOUT_S + 0.5)
+    status = daemon.collected()["odometry"]
+    assert (status.level, status.message) == (STALE, "no new pose")
+    assert float(status.values[Key.AGE_S]) == pytest.approx(TIMEOUT_S + 0.5, abs=0.2)
 
 
-def test_cameras_in_step(daemon: Daemon) -> None:
-    daemon.asked()
+def test_synchronised_cameras(daemon: Daemon) -> None:
+    daemon.collected()
     daemon.shoot("lower", "upper")
-    said = daemon.asked()
-    pairing = said["pairing"]
-    assert (pairing.level, pairing.message, pairing.values["pairs"]) == (OK, "in step", "1")
-    assert {said[f"{name} camera"].level for name in ("lower", "upper")} == {OK}
-    assert said["lower camera"].message == "streaming" and float(said["lower camera"].values["rate_hz"]) > 0
+    entries = daemon.collected()
+    pairing = entries["pairing"]
+    assert (pairing.level, pairing.message, pairing.values["pairs"]) == (OK, "synchronised", "1")
+    assert {entries[f"{name} camera"].level for name in ("lower", "upper")} == {OK}
+    assert entries["lower camera"].message == "streaming" and float(entries["lower camera"].values["rate_hz"]) > 0
 
 
-def test_a_camera_that_says_nothing_is_named(daemon: Daemon) -> None:
+def test_a_camera_without_images_is_named(daemon: Daemon) -> None:
     daemon.shoot("lower")
-    daemon.shoot("upper", age_s=SILENT_S + 2)
-    said = daemon.asked()
-    assert (said["pairing"].level, said["pairing"].message) == (WARN, "no images of the upper camera")
-    assert said["upper camera"].level == ERROR and said["upper camera"].message.startswith("no image for 3.0")
-    assert said["lower camera"].level == OK
+    daemon.shoot("upper", age_s=TIMEOUT_S + 2)
+    entries = daemon.collected()
+    assert (entries["pairing"].level, entries["pairing"].message) == (WARN, "no images of the upper camera")
+    assert (entries["upper camera"].level, entries["upper camera"].message) == (ERROR, "no new image")
+    assert float(entries["upper camera"].values[Key.AGE_S]) == pytest.approx(TIMEOUT_S + 2, abs=0.2)
+    assert entries["lower camera"].level == OK
 
 
-def test_a_lost_camera_tells_why(daemon: Daemon) -> None:
+def test_a_lost_camera_has_the_reason(daemon: Daemon) -> None:
     daemon.shoot("lower", "upper")
     daemon.cameras["lower"].status, daemon.cameras["lower"].problem = "lost", "it was unplugged"
-    said = daemon.asked()["lower camera"]
-    assert (said.level, said.message) == (ERROR, "it was unplugged")
+    status = daemon.collected()["lower camera"]
+    assert (status.level, status.message) == (ERROR, "it was unplugged")
 
 
-def test_images_that_never_meet_and_images_that_are_none(daemon: Daemon) -> None:
-    daemon.asked()
+def test_images_without_a_partner_and_images_that_cannot_be_decoded(daemon: Daemon) -> None:
+    daemon.collected()
     daemon.shoot("lower")
     daemon.shoot("upper", age_s=0.3)
-    assert "pair.tolerance_ms" in daemon.asked()["pairing"].message
+    assert "pair.tolerance_ms" in daemon.collected()["pairing"].message
     daemon.shoot("lower", "upper", data=b"no image")
-    said = daemon.asked()["pairing"]
-    assert said.level == WARN and "cannot be decoded" in said.message and said.values["broken"] == "2"
+    status = daemon.collected()["pairing"]
+    assert status.level == WARN and "cannot be decoded" in status.message and status.values["broken"] == "2"
 
 
-def test_a_stage_tells_what_a_message_takes_and_what_of_it_is_its_own(daemon: Daemon) -> None:
+def test_a_stage_has_wall_time_and_processor_time(daemon: Daemon) -> None:
     daemon.stages[0].timed(lambda: time.sleep(0.02))
-    values = daemon.asked()["stage stereo"].values
+    values = daemon.collected()["stage stereo"].values
     assert float(values["work_p50_ms"]) >= 19 and float(values["cpu_p50_ms"]) < float(values["work_p50_ms"]) / 2
 
 
-def test_wheels(daemon: Daemon) -> None:
+def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
     daemon.pose()
     daemon.controller.set_command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
     daemon.tick()
-    said = daemon.asked()["wheels"]
-    assert (said.level, said.message) == (OK, "driving") and said.values["sent"] == "1"
-    assert "capture_to_wheel_p50_ms" in said.values and "tick_late_p99_ms" in said.values
+    status = daemon.collected()["wheels"]
+    assert (status.level, status.message) == (OK, "driving") and status.values["sent"] == "1"
+    assert "capture_to_wheel_p50_ms" in status.values and "tick_late_p99_ms" in status.values
     daemon.pose("lost")
     daemon.tick()
-    said = daemon.asked()["wheels"]
-    assert (said.level, said.message) == (WARN, "the pose is lost") and said.values["stopped, the pose is lost"] == "1"
-    daemon.wheels.fault = 7
+    status = daemon.collected()["wheels"]
+    assert (status.level, status.message) == (WARN, "the pose is lost")
+    assert status.values["stopped, the pose is lost"] == "1"
+    daemon.motor.fault = 7
     daemon.tick()
-    said = daemon.asked()["wheels"]
-    assert said.level == ERROR and said.values["fault"] == "7"
+    status = daemon.collected()["wheels"]
+    assert status.level == ERROR and status.values["fault"] == "7"
 
 
-def test_refused_commands_are_told_by_reason(daemon: Daemon) -> None:
+def test_refused_commands_are_counted_by_reason(daemon: Daemon) -> None:
     for payload in (b"", b"x" * 5000):
         daemon.commands.receive("cmd/twist", payload)
-    values = daemon.asked()["wheels"].values
+    values = daemon.collected()["wheels"].values
     assert values["refused, malformed"] == values["refused, too long"] == "1" and values["commands"] == "0"
 
 
-def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
-    """New reasons appear while the old ones are told."""
+def test_collects_while_other_threads_change_counters(daemon: Daemon) -> None:
+    """New reasons appear while the old ones are copied."""
     halt = threading.Event()
 
-    def meddle() -> None:
+    def change_counters() -> None:
         number = 0
         while not halt.is_set():
             number = (number + 1) % 300
@@ -210,7 +213,7 @@ def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
                 daemon.commands.refused.clear()
             daemon.commands.refused[f"reason {number}"] += 1
 
-    thread = threading.Thread(target=meddle)
+    thread = threading.Thread(target=change_counters)
     thread.start()
     try:
         for _ in range(300):
@@ -220,7 +223,7 @@ def test_reports_bear_what_other_threads_do_meanwhile(daemon: Daemon) -> None:
         thread.join()
 
 
-def test_the_tick_hands_the_report_to_everybody(daemon: Daemon) -> None:
-    heard: list[list[DiagnosticStatus]] = []
-    StatusTick(daemon.report, heard.append, heard.append)()
-    assert len(heard) == 2 and heard[0] is heard[1] and heard[0][0].name == "omnid: odometry"
+def test_tick_passes_the_report_to_all_consumers(daemon: Daemon) -> None:
+    received: list[list[DiagnosticStatus]] = []
+    StatusTick(daemon.report, received.append, received.append)()
+    assert len(received) == 2 and received[0] is received[1] and received[0][0].name == ODOMETRY

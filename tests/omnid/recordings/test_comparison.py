@@ -1,4 +1,4 @@
-"""`omnid diff` on recordings whose differences are known, and on files that are none."""
+"""`omnid diff` on recordings with known differences, and on invalid files."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import pytest
 from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from omnid.recordings import run_reader as recorded_run
-from omnid.recordings.run_reader import read_run
+from omnid.recordings import run_series
+from omnid.recordings.run_series import read_run_series
 from omnid.recordings.series_differences import Series, gaps, pose_excess
 from omnid.recordings.settings_differences import table_differences
 from omnid.transport import codec
+from omnid.transport.status_names import ODOMETRY
 from tests.drivers.logs.mcap_logs import START_NS
 
 PERIOD_NS = 10**8
@@ -25,7 +26,7 @@ COUNT = 20
 
 
 def pose(index: int, off_m: float = 0.0, off_deg: float = 0.0) -> np.ndarray:
-    """On a circle, put aside by so much."""
+    """Return a pose on a circle, displaced and rotated by so much."""
     turn = se3.rotation_exp((0, 0, 0.1 * index + math.radians(off_deg)))
     return se3.transform(turn, (math.sin(0.1 * index), 1 - math.cos(0.1 * index) + off_m, 0.0))
 
@@ -39,34 +40,34 @@ def text_of(index: int) -> str:
 
 
 class Recording:
-    """A recording as a run writes it, with what is wanted in it."""
+    """Writer of a recording as a run writes it."""
 
     def __init__(self, path: Path, settings: str = "", robot: str = "omnid") -> None:
         self.path, self._robot = path, robot
         self._writer = LogWriter(path, {"omnid.toml": settings.encode(), "rig.toml": b"schema = 1\n"})
 
     def add(self, topic: str, schema: str, data: bytes, index: int) -> None:
-        """Any message."""
+        """Add any message."""
         self._writer.write(f"/{self._robot}/{topic}", schema, data, stamp_ns(index))
 
     def odom(self, index: int, T: np.ndarray) -> None:
-        """A pose."""
+        """Add a pose."""
         zero = np.zeros((6, 6))
         data = codec.odometry_cdr(stamp_ns(index), T, zero, np.zeros(6), zero)
         self.add("odom", codec.ODOMETRY_SCHEMA, data, index)
 
     def state(self, index: int, state: str, resets: int = 0) -> None:
-        """A change of the state."""
-        said = codec.DiagnosticStatus("omnid: odometry", 0, state, {"state": state, "resets": str(resets)})
-        self.add("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns(index), [said]), index)
+        """Add a change of the state."""
+        status = codec.DiagnosticStatus(ODOMETRY, 0, state, {"state": state, "resets": str(resets)})
+        self.add("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns(index), [status]), index)
 
     def drive(self, index: int, velocity_mps: float) -> None:
-        """A command."""
+        """Add a command."""
         data = codec.twist_stamped_cdr(stamp_ns(index), "base_link", velocity_mps, 0.0)
         self.add("drive", codec.TWIST_SCHEMA, data, index)
 
     def done(self) -> Path:
-        """The whole file."""
+        """Complete the file and return its path."""
         self._writer.close()
         return self.path
 
@@ -81,7 +82,7 @@ def run_of(path: Path, poses: Sequence[tuple[int, np.ndarray]], settings: str = 
 
 
 def circle(off_from: int = COUNT, off_m: float = 0.0, off_deg: float = 0.0) -> list[tuple[int, np.ndarray]]:
-    """All poses; those from one number on are put aside."""
+    """Return all poses; those from one index on are displaced."""
     return [(i, pose(i, off_m, off_deg) if i >= off_from else pose(i)) for i in range(COUNT)]
 
 
@@ -97,109 +98,109 @@ def first(tmp_path: Path) -> Path:
     return run_of(tmp_path / "a.mcap", circle())
 
 
-def test_the_same_file_is_identical(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_a_copy_is_identical(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = tmp_path / "copy.mcap"
     other.write_bytes(first.read_bytes())
     code, out = diff(capsys, first, other)
     assert code == 0 and out.endswith("are identical, byte for byte\n")
 
 
-def test_the_same_poses_in_another_file_agree_to_the_last_bit(
+def test_the_same_poses_in_another_file_are_bit_identical(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
 ) -> None:
     code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", circle(), "a = 1"))
-    assert code == 0 and "to the last bit the same" in out and "at most 0.000 mm, 0.0000 deg" in out
+    assert code == 0 and "bit-identical" in out and "at most 0.000 mm, 0.0000 deg" in out
     assert "a: A nothing, B 1" in out and "rig        the same" in out
 
 
-def test_where_they_part_and_by_how_much(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_reports_the_first_difference(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = run_of(tmp_path / "b.mcap", circle(12, 0.0071, 0.03))
     code, out = diff(capsys, first, other)
-    assert code == 1 and out.endswith("they part: poses\n")
+    assert code == 1 and out.endswith("the runs differ: poses\n")
     assert f"more than 5 mm or 0.1 deg first at {text_of(12)}: 7.100 mm, 0.0300 deg; at 8 poses in all" in out
-    assert f"the same to the last bit before {text_of(12)}" in out
+    assert f"bit-identical before {text_of(12)}" in out
     assert diff(capsys, first, other, "--tolerance-mm", 7.2)[0] == 0
     code, out = diff(capsys, first, other, "--tolerance-mm", 7.2, "--tolerance-deg", 0.02)
     assert code == 1 and f"first at {text_of(12)}: 7.100 mm" in out
 
 
-def test_at_most_and_at_the_end_are_told_apart(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_reports_maximum_and_last_difference(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     bent = [(i, pose(i, 0.02 if i == 7 else 0.001 if i == COUNT - 1 else 0.0)) for i in range(COUNT)]
     code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", bent))
     assert code == 1 and "at most 20.000 mm, 0.0000 deg; at the end 1.000 mm, 0.0000 deg" in out
 
 
-def test_half_a_turn_is_no_small_difference(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_detects_a_rotation_by_half_a_turn(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     code, out = diff(capsys, first, run_of(tmp_path / "b.mcap", circle(3, 0.0, 180.0)))
     assert code == 1 and "at most 0.000 mm, 180.0000 deg" in out
 
 
-def test_either_side_of_half_a_turn_is_near(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_angles_wrap_at_half_a_turn(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     both = [run_of(tmp_path / f"{name}.mcap", [(0, se3.exp((0, 0, 0, 0, 0, math.radians(turn_deg))))])
             for name, turn_deg in (("a", 170), ("b", -170))]
     code, out = diff(capsys, *both)
     assert code == 1 and "at most 0.000 mm, 20.0000 deg" in out
 
 
-def test_poses_that_one_run_lacks(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_reports_poses_that_one_run_lacks(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     lost = [(i, T) for i, T in circle() if i not in (4, 9, 10, 11)]
     other = run_of(tmp_path / "b.mcap", lost)
     code, out = diff(capsys, first, other)
-    assert code == 1 and "they part: less than 90% of the poses are in both" in out
+    assert code == 1 and "the runs differ: less than 90% of the poses are in both" in out
     assert "in both    16 poses (80.0% of the longer run)" in out
-    assert f"only in A  4 poses in 2 stretches, the longest of 3 from {text_of(9)} on" in out
+    assert f"only in A  4 poses in 2 gaps, the longest of 3 from {text_of(9)} on" in out
     assert "only in B  none" in out
     assert diff(capsys, first, other, "--shared", 80)[0] == 0
 
 
-def test_states_and_resets_that_differ(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_reports_different_states_and_resets(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = Recording(tmp_path / "b.mcap")
     for i, T in circle():
         other.odom(i, T)
     for index, state, resets in ((0, "tracking", 0), (8, "lost", 0), (11, "degraded", 1), (13, "tracking", 1)):
         other.state(index, state, resets)
     code, out = diff(capsys, first, other.done())
-    assert code == 1 and out.endswith("they part: states\n")
+    assert code == 1 and out.endswith("the runs differ: states\n")
     assert "states     A 0 changes, 0 resets; B 3 changes, 1 resets" in out
-    assert f"others at 12 poses, first at {text_of(8)}: A tracking after 0 resets, B lost after 0 resets" in out
+    assert f"different at 12 poses, first at {text_of(8)}: A tracking after 0 resets, B lost after 0 resets" in out
 
 
-def test_a_run_without_states_differs_in_none(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_a_run_without_states_agrees(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = Recording(tmp_path / "b.mcap")
     for i, T in circle():
         other.odom(i, T)
     code, out = diff(capsys, first, other.done())
-    assert code == 0 and "; B tells none" in out and "commands   A 20, B 0, 0 of the same stamps" in out
+    assert code == 0 and "; B reports none" in out and "commands   A 20, B 0, 0 of the same stamps" in out
 
 
-def test_commands_that_differ(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_reports_different_commands(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = Recording(tmp_path / "b.mcap")
     for i, T in circle():
         other.odom(i, T)
         other.drive(i, 0.3 if i < 15 else 0.31)
     code, out = diff(capsys, first, other.done())
-    assert code == 1 and out.endswith("they part: commands\n")
+    assert code == 1 and out.endswith("the runs differ: commands\n")
     assert f"first at {text_of(15)}: 10.000 mm/s, 0.0000 deg/s; 5 commands in all" in out
 
 
-def test_runs_that_start_elsewhere_can_be_aligned(
+def test_aligns_runs_with_different_starts(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
 ) -> None:
     elsewhere = se3.exp((3.0, -1.0, 0.2, 0.0, 0.0, 2.0))
     other = run_of(tmp_path / "b.mcap", [(i, elsewhere @ T) for i, T in circle()[2:]])
     code, out = diff(capsys, first, other)
-    assert code == 1 and "with --align the first pose of B is laid on that of A" in out
+    assert code == 1 and "--align moves B so that they coincide" in out
     code, out = diff(capsys, first, other, "--align")
     assert code == 0 and "at most 0.000 mm, 0.0000 deg" in out
 
 
-def test_other_clocks_are_refused_with_advice(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
+def test_refuses_runs_without_common_stamps(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     other = run_of(tmp_path / "b.mcap", [(i + 100, T) for i, T in circle()])
     code, line = diff(capsys, first, other)
     assert code == 2 and line.count("\n") == 1 and "has the same stamp" in line and "omnid replay" in line
 
 
-def test_a_run_cut_short_says_what_is_compared(
+def test_a_cut_file_is_compared_as_far_as_it_goes(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
 ) -> None:
     cut = tmp_path / "cut.mcap"
@@ -209,7 +210,7 @@ def test_a_run_cut_short_says_what_is_compared(
     assert "cut or corrupt" in capsys.readouterr().err
 
 
-def test_foreign_bytes_and_repeated_stamps_are_told(
+def test_warns_of_unreadable_messages_and_repeated_stamps(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
 ) -> None:
     other = Recording(tmp_path / "b.mcap")
@@ -219,14 +220,14 @@ def test_foreign_bytes_and_repeated_stamps_are_told(
     other.drive(COUNT, math.nan)
     assert main(["diff", str(first), str(other.done())]) == 0
     err = capsys.readouterr().err
-    assert "1 messages on '/omnid/odom' are no nav_msgs/msg/Odometry" in err and "have a stamp that came before" in err
-    assert "1 messages on '/omnid/drive' are no geometry_msgs/msg/TwistStamped" in err
+    assert "1 messages on '/omnid/odom' cannot be read" in err and "repeat a stamp" in err
+    assert "1 messages on '/omnid/drive' cannot be read" in err
 
 
 WRONG = {
     "no file": (["{a}", "none.mcap"], "none.mcap"),
     "no log": (["{a}", "{text}"], "is not an MCAP log"),
-    "no poses": (["{a}", "{bare}"], "omnid replay"),
+    "no poses": (["{a}", "{bare}"], "expected a recording of a run"),
     "no such topic": (["{a}", "{a}", "--topic", "/x"], "'/omnid/odom'"),
     "several topics": (["{a}", "{two}"], "--topic"),
     "nan": (["{a}", "{a}", "--tolerance-mm", "nan"], "--tolerance-mm nan"),
@@ -241,7 +242,7 @@ def test_wrong_input_gives_one_line(
     words, expected = WRONG[case]
     bare, two = Recording(tmp_path / "bare.mcap"), Recording(tmp_path / "two.mcap")
     bare.drive(0, 1.0)
-    for topic in ("odom", "other"):
+    for topic in ("pose", "other"):
         zero = np.zeros((6, 6))
         two.add(topic, codec.ODOMETRY_SCHEMA, codec.odometry_cdr(START_NS, np.eye(4), zero, np.zeros(6), zero), 0)
     (tmp_path / "text").write_text("no log")
@@ -250,7 +251,7 @@ def test_wrong_input_gives_one_line(
     assert code == 2 and line.count("\n") == 1 and expected in line
 
 
-def test_of_several_topics_the_named_one_counts(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_compares_the_named_topic(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for name, off_m in (("a", 0.0), ("b", 1.0)):
         recording = Recording(tmp_path / f"{name}.mcap")
         for i in range(3):
@@ -264,13 +265,13 @@ def test_of_several_topics_the_named_one_counts(capsys: pytest.CaptureFixture[st
     assert diff(capsys, *both, "--topic", "/omnid/wheels")[0] == 1
 
 
-def test_what_cannot_be_held_is_refused(tmp_path: Path, first: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorded_run, "MOST", COUNT - 1)
-    with pytest.raises(recorded_run.OmnidError, match="cut it into shorter ones"):
-        read_run(first)
+def test_refuses_recordings_that_are_too_long(tmp_path: Path, first: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_series, "MAX_ROWS", COUNT - 1)
+    with pytest.raises(run_series.OmnidError, match="cut it into shorter ones"):
+        read_run_series(first)
 
 
-def test_keys_are_named_by_their_paths() -> None:
+def test_names_keys_by_their_paths() -> None:
     a = {"rig": {"T": [[1.0, 0.0], [0.0, 1.0]], "name": "x"}, "same": 1, "flag": True}
     b = {"rig": {"T": [[1.0, 0.0], [0.5, 1.0]], "name": "x"}, "same": 1.0, "flag": 1, "new": "y" * 100}
     found = table_differences(a, b)
@@ -279,18 +280,18 @@ def test_keys_are_named_by_their_paths() -> None:
     assert found[2].path == "new" and found[2].a == "nothing" and found[2].b.endswith("(102 characters)")
 
 
-def test_stretches_that_are_missing() -> None:
+def test_finds_gaps() -> None:
     whole, other = (Series(np.array(stamps), np.zeros((len(stamps), 1))) for stamps in ([1, 2, 3, 4, 5, 6], [2, 5]))
     found = gaps(whole, other)
     assert (found.missing, found.stretches, found.longest, found.longest_ns) == (4, 3, 2, 3)
     assert gaps(other, whole).missing == 0
 
 
-def test_angles_are_exact_where_they_are_tiny() -> None:
+def test_small_angles_are_exact() -> None:
     stamps = np.array([1, 2])
     angles = (1e-9, 1e-4)
     a = Series(stamps, np.tile([0, 0, 0, *se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)))], (2, 1)))
     turned = [se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)) @ se3.rotation_exp((0, angle, 0))) for angle in angles]
     b = Series(stamps, np.array([[0, 0, 0, *q] for q in turned]))
     np.testing.assert_allclose(pose_excess(a, b, 0, 0).amounts[:, 1], angles, rtol=1e-5)
-    assert pose_excess(a, a, 0, 0).first_trace is None
+    assert pose_excess(a, a, 0, 0).first_different is None

@@ -1,4 +1,4 @@
-"""Metrics against hand-made errors, and against the program evo on the same files."""
+"""Metrics of known errors, and compared with the program evo on the same files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def trajectory(stamps_ns: np.ndarray | list[int], T: np.ndarray) -> Trajectory:
 
 
 def spline(count: int = 80) -> Trajectory:
-    """A curved drive with some roll and pitch, somewhere in the world."""
+    """Return a curved path with some roll and pitch, anywhere in the world."""
     s = np.linspace(0.0, 4.0, count)
     turn = np.stack([0.05 * np.sin(3 * s), 0.04 * np.cos(2 * s), 0.4 + 0.8 * np.sin(s)], axis=1)
     t = np.stack([3 + 2 * s, np.sin(s) - 7, 1.2 + 0.02 * s], axis=1)
@@ -33,7 +33,7 @@ def spline(count: int = 80) -> Trajectory:
 
 
 def drifted(truth: Trajectory) -> Trajectory:
-    """The truth seen from its first pose, with errors that add up, and stamps a little off."""
+    """Return the truth relative to its first pose, with accumulated errors and shifted stamps."""
     rng = np.random.default_rng(7)
     steps = se3.inverse(truth.T[:-1]) @ truth.T[1:]
     steps = steps @ se3.exp(rng.normal(0.0, 0.01, (len(steps), 6)))
@@ -78,7 +78,7 @@ def test_step_error_is_per_step() -> None:
     assert metrics.rpe_translation_rmse_m == pytest.approx(0.001) and metrics.rpe_rotation_rmse_rad == 0.0
 
 
-def test_worst_is_not_the_end() -> None:
+def test_maximum_and_last_error_differ() -> None:
     estimate = straight(11, 0.1)
     estimate.T[4, 1, 3] = 0.3
     metrics = evaluate(estimate, straight(11, 0.1))
@@ -106,7 +106,7 @@ def test_each_truth_is_used_once_by_the_nearest() -> None:
 def test_standing_still_has_no_relative_length() -> None:
     metrics = evaluate(straight(5, 0.01), straight(5, 0.0))
     assert math.isnan(metrics.length_error_ratio)
-    assert "no truth to compare" in format_metrics(metrics)
+    assert "(undefined)" in format_metrics(metrics)
 
 
 def test_too_few_poses_names_both_ranges() -> None:

@@ -1,4 +1,4 @@
-"""Small recordings of a made-up run, written with the project's codec and with mcap itself."""
+"""Small recordings of an artificial run, written with omnid's codec."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import ODOMETRY, Key
 
 START_NS = 1_700_000_000 * 10**9
 PERIOD_NS = 100_000_000
@@ -19,12 +20,12 @@ Entry = tuple[int, str, str, bytes]  # stamp [ns], topic, type, message
 
 
 def at(pose: float) -> int:
-    """The stamp of a pose."""
+    """Return the stamp of a pose."""
     return START_NS + round(pose * PERIOD_NS)
 
 
 def T_odom_base(pose: int) -> np.ndarray:
-    """Poses on a circle, 5 cm and 0.02 rad apart."""
+    """Return poses on a circle, 5 cm and 0.02 rad apart."""
     return se3.exp([2.5 * math.sin(0.02 * pose), 2.5 * (1 - math.cos(0.02 * pose)), 0, 0, 0, 0]) @ se3.exp(
         [0, 0, 0, 0, 0, 0.02 * pose])
 
@@ -38,31 +39,31 @@ def odom(pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", 
 
 
 def status(pose: float, *statuses: DiagnosticStatus) -> Entry:
-    """What the parts said at the time of a pose."""
+    """Return a status message at the time of a pose."""
     return at(pose), "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(at(pose), statuses)
 
 
-def state(pose: float, name: str, resets: int = 0, landmarks: str = "80 of 100") -> Entry:
-    """The report of a new state, as the recorder writes it right after the first pose in it."""
+def state(pose: float, name: str, resets: int = 0) -> Entry:
+    """Return the status of a new state, as the recorder writes it right after the first pose in it."""
     level = ("tracking", "degraded", "lost").index(name)
-    return status(pose, DiagnosticStatus("omnid: odometry", level, name,
-                               {"state": name, "resets": str(resets), "landmarks": landmarks}))
+    values: dict[str, str] = {Key.STATE: name, Key.RESETS: str(resets), Key.INLIERS: "80", Key.TRACKED: "100"}
+    return status(pose, DiagnosticStatus(ODOMETRY, level, name, values))
 
 
 def drive(pose: float, speed_mps: float) -> Entry:
-    """What the wheels were told."""
+    """Return a command to the wheels."""
     payload = codec.twist_stamped_cdr(at(pose), "base_link", speed_mps, 0.1)
     return at(pose), "/omnid/drive", codec.TWIST_SCHEMA, payload
 
 
 def cloud(pose: float, points: np.ndarray, frame: str = "odom") -> Entry:
-    """The map."""
+    """Return a map."""
     payload = codec.point_cloud_cdr(at(pose), frame, points, np.ones(len(points)))
     return at(pose), "/omnid/cloud", codec.POINT_CLOUD_SCHEMA, payload
 
 
 def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | None = None) -> Path:
-    """A log of these messages in their order; its path."""
+    """Write a log of these messages in their order and return its path."""
     with LogWriter(path, attachments) as log:
         for stamp_ns, topic, schema, payload in entries:
             log.write(topic, schema, payload, stamp_ns)
@@ -70,7 +71,7 @@ def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | N
 
 
 def run(count: int = 100, lost: Sequence[int] = (), missing: Sequence[int] = ()) -> list[Entry]:
-    """A run that tracks but for the poses that are lost; those that are missing are not there."""
+    """Return a run with tracked, lost and missing poses."""
     entries: list[Entry] = []
     before = ""
     for pose in (k for k in range(count) if k not in missing):

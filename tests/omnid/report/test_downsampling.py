@@ -1,4 +1,4 @@
-"""Long series come out short, and no spike is lost."""
+"""Downsampling of long series without loss of spikes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from omnid.report.downsampling import BINS, Corner, Downsampled, PathTrace
 
 
-def test_few_values_stay_as_they_are() -> None:
+def test_few_values_are_kept() -> None:
     series = Downsampled()
     points = [(0.1 * k, math.sin(k)) for k in range(BINS)]
     for t_s, value in reversed(points):
@@ -32,7 +32,7 @@ def test_spikes_survive_any_length() -> None:
     assert len({int(t // 100) for t, _ in points}) == 34  # nowhere a hole
 
 
-def test_nonsense_is_left_out() -> None:
+def test_invalid_values_are_left_out() -> None:
     series = Downsampled()
     for value in (math.nan, math.inf, -math.inf, 1e300):
         series.add(0.0, value)
@@ -41,7 +41,7 @@ def test_nonsense_is_left_out() -> None:
     assert series.count == 0 and series.points() == [] and math.isnan(series.highest)
 
 
-def test_scattered_times_end_in_bounds() -> None:
+def test_scattered_times_stay_within_bounds() -> None:
     series = Downsampled()
     for t_s in np.random.default_rng(2).uniform(-1e9, 1e9, 3000):
         series.add(float(t_s), 1.0)

@@ -1,4 +1,4 @@
-"""`omnid report`: what a recording says is on the page, what it does not say is named, and nothing of it is run."""
+"""`omnid report`: the page shows what is recorded and names what is missing, and text of the log is never executed."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import evaluate
 from omnid.report.report import report_html
-from omnid.report.report_data import ReportData, read_recording
-from omnid.report.truth_comparison import compare
+from omnid.report.report_data import ReportData, collect_report_data
+from omnid.report.truth_comparison import compare_with_truth
 from omnid.runs.log_rig import attached_rig
 from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import ODOMETRY, PAIRING, SUMMARY, WHEELS, camera_name, stage_name
 from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
@@ -41,7 +42,7 @@ EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
 
 
 class Page(HTMLParser):
-    """What a browser would make of a page: its tags with their attributes, its text, and whether tags match."""
+    """Tags with their attributes and text of a page; asserts that the tags match."""
 
     VOID = frozenset({"meta", "img", "br"})
 
@@ -70,15 +71,15 @@ class Page(HTMLParser):
 
 
 def html_of(path: Path, truth: Trajectory | None = None) -> str:
-    return report_html(path, read_recording(path, keep_poses=truth is not None), truth)
+    return report_html(path, collect_report_data(path, keep_poses=truth is not None), truth)
 
 
-def told(recording: ReportData) -> list[tuple[str, str]]:
-    return [(event.source, event.text) for event in recording.events.in_order()]
+def event_texts(data: ReportData) -> list[tuple[str, str]]:
+    return [(event.source, event.text) for event in data.events.in_order()]
 
 
 def assert_harmless(page: Page) -> None:
-    """Nothing that runs, and nothing that is fetched."""
+    """Assert that nothing in the page is executed or fetched."""
     names = {tag for tag, _ in page.tags}
     assert not names & {"script", "iframe", "object", "embed", "link", "base", "form", "foreignobject"}
     for tag, attributes in page.tags:
@@ -87,7 +88,7 @@ def assert_harmless(page: Page) -> None:
             assert (attributes.get(name) or "#").startswith(("#", "data:image/png;base64,", "data:image/jpeg;base64,"))
 
 
-def test_command_writes_one_whole_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     entries = [*run(100, lost=range(40, 50)), drive(3, 0.4), drive(60, 0.4),
                cloud(99, np.random.default_rng(1).uniform(-2, 3, (500, 3)))]
     log, out = save(tmp_path / "log.mcap", entries), tmp_path / "out.html"
@@ -95,57 +96,57 @@ def test_command_writes_one_whole_page(tmp_path: Path, capsys: pytest.CaptureFix
     assert "100 poses of /omnid/odom" in capsys.readouterr().out
     page = Page(out.read_text("utf-8"))
     assert_harmless(page)
-    for words in ("Run of omnid", "9.9 s", "4.95 m", "90.0 %", "told to the wheels", "Standard deviation", "lost here",
+    for words in ("Run of omnid", "9.9 s", "4.95 m", "90.0 %", "sent to the wheels", "Standard deviation", "lost here",
                   "of the map's 500 points", "no settings are attached".capitalize()):
         assert words in page.text, words
     assert any(tag == "image" for tag, _ in page.tags)  # the map
     assert "http" not in out.read_text("utf-8")
 
 
-def test_states_are_those_of_the_poses(tmp_path: Path) -> None:
-    recording = read_recording(save(tmp_path / "log.mcap", run(100, lost=range(40, 50))))
-    assert recording.poses.states == {0: 90, 2: 10}
-    assert told(recording) == [("state", "lost"), ("state", "tracking")]
-    assert [round(event.start_s, 6) for event in recording.events.in_order()] == [4.0, 5.0]
+def test_poses_have_the_state_reported_after_them(tmp_path: Path) -> None:
+    data = collect_report_data(save(tmp_path / "log.mcap", run(100, lost=range(40, 50))))
+    assert data.poses.states == {0: 90, 2: 10}
+    assert event_texts(data) == [("state", "lost"), ("state", "tracking")]
+    assert [round(event.start_s, 6) for event in data.events.in_order()] == [4.0, 5.0]
 
 
-def test_gaps_resets_and_lost_cameras_are_told(tmp_path: Path) -> None:
-    camera = "omnid: upper camera"
+def test_reports_gaps_resets_and_lost_cameras(tmp_path: Path) -> None:
+    camera = camera_name("upper")
     entries = [
         *run(100, missing=range(30, 50)),
         state(60, "tracking", resets=1),
         status(
             61,
             DiagnosticStatus(camera, 0, "streaming", {"drops": "3"}),
-            DiagnosticStatus("omnid: wheels", 0, "driving", {}),
+            DiagnosticStatus(WHEELS, 0, "driving", {}),
         ),
         status(
             71,
             DiagnosticStatus(camera, 2, "lost since 1.0 s", {"drops": "3"}),
-            DiagnosticStatus("omnid: wheels", 1, "the pose is lost", {"stopped, the pose is lost": "1"}),
+            DiagnosticStatus(WHEELS, 1, "the pose is lost", {"stopped, the pose is lost": "1"}),
         ),
         status(
             81,
             DiagnosticStatus(camera, 2, "lost since 2.0 s", {"drops": "8"}),
-            DiagnosticStatus("omnid: wheels", 0, "driving", {"stopped, the pose is lost": "1"}),
+            DiagnosticStatus(WHEELS, 0, "driving", {"stopped, the pose is lost": "1"}),
         ),
     ]
-    recording = read_recording(save(tmp_path / "log.mcap", entries))
-    assert told(recording) == [
-        ("poses", "none for 2.10 s"), ("state", "odometry began anew, with an unknown gap"),
+    data = collect_report_data(save(tmp_path / "log.mcap", entries))
+    assert event_texts(data) == [
+        ("poses", "none for 2.10 s"), ("state", "odometry was reset, with an unknown gap"),
         ("upper camera", "lost since 1.0 s"), ("wheels", "the pose is lost"), ("wheels", "stopped, the pose is lost"),
         ("upper camera", "images dropped"), ("wheels", "driving")]
-    assert recording.statuses.resets == 1
-    page = Page(report_html(tmp_path / "log.mcap", recording))
+    assert data.statuses.resets == 1
+    page = Page(report_html(tmp_path / "log.mcap", data))
     assert "images dropped (5)" in page.text and "upper camera" in page.text
 
 
-def test_reports_that_come_before_the_first_pose_and_too_late(tmp_path: Path) -> None:
+def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path) -> None:
     entries = [
         status(
             -20,
-            DiagnosticStatus("omnid: odometry", 3, "no pose yet", {}),
-            DiagnosticStatus("omnid: pairing", 1, "none", {}),
+            DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}),
+            DiagnosticStatus(PAIRING, 1, "none", {}),
         ),
         odom(0),
         state(0, "tracking"),
@@ -153,41 +154,41 @@ def test_reports_that_come_before_the_first_pose_and_too_late(tmp_path: Path) ->
         state(5, "lost"),
         state(4, "tracking"),
         odom(6),
-    ]  # a report from before the loss, written after it
-    recording = read_recording(save(tmp_path / "log.mcap", entries))
-    assert recording.poses.states == {0: 1, 2: 2}
-    assert told(recording)[0] == ("pairing", "none") and recording.events.in_order()[0].start_s == -2.0
+    ]  # status from before the loss, recorded after it
+    data = collect_report_data(save(tmp_path / "log.mcap", entries))
+    assert data.poses.states == {0: 1, 2: 2}
+    assert event_texts(data)[0] == ("pairing", "none") and data.events.in_order()[0].start_s == -2.0
 
 
-def test_stages_and_latencies_are_shown(tmp_path: Path) -> None:
+def test_shows_stages_and_latencies(tmp_path: Path) -> None:
     def second(k: int) -> tuple[DiagnosticStatus, ...]:
-        odometry = {"landmarks": f"{200 + k} of 300", "capture_to_pose_p50_ms": "81.25", "rate_hz": "9.5",
+        odometry = {"inliers": str(200 + k), "tracked": "300", "capture_to_pose_p50_ms": "81.25", "rate_hz": "9.5",
                     "capture_to_pose_p99_ms": "163.00"}
         stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_p99_ms": "44.0",
                   "work_max_ms": "52.1"}
-        return DiagnosticStatus("omnid: odometry", 0, "tracking", odometry), DiagnosticStatus(
-            "omnid: stage stereo", 0, "", stereo
+        return DiagnosticStatus(ODOMETRY, 0, "tracking", odometry), DiagnosticStatus(
+            stage_name("stereo"), 0, "", stereo
         )
 
     entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
-    for words in ("81.2 / 163 ms", "stereo", "31.5", "52.1", "stereo, dropped", "that agree with the pose",
+    for words in ("81.2 / 163 ms", "stereo", "31.5", "52.1", "stereo, dropped", "inliers of the pose",
                   "messages dropped (9)"):
         assert words in text, words
-    assert "No reports of the daemon" not in text
+    assert "no status of the daemon" not in text
 
 
-def test_what_a_foreign_log_does_not_hold_is_named(tmp_path: Path) -> None:
+def test_names_what_a_foreign_log_lacks(tmp_path: Path) -> None:
     entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
-    for words in ("Run of wheels", "does not tell the state", "nobody set them", "no numbers of landmarks",
-                  "No reports of the daemon", "holds no images", "no rig.toml is attached", "holds no map",
+    for words in ("Run of wheels", "does not hold the state", "they were not set", "no numbers of landmarks",
+                  "no status of the daemon", "holds no images", "no rig.toml is attached", "holds no map",
                   "holds no commands"):
         assert words in text, words
 
 
-def test_truth_is_compared_as_eval_does_it(tmp_path: Path) -> None:
-    """The rig stands aside and askew on its base, and the truth has a world of its own."""
+def test_compares_with_the_truth_as_eval_does(tmp_path: Path) -> None:
+    """The rig is displaced and rotated on its base, and the truth has another world frame."""
     rig = attached_rig_of_sample()
     T_base_rig, T_world_odom = se3.exp([0.3, -0.1, 0.5, 0.1, 0.2, 1.0]), se3.exp([5, -3, 1, 0, 0, 2.0])
     text = rig_toml(Rig(rig.lower, rig.upper, T_base_rig, rig.topics)).encode()
@@ -195,15 +196,15 @@ def test_truth_is_compared_as_eval_does_it(tmp_path: Path) -> None:
     drift = [se3.exp([0.001 * k, 0, 0, 0, 0, 0.0005 * k]) for k in range(100)]
     T_odom_rig = np.array([se3.inverse(T_base_rig) @ T_odom_base(k) @ T_base_rig for k in range(100)])
     truth = Trajectory(np.array([at(k) for k in range(100)]), T_world_odom @ T_odom_rig @ np.array(drift))
-    recording = read_recording(log, keep_poses=True)
-    found = compare(recording.poses, recording.T_base_rig, truth)
+    data = collect_report_data(log, keep_poses=True)
+    found = compare_with_truth(data.poses, data.T_base_rig, truth)
     expected = evaluate(Trajectory(truth.stamps_ns, T_odom_rig), truth)
     assert found.metrics.ate_rmse_m == pytest.approx(expected.ate_rmse_m, rel=1e-6)
     assert found.position_m.highest == pytest.approx(expected.ate_max_m, rel=1e-6)
     assert found.heading_rad.newest == pytest.approx(expected.heading_end_rad, rel=1e-6)
     assert found.path[0] == pytest.approx((0, 0), abs=1e-9)
     assert found.path[-1] == pytest.approx(T_odom_base(99)[:2, 3], abs=0.2)
-    assert "Against the truth" in Page(report_html(log, recording, truth)).text
+    assert "Against the truth" in Page(report_html(log, data, truth)).text
 
 
 def attached_rig_of_sample() -> Rig:
@@ -213,7 +214,7 @@ def attached_rig_of_sample() -> Rig:
     return rig
 
 
-def test_images_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_of_images_is_refused_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = SAMPLE / "log.mcap"
     assert main(["report", str(log), "-o", str(tmp_path / "out.html")]) == 2
     said = capsys.readouterr().err
@@ -221,8 +222,8 @@ def test_images_alone_are_told_what_to_do(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "out.html").exists()
 
 
-def test_panorama_of_a_log_with_images(tmp_path: Path) -> None:
-    """The sample's first images with poses beside them."""
+def test_shows_a_panorama_of_a_log_with_images(tmp_path: Path) -> None:
+    """The log holds the sample's first images, and poses."""
     entries = run(20)
     with (SAMPLE / "log.mcap").open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
@@ -234,24 +235,14 @@ def test_panorama_of_a_log_with_images(tmp_path: Path) -> None:
     assert [tag for tag, _ in page.tags].count("img") == 1 and "panorama at the first pose" in page.text
 
 
-def test_which_odometry(tmp_path: Path) -> None:
-    both = [*(odom(k, topic="/a/pose") for k in range(3)), *(odom(k, topic="/b/pose") for k in range(3, 9))]
-    log = save(tmp_path / "log.mcap", both)
-    with pytest.raises(OmnidError, match=r"several odometries.*--topic"):
-        read_recording(log)
-    with pytest.raises(OmnidError, match="no nav_msgs/msg/Odometry on '/c'"):
-        read_recording(log, "/c")
-    assert read_recording(log, "/b/pose").poses.poses == 6
-
-
-def test_a_hostile_log_is_text_and_no_more(tmp_path: Path) -> None:
+def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     stage = {"processed": EVIL, "dropped": EVIL, "work_p50_ms": EVIL}
-    odometry = {"state": EVIL, "resets": EVIL, "landmarks": EVIL, "capture_to_pose_p50_ms": EVIL}
+    odometry = {"state": EVIL, "resets": EVIL, "inliers": EVIL, "capture_to_pose_p50_ms": EVIL}
     parts = (
         DiagnosticStatus(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}),
-        DiagnosticStatus(f"omnid: stage {EVIL}", 1, EVIL, stage),
-        DiagnosticStatus("omnid: summary", 0, EVIL, {EVIL: EVIL}),
-        DiagnosticStatus("omnid: odometry", 0, EVIL, odometry),
+        DiagnosticStatus(stage_name(EVIL), 1, EVIL, stage),
+        DiagnosticStatus(SUMMARY, 0, EVIL, {EVIL: EVIL}),
+        DiagnosticStatus(ODOMETRY, 0, EVIL, odometry),
     )
     settings = f'robot = "{EVIL.replace(chr(34), "")}"\n["<b>"]\nx = 1\n'
     entries = [*(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
@@ -267,7 +258,7 @@ def test_a_hostile_log_is_text_and_no_more(tmp_path: Path) -> None:
     assert page.text.count("rig.toml: <img src=x") == 2  # in a remark and in a warning
 
 
-def test_a_flood_of_everything_stays_small(tmp_path: Path) -> None:
+def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
     rng = random.Random(1)
     entries = []
     for k in range(3000):
@@ -279,26 +270,26 @@ def test_a_flood_of_everything_stays_small(tmp_path: Path) -> None:
             entries.append(status(k, *(DiagnosticStatus(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
                                        for n in range(k, k + 9))))
     entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
-    recording = read_recording(save(tmp_path / "log.mcap", entries))
-    html = report_html(tmp_path / "log.mcap", recording)
+    data = collect_report_data(save(tmp_path / "log.mcap", entries))
+    html = report_html(tmp_path / "log.mcap", data)
     assert len(html) < 3_000_000
-    assert len(recording.events.in_order()) <= 32 * 40 and recording.events.beyond['others'] > 100
+    assert len(data.events.in_order()) <= 32 * 40 and data.events.left_out['others'] > 100
     assert re.search(r"and \d+ more: ", Page(html).text)
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_any_bytes_give_a_page_or_one_line(tmp_path: Path, seed: int) -> None:
+def test_any_bytes_give_a_page_or_one_error_line(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     points = np.random.default_rng(seed).uniform(-2, 3, (50, 3))
     entries = [*run(40, lost=range(9, 12)), drive(3, 0.4), cloud(39, points)]
-    spoilt = []
+    damaged = []
     for stamp_ns, topic, schema, payload in entries:
         data = bytearray(payload)
         for _ in range(rng.randrange(4)):
             data[rng.randrange(len(data))] = rng.randrange(256)
         kept = rng.choice((len(data), len(data), rng.randrange(len(data))))
-        spoilt.append((stamp_ns, topic, schema, bytes(data[:kept])))
-    log = save(tmp_path / "log.mcap", spoilt)
+        damaged.append((stamp_ns, topic, schema, bytes(data[:kept])))
+    log = save(tmp_path / "log.mcap", damaged)
     whole = bytearray(log.read_bytes())
     if seed % 2:
         for _ in range(20):
@@ -310,22 +301,22 @@ def test_any_bytes_give_a_page_or_one_line(tmp_path: Path, seed: int) -> None:
         assert "\n" not in str(error)
 
 
-def test_absurd_poses_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_leaves_invalid_poses_out_and_counts_them(tmp_path: Path) -> None:
     far, early = np.eye(4), np.eye(4)
     far[0, 3] = 1e12
     stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
     entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, early)[1:]), odom(12)]
-    recording = read_recording(save(tmp_path / "log.mcap", entries))
-    assert (recording.poses.poses, recording.poses.absurd, recording.unread, recording.poses.late) == (11, 1, 1, 1)
-    text = Page(report_html(tmp_path / "log.mcap", recording)).text
+    data = collect_report_data(save(tmp_path / "log.mcap", entries))
+    assert (data.poses.poses, data.poses.out_of_range, data.unreadable, data.poses.late) == (11, 1, 1, 1)
+    text = Page(report_html(tmp_path / "log.mcap", data)).text
     assert "2 messages were left out" in text and "1 poses were left out" in text
 
 
-def test_a_single_pose_is_a_report_too(tmp_path: Path) -> None:
+def test_a_single_pose_gives_a_report(tmp_path: Path) -> None:
     assert "0.0 s" in Page(html_of(save(tmp_path / "log.mcap", [odom(0)]))).text
 
 
-def test_truth_of_another_time_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refuses_a_truth_of_another_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, truth = save(tmp_path / "log.mcap", run(9)), tmp_path / "truth.txt"
     truth.write_text("\n".join(tum_row(k * 10**9, np.eye(4)) for k in range(5)))
     assert main(["report", str(log), "--truth", str(truth), "-o", str(tmp_path / "out.html")]) == 2

@@ -1,4 +1,4 @@
-"""Reads what was drawn, by rerun's own reader of files."""
+"""Reading of .rrd files with rerun's own reader."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ WITHOUT = "needs rerun: pip install 'omnid[view]'"
 
 
 class Row(NamedTuple):
-    """A value of an entity, and when."""
+    """A value of an entity and its stamp."""
 
     stamp_ns: int
-    value: Any  # a list, one element for each instance
+    value: Any  # a list, one element per instance
 
 
 def need_rerun() -> None:
-    """Skips whatever asks where there is no rerun."""
+    """Skip the calling test where rerun is not installed."""
     pytest.importorskip("rerun", reason=WITHOUT)
 
 
 def rows(path: Path, entity: str, component: str) -> list[Row]:
-    """All values of a component in the order of their stamps, those for good left out."""
+    """Return all values of a component in the order of their stamps, without static ones."""
     from rerun.chunk import RrdReader
 
     found = []
@@ -41,19 +41,19 @@ def rows(path: Path, entity: str, component: str) -> list[Row]:
 
 
 def entities(path: Path) -> set[str]:
-    """Everything that was drawn."""
+    """Return the paths of all entities."""
     from rerun.chunk import RrdReader
 
     return {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
 
 
 def positions(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Stamps [ns] and positions (N, 3) [m] of the robot."""
+    """Return stamps [ns] and positions (N, 3) [m] of the robot."""
     found = rows(path, "/odom/base_link", "Transform3D:translation")
     return np.array([row.stamp_ns for row in found]), np.array([row.value[0] for row in found])
 
 
 def verified(path: Path) -> bool:
-    """Whether rerun's own program finds the file in order."""
+    """True if rerun's own program finds no fault in the file."""
     words = [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())"]
     return subprocess.run([*words, "rrd", "verify", str(path)], capture_output=True, check=False).returncode == 0

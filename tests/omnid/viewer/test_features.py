@@ -1,4 +1,4 @@
-"""What the odometry tells of its features, for whoever looks on."""
+"""Features that the odometry publishes for the viewer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.conftest import PAIRS
 
 
 class Watcher:
-    """Keeps all poses of a run."""
+    """Sink that keeps all poses of a run."""
 
     def __init__(self) -> None:
         self.poses: list[OdometryUpdate] = []
@@ -32,30 +32,30 @@ def poses(scene: Path) -> list[OdometryUpdate]:
     return watcher.poses
 
 
-def test_the_first_pair_has_new_ones_and_no_others(poses: list[OdometryUpdate]) -> None:
+def test_the_first_pair_has_new_features_only(poses: list[OdometryUpdate]) -> None:
     first, *others = poses
     assert len(others) == PAIRS - 1
-    assert len(first.features.new) >= first.tracks > 50  # a few are left out of the map: too far to be located
+    assert len(first.features.new) >= first.tracks > 50  # a few are too far away to be located
     assert not len(first.features.inliers) and not len(first.features.rejected)
 
 
-def test_those_that_agree_carry_the_pose_and_those_that_do_not_are_others(poses: list[OdometryUpdate]) -> None:
+def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUpdate]) -> None:
     gaps: list[float] = []
     for odometry in poses[1:]:
         seen = odometry.features
         assert len(seen.inliers) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
         gaps += np.linalg.norm(seen.rejected[:, None] - seen.inliers[None], axis=2).min(axis=1).tolist()
-    assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; one that goes wrong may end on another
+    assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; a wrongly tracked feature may end on another
 
 
-def test_all_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
+def test_features_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
     for odometry in poses:
         height, width = odometry.depth.disparity.shape
         for pixels in (odometry.features.inliers, odometry.features.rejected, odometry.features.new):
             assert pixels.shape[1] == 2 and (pixels >= -1).all() and (pixels <= [width, height]).all()
 
 
-def test_new_ones_are_where_there_were_none(poses: list[OdometryUpdate]) -> None:
+def test_new_features_are_apart_from_inliers(poses: list[OdometryUpdate]) -> None:
     for odometry in poses[1:]:
         new, known = odometry.features.new, odometry.features.inliers
         if len(new):

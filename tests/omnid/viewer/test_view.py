@@ -1,4 +1,4 @@
-"""`omnid view`: what it draws, read back by rerun's own reader, and what it says where it cannot."""
+"""`omnid view`: its drawings, read back with rerun's own reader, and its errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
 
 @pytest.fixture(scope="module")
 def drawn(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the same log replayed, recorded and drawn."""
+    """Return a folder with the same log replayed, recorded and drawn."""
     need_rerun()
     from omnid.cli import main
 
@@ -52,11 +52,11 @@ def test_the_path_is_that_of_the_tum_file(drawn: Path) -> None:
     assert verified(drawn / "out.rrd")
 
 
-def test_every_pair_has_a_image_with_its_features_and_depth(drawn: Path) -> None:
+def test_every_pair_has_an_image_with_features_and_depth(drawn: Path) -> None:
     images = rows(drawn / "out.rrd", "/panorama", "EncodedImage:blob")
     depths = rows(drawn / "out.rrd", "/depth", "EncodedDepthImage:blob")
-    inliers = rows(drawn / "out.rrd", "/panorama/agreeing", "Points2D:positions")
-    found = rows(drawn / "out.rrd", "/landmarks/agreeing", "Scalars:scalars")
+    inliers = rows(drawn / "out.rrd", "/panorama/inliers", "Points2D:positions")
+    found = rows(drawn / "out.rrd", "/landmarks/inliers", "Scalars:scalars")
     assert len(images) == len(depths) == len(inliers) == len(found) == PAIRS
     image = cv2.imdecode(np.array(images[0].value[0], np.uint8), cv2.IMREAD_UNCHANGED)
     depth = cv2.imdecode(np.array(depths[0].value[0], np.uint8), cv2.IMREAD_UNCHANGED)
@@ -66,7 +66,7 @@ def test_every_pair_has_a_image_with_its_features_and_depth(drawn: Path) -> None
     assert len(rows(drawn / "out.rrd", "/panorama/new", "LineStrips2D:strips")[0].value) > 50
 
 
-def test_there_is_a_map_and_the_ellipsoid_and_plots(drawn: Path) -> None:
+def test_draws_map_ellipsoid_and_plots(drawn: Path) -> None:
     clouds = rows(drawn / "out.rrd", "/odom/map", "Points3D:positions")
     assert len(clouds[-1].value) > 500 and np.abs(np.array(clouds[-1].value)).max() < 20
     assert len(rows(drawn / "out.rrd", "/odom/covariance", "Ellipsoids3D:half_sizes")) == PAIRS
@@ -74,12 +74,12 @@ def test_there_is_a_map_and_the_ellipsoid_and_plots(drawn: Path) -> None:
     assert len(speed) == PAIRS and 0.2 < np.median(speed) < 1.0
     odometry_ms = [row.value[0] for row in rows(drawn / "out.rrd", "/latency/odometry", "Scalars:scalars")]
     assert odometry_ms and min(odometry_ms) > 0
-    assert {"/legend", "/state", "/log", "/deviation/position\\ mm"} <= entities(drawn / "out.rrd")
+    assert {"/legend", "/state", "/log", "/sigma/position\\ mm"} <= entities(drawn / "out.rrd")
 
 
-def test_a_recording_is_shown_as_it_stands(drawn: Path, omnid: Command) -> None:
-    code, said, _ = omnid("view", drawn / "rec.mcap", "-o", drawn / "rec.rrd")
-    assert code == 0 and said.startswith(f"{PAIRS} poses and 0 images shown\n")
+def test_shows_a_recording(drawn: Path, omnid: Command) -> None:
+    code, out, _ = omnid("view", drawn / "rec.mcap", "-o", drawn / "rec.rrd")
+    assert code == 0 and out.startswith(f"{PAIRS} poses and 0 images shown\n")
     for ours, recorded in zip(positions(drawn / "out.rrd"), positions(drawn / "rec.rrd"), strict=True):
         np.testing.assert_allclose(ours, recorded, atol=1e-6)
     clouds = [rows(drawn / name, "/odom/map", "Points3D:positions")[-1].value for name in ("out.rrd", "rec.rrd")]
@@ -88,21 +88,22 @@ def test_a_recording_is_shown_as_it_stands(drawn: Path, omnid: Command) -> None:
     assert "/panorama" not in entities(drawn / "rec.rrd") and verified(drawn / "rec.rrd")
 
 
-def test_a_recording_without_images_cannot_be_computed_anew(drawn: Path, omnid: Command) -> None:
-    told = omnid.refused("view", drawn / "rec.mcap", "--replay", "-o", drawn / "not.rrd")
-    assert "no image topics" in told and not (drawn / "not.rrd").exists()
+def test_a_recording_without_images_cannot_be_replayed(drawn: Path, omnid: Command) -> None:
+    error = omnid.refused("view", drawn / "rec.mcap", "--replay", "-o", drawn / "not.rrd")
+    assert "no image topics" in error and not (drawn / "not.rrd").exists()
 
 
 def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
-    """A recording with three poses, two states, two images of either kind and what cannot be read."""
+    """Write a recording with three poses, two states, an image and a damaged message per robot."""
     writer = LogWriter(path, {})
     for robot in robots:
         for number, state in enumerate(("tracking", "tracking", "lost")):
             stamp_ns, T = START_NS + number * 10**8, se3.transform(np.eye(3), [0.1 * number, 0.0, 0.0])
             writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA,
                          codec.odometry_cdr(stamp_ns, T, 1e-4 * np.eye(6), np.zeros(6), np.eye(6)), stamp_ns)
-            said = [DiagnosticStatus("omnid: odometry", 0, state, {"landmarks": f"{number} of 9"})]
-            writer.write(f"/{robot}/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, said), stamp_ns)
+            statuses = [DiagnosticStatus("omnid: odometry", 0, state, {"inliers": str(number), "tracked": "9"})]
+            payload = codec.diagnostics_cdr(stamp_ns, statuses)
+            writer.write(f"/{robot}/status", codec.DIAGNOSTICS_SCHEMA, payload, stamp_ns)
         writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA, b"nonsense", START_NS + 10**9)
         raw = Frame(0, START_NS, "lower", "mono8", np.full((8, 16), 50, np.uint8), 16, 8)
         writer.write(f"/{robot}/lower/image_raw", *image_cdr(raw, START_NS), START_NS)
@@ -110,41 +111,41 @@ def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
     return path
 
 
-def test_a_pose_has_the_state_that_is_written_after_it(tmp_path: Path, omnid: Command) -> None:
+def test_poses_have_the_state_recorded_after_them(tmp_path: Path, omnid: Command) -> None:
     need_rerun()
-    code, said, warned = omnid("view", made(tmp_path / "made.mcap"), "-o", tmp_path / "made.rrd")
-    assert code == 0 and said.startswith("3 poses and 1 images shown") and "1 messages" in warned
+    code, out, err = omnid("view", made(tmp_path / "made.mcap"), "-o", tmp_path / "made.rrd")
+    assert code == 0 and out.startswith("3 poses and 1 images shown") and "1 messages" in err
     states = rows(tmp_path / "made.rrd", "/state", "StateChange:state")
     assert [row.value[0] for row in states] == ["tracking", "lost"] and states[1].stamp_ns == START_NS + 2 * 10**8
     widths = [-row.value[0] for row in rows(tmp_path / "made.rrd", "/odom/path", "LineStrips3D:radii")]
-    assert widths[0] == widths[1] < widths[2]  # on the screen: rerun has it negative
-    found = [row.value[0] for row in rows(tmp_path / "made.rrd", "/landmarks/agreeing", "Scalars:scalars")]
+    assert widths[0] == widths[1] < widths[2]  # negative: in pixels of the screen
+    found = [row.value[0] for row in rows(tmp_path / "made.rrd", "/landmarks/inliers", "Scalars:scalars")]
     assert found == [0, 1, 2]
     image = rows(tmp_path / "made.rrd", "/panorama", "EncodedImage:blob")[0].value[0]
     assert cv2.imdecode(np.array(image, np.uint8), cv2.IMREAD_UNCHANGED).shape == (8, 16)
 
 
-def test_one_of_several_robots_is_shown(tmp_path: Path, omnid: Command) -> None:
+def test_shows_one_of_several_robots(tmp_path: Path, omnid: Command) -> None:
     need_rerun()
     log, out = made(tmp_path / "two.mcap", ("rover", "digger")), tmp_path / "two.rrd"
-    told = omnid.refused("view", log, "-o", out)
-    assert "/rover/odom" in told and "/digger/odom" in told and "--robot" in told
-    assert "'crane'" in omnid.refused("view", log, "-o", out, "--robot", "crane") and not out.exists()
+    error = omnid.refused("view", log, "-o", out)
+    assert "/rover/odom" in error and "/digger/odom" in error and "--topic" in error
+    assert "'/crane/odom'" in omnid.refused("view", log, "-o", out, "--robot", "crane") and not out.exists()
     assert omnid("view", log, "-o", out, "--robot", "digger").out.startswith("3 poses")
 
 
-@pytest.mark.parametrize(("words", "told"), [
+@pytest.mark.parametrize(("words", "expected"), [
     (("--web", "-o", "x.rrd"), "-o and --web"),
     (("--replay",), "--replay"),
     (("--seconds", "-1"), "--seconds"),
     (("log.mcap", "--connect", "tcp/127.0.0.1:1"), "--connect"),
     (("log.mcap", "--seconds", "3"), "--seconds"),
 ])
-def test_contradictions_are_refused(words: tuple[str, ...], told: str, omnid: Command) -> None:
-    assert told in omnid.refused("view", *words)
+def test_refuses_contradictory_options(words: tuple[str, ...], expected: str, omnid: Command) -> None:
+    assert expected in omnid.refused("view", *words)
 
 
-def test_files_that_cannot_be_written_are_refused(scene: Path, tmp_path: Path, omnid: Command) -> None:
+def test_refuses_files_that_cannot_be_written(scene: Path, tmp_path: Path, omnid: Command) -> None:
     need_rerun()
     log = scene / "log.mcap"
     assert "no folder" in omnid.refused("view", log, "-o", tmp_path / "nowhere" / "x.rrd")
@@ -152,17 +153,17 @@ def test_files_that_cannot_be_written_are_refused(scene: Path, tmp_path: Path, o
     assert "device or a pipe" in omnid.refused("view", log, "-o", "/dev/full")
 
 
-def test_without_a_display_it_is_told_what_else_there_is(
+def test_without_a_display_the_alternatives_are_named(
     scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     need_rerun()
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    told = omnid.refused("view", scene / "log.mcap")
-    assert "display" in told and "-o FILE.rrd" in told and "--web" in told
+    error = omnid.refused("view", scene / "log.mcap")
+    assert "display" in error and "-o FILE.rrd" in error and "--web" in error
 
 
-def test_without_rerun_it_is_told_how_to_have_it(
+def test_without_rerun_the_installation_is_named(
     scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)

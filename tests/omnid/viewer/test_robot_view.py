@@ -1,4 +1,4 @@
-"""`omnid view` in a process of its own: a robot on the bus, and a browser that looks."""
+"""`omnid view` in a process of its own: of a robot on the bus, and in a browser."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.omnid.viewer.test_view import START_NS, made
 
 @contextlib.contextmanager
 def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
-    """`omnid view` of somebody whose settings are in a folder of their own."""
+    """Run `omnid view` with a home folder of its own."""
     environment = os.environ | {"HOME": str(home), "XDG_CONFIG_HOME": str(home / "config")}
     with subprocess.Popen([sys.executable, "-m", "omnid", "view", *map(str, words)], stdout=subprocess.PIPE,
                           stderr=subprocess.PIPE, text=True, env=environment) as process:
@@ -45,58 +45,58 @@ def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def say(bus: Bus, number: int) -> None:
-    """Poses, one of them broken, a image, a map, reports."""
+def publish(bus: Bus, number: int) -> None:
+    """Publish a pose, an image, a map and a status; some are damaged."""
     stamp_ns, T = START_NS + number * 10**7, se3.transform(np.eye(3), [0.01 * number, 0.5, 0.0])
     pose = codec.odometry_cdr(stamp_ns, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
     bus.publish("odom", pose if number % 7 else b"nonsense",
                 PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
-    said = [DiagnosticStatus("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
-    bus.publish("status", codec.diagnostics_cdr(stamp_ns, said))
+    statuses = [DiagnosticStatus("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
+    bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
     pixels = {"inliers": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}
     bus.publish("panorama", image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1],
                 features_to_bytes(pixels) if number % 5 else b"nonsense")
 
 
-def test_a_robot_is_drawn_as_it_speaks(tmp_path: Path) -> None:
+def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     need_rerun()
-    endpoint, out = free_endpoint(), tmp_path / "live.rrd"
-    speaking = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
-    looking = viewing(tmp_path, "--robot", "rover", "--connect", endpoint, "-o", out, "--seconds", 2)
-    with speaking as bus, looking as it:
+    endpoint, drawn = free_endpoint(), tmp_path / "live.rrd"
+    publishing = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
+    viewer = viewing(tmp_path, "--robot", "rover", "--connect", endpoint, "-o", drawn, "--seconds", 2)
+    with publishing as bus, viewer as it:
         deadline_s = time.monotonic() + DEADLINE_S
         for number in count():
-            say(bus, number)
+            publish(bus, number)
             time.sleep(0.01)
             if it.poll() is not None:
                 break
             assert time.monotonic() < deadline_s
-        said, warned = it.communicate()
-    assert it.returncode == 0 and warned == "" and "poses and" in said
-    stamps_ns, xyz = positions(out)
+        out, err = it.communicate()
+    assert it.returncode == 0 and err == "" and "poses and" in out
+    stamps_ns, xyz = positions(drawn)
     numbers = (stamps_ns - START_NS) // 10**7
     assert len(numbers) > 20 and (np.diff(numbers) > 0).all() and not (numbers % 7 == 0).any()
     np.testing.assert_allclose(xyz, np.column_stack([0.01 * numbers, 0.5 + 0 * numbers, 0 * numbers]), atol=1e-5)
-    assert rows(out, "/state", "StateChange:state")[0].value == ["degraded"]
-    assert rows(out, "/latency/odometry", "Scalars:scalars")[0].value == [30.5]
-    assert np.allclose(rows(out, "/panorama/agreeing", "Points2D:positions")[0].value, [[3, 4], [5, 6]])
-    assert rows(out, "/panorama", "EncodedImage:blob") and rows(out, "/odom/map", "Points3D:positions")
-    assert verified(out)
+    assert rows(drawn, "/state", "StateChange:state")[0].value == ["degraded"]
+    assert rows(drawn, "/latency/odometry", "Scalars:scalars")[0].value == [30.5]
+    assert np.allclose(rows(drawn, "/panorama/inliers", "Points2D:positions")[0].value, [[3, 4], [5, 6]])
+    assert rows(drawn, "/panorama", "EncodedImage:blob") and rows(drawn, "/odom/map", "Points3D:positions")
+    assert verified(drawn)
 
 
-def test_a_robot_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_reports_a_robot_that_cannot_be_reached(tmp_path: Path) -> None:
     need_rerun()
     endpoint = free_endpoint()
     with viewing(tmp_path, "--connect", endpoint, "-o", tmp_path / "x.rrd") as it:
-        said, told = it.communicate(timeout=DEADLINE_S)
-    assert it.returncode == 2 and said == "" and endpoint in told and told.count("\n") == 1
+        out, err = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 2 and out == "" and endpoint in err and err.count("\n") == 1
     assert not (tmp_path / "x.rrd").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_browser_of_this_machine_is_served_until_a_signal(tmp_path: Path, number: signal.Signals) -> None:
+def test_serves_a_browser_until_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     need_rerun()
     with viewing(tmp_path, made(tmp_path / "made.mcap"), "--web") as it:
         assert it.stderr is not None
@@ -107,8 +107,8 @@ def test_a_browser_of_this_machine_is_served_until_a_signal(tmp_path: Path, numb
             assert page.status == 200 and b"rerun" in page.read().lower()
         assert "Ctrl-C" in lines[2]
         it.send_signal(number)
-        said, _ = it.communicate(timeout=DEADLINE_S)
-    assert it.returncode == 0 and said.startswith("3 poses")
+        out, _ = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 0 and out.startswith("3 poses")
     for port in map(int, found.groups()):
         with socket.socket() as probe:
             assert probe.connect_ex(("127.0.0.1", port)) != 0
@@ -116,11 +116,11 @@ def test_a_browser_of_this_machine_is_served_until_a_signal(tmp_path: Path, numb
     assert settings["analytics_enabled"] is False
 
 
-@pytest.mark.slow  # the viewer takes its time to find out
-def test_a_viewer_that_finds_no_screen_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow  # the viewer needs seconds to detect it
+def test_reports_a_viewer_without_a_screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need_rerun()
     monkeypatch.setenv("DISPLAY", ":4711")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with viewing(tmp_path, made(tmp_path / "made.mcap")) as it:
-        _, told = it.communicate(timeout=DEADLINE_S)
-    assert it.returncode == 2 and "-o FILE.rrd" in told.splitlines()[-1]
+        _, err = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 2 and "-o FILE.rrd" in err.splitlines()[-1]

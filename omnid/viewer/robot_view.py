@@ -24,7 +24,7 @@ CONNECT_TIMEOUT_S: Final = 2.0
 POLL_S: Final = 0.5  # between two checks for the end
 
 
-class LiveRobotView:
+class RobotView:
     """Draws the messages of a robot; broken: messages that could not be decoded."""
 
     def __init__(self, scene: RerunScene) -> None:

@@ -1,0 +1,83 @@
+"""View of a replay: draws what the stages compute from a log of images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from calib import se3
+from omnid.engine.telemetry import Telemetry
+from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.sinks.encoder import Outgoing
+from omnid.stages.geometry import Geometry
+from omnid.stages.odometry import of_base
+from omnid.transport.decode import Cloud, Pose
+from omnid.transport.pose_attachment import PoseAttachment
+from omnid.viewer.image_encoding import jpeg
+from omnid.viewer.rerun_scene import RerunScene
+from omnid.viewer.status_plots import STAGES
+from omnid.viewer.style import depth_image
+
+MAP_EVERY_S: Final = 2.0
+
+
+class ReplayView:
+    """A sink of a run that draws poses, frames and maps."""
+
+    def __init__(self, scene: RerunScene, geometry: Geometry, telemetry: Telemetry) -> None:
+        self._scene, self._geometry = scene, geometry
+        self._latencies = StageLatencies(telemetry)
+
+    def process(self, message: Outgoing) -> None:
+        """Draw a message; velocity commands are not drawn."""
+        if isinstance(message, OdometryUpdate):
+            self._odometry(message)
+        elif isinstance(message, MapUpdate):
+            self._map(message)
+
+    def _odometry(self, odometry: OdometryUpdate) -> None:
+        scene = self._scene
+        if not scene.poses:
+            scene.rig(self._geometry.rig.T_base_rig)
+        scene.pose(pose_of(odometry, self._geometry))
+        for stage, mean_ms in self._latencies():
+            scene.latency(odometry.stamp_ns, (stage,), mean_ms)
+        if scene.wants("frame"):
+            self._frame(odometry)
+
+    def _frame(self, odometry: OdometryUpdate) -> None:
+        scene, depth, stamp_ns = self._scene, odometry.depth, odometry.stamp_ns
+        scene.panorama(stamp_ns, jpeg(depth.panoramas.lower.panorama))
+        scene.features(stamp_ns, odometry.features)
+        focal_baseline = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m
+        scene.depth(stamp_ns, depth_image(depth.disparity, focal_baseline), depth.points)
+
+    def _map(self, update: MapUpdate) -> None:
+        points = se3.apply(self._geometry.rig.T_base_rig, update.points.xyz.astype(float)).astype(np.float32)
+        self._scene.cloud(Cloud(update.stamp_ns, "odom", points, update.points.confidence))
+
+
+def pose_of(odometry: OdometryUpdate, geometry: Geometry) -> Pose:
+    """Return the pose of the base, as subscribers of the bus receive it."""
+    attachment = PoseAttachment(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks)
+    return Pose(odometry.stamp_ns, *of_base(odometry, geometry.rig.T_base_rig), attachment, odometry.stamp_ns)
+
+
+class StageLatencies:
+    """Mean processing time of each stage since the previous call."""
+
+    def __init__(self, telemetry: Telemetry) -> None:
+        self._telemetry = telemetry
+        self._before: dict[str, tuple[int, float]] = {}
+
+    def __call__(self) -> Iterator[tuple[str, float]]:
+        """Yield name and mean [ms] of the stages that have processed messages since the previous call."""
+        for stage in self._telemetry.stages:
+            count, mean_s = stage.wall.count, stage.wall.mean_s
+            total_s = count * mean_s if count else 0.0
+            before, before_s = self._before.get(stage.name, (0, 0.0))
+            self._before[stage.name] = count, total_s
+            if count > before and stage.name in STAGES:
+                yield stage.name, 1e3 * (total_s - before_s) / (count - before)
