@@ -66,12 +66,12 @@ def figures(operator: Operator, load: float) -> dict[str, str]:
     values = {f"pose {q}": odometry.get(f"capture_to_pose_{q}_ms", "") for q in ("p50", "p99", "max")}
     values |= {f"wheel {q}": wheels.get(f"capture_to_wheel_{q}_ms", "") for q in ("p50", "p99", "max")}
     values |= {f"tick {q}": wheels.get(f"tick_late_{q}_ms", "") for q in ("p50", "p99", "p999", "max")}
-    missed, untold = operator.values("stage motor")["missed"], wheels["untold"]
+    missed, lost_reports = operator.values("stage motor")["missed"], wheels["lost_reports"]
     drops = {name: operator.values(f"stage {name}").get("dropped", "?") for name in STAGES}
     lost = " ".join(f"{name} {count}" for name, count in drops.items() if count != "0")
     values |= {f"publishing cpu {q}": operator.values("stage bus").get(f"cpu_{q}_ms", "") for q in ("p50", "p99")}
     return values | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed,
-                     "untold": untold, "dropped": lost or "0", "load": f"{load:.1f}"}
+                     "lost_reports": lost_reports, "dropped": lost or "0", "load": f"{load:.1f}"}
 
 
 @pytest.mark.benchmark
