@@ -1,4 +1,4 @@
-"""What flows between the stages. p_a = T_a_b @ p_b; SI units; NaN for unknown; nobody writes into a message."""
+"""Messages between the stages. p_a = T_a_b @ p_b; SI units; NaN for unknown; messages are not modified."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ class Panoramas:
     stamp_ns: int
     lower: PaddedPanorama
     upper: PaddedPanorama
-    visible: NDArray[np.bool_]  # (H, W) both cameras show the world here, and in a tracking window around
+    visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoDepth:
-    """Disparities of the lower panorama, and the points they stand for."""
+    """Disparities of the lower panorama and their points."""
 
     seq: int
     stamp_ns: int
     panoramas: Panoramas
     disparity: NDArray[np.float32]  # (H, W) px > 0, NaN unknown
-    pixels: Array  # (N, 2) column, row of the located pixels
+    pixels: Array  # (N, 2) column, row of the matched pixels
     points: Array  # (N, 3) m, in the rig frame
     variance_m2: Array  # (N,) along the ray, where it is largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryUpdate:
-    """The rig's pose, its uncertainty and motion, and the depth it came from."""
+    """Pose and velocity of the rig with covariances, and the depth they were estimated from."""
 
     seq: int
     stamp_ns: int
@@ -60,18 +60,18 @@ class OdometryUpdate:
     velocity: Array  # (6,) m/s, rad/s in the rig frame
     velocity_covariance: Array  # (6, 6)
     state: TrackingState
-    reset_counter: int  # how often odom had to start anew with an unknown gap
+    reset_counter: int  # how often odom was continued after a gap of unknown motion
     inliers: int  # landmarks that agree with the pose
-    tracks: int  # landmarks that were found
+    tracks: int  # landmarks that were tracked
     depth: StereoDepth
-    features: Features = field(default_factory=Features)  # for whoever looks on; the paper's method gives none
+    features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """The map as it stands, and the way there."""
+    """The map so far, and the path of the rig."""
 
     seq: int
     stamp_ns: int
     points: MapPoints  # m, in the rig frame of the first pair
-    path_xy: Array  # (N, 2) m, likewise, thinned where the run is long
+    path_xy: Array  # (N, 2) m, in the same frame, thinned in a long run

@@ -1,1 +1,1 @@
-"""The boxes of the flow, one class each: short, state and glue around the numerics of `omnid.core`."""
+"""Stages of the flow, one class each: state and glue around the numerics of `omnid.core`."""

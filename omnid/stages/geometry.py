@@ -1,4 +1,4 @@
-"""What every stage knows about the rig: the cameras with their masks, the cylinder, and the frames between."""
+"""Geometry of a run: the rig with its masks, the cylinder of the panoramas, and the rectified frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from omnid.stages.decoder import Decoder
 
 Array = NDArray[np.float64]
 
-LOOKS, FRAMES_A_LOOK = 5, 12  # so often the rim is looked for, each time in the maximum of so many more images
+RIM_ATTEMPTS = 5  # to find the rims, each with more images than the one before
+FRAMES_PER_ATTEMPT = 12  # frames of both cameras added to the maximum image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,25 +34,25 @@ class Geometry:
 
     @property
     def T_rig_rect(self) -> Array:
-        """From the rectified frame, in which the epipolar lines are columns, to the rig's own (4, 4)."""
+        """Transform (4, 4) from the rectified frame, in which epipolar lines are columns, to the rig frame."""
         return se3.inverse(self.rig.T_rect_rig)
 
     def model(self, noise_px: float) -> StereoModel:
-        """What turns points into views, for corners located with a deviation of noise_px."""
+        """Return the measurement model of corners located with a standard deviation of noise_px."""
         return StereoModel(self.cylinder, self.rig.baseline_m, noise_px)
 
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
-    """The geometry of a rig; a camera without a mask counts as far as its image goes."""
+    """Return the geometry of a rig; of a camera without a mask the whole image is used."""
     return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg))
 
 
 def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
-    """The rig with the mirrors' rims where it has no masks, as seen in its first images; else as it is."""
+    """Return the rig with masks of the mirrors' rims, found in the first images of cameras without a mask."""
     missing: list[Camera] = [name for name, camera in _cameras(rig).items() if camera.mask is None]
     if not missing:
         return rig
-    found = _look(rig, missing, frames)
+    found = _find_rims(rig, missing, frames)
     return replace(rig, lower=_masked(rig.lower, found.get("lower")), upper=_masked(rig.upper, found.get("upper")))
 
 
@@ -59,13 +60,13 @@ def _cameras(rig: Rig) -> dict[Camera, MountedCamera]:
     return {"lower": rig.lower, "upper": rig.upper}
 
 
-def _look(rig: Rig, missing: list[Camera], frames: Iterable[Frame]) -> dict[Camera, Mask]:
-    """The rims in the brightest of the first images: one alone may be dark at some side."""
+def _find_rims(rig: Rig, missing: list[Camera], frames: Iterable[Frame]) -> dict[Camera, Mask]:
+    """Return the rims in the maximum of the first images: a single one may be dark on one side."""
     decode, stream = Decoder(rig), iter(frames)
     brightest: dict[Camera, NDArray[np.uint8]] = {}
     found: dict[Camera, Mask] = {}
-    for _ in range(LOOKS):
-        for frame in islice(stream, FRAMES_A_LOOK):
+    for _ in range(RIM_ATTEMPTS):
+        for frame in islice(stream, FRAMES_PER_ATTEMPT):
             image = decode(frame)
             if image is not None:
                 brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)

@@ -1,4 +1,4 @@
-"""The map of a whole run: points of all frames in one frame, fused in voxels (Dang et al. 2012, section IV.G)."""
+"""Map of a run: points of all pairs in one frame, fused in voxels (Dang et al. 2012, section IV.G)."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-LEAST_FRAMES = 2  # that must have seen a voxel, however short the run,
-SHORT_RUN = 10  # and one more for so many frames of the run, up to what is asked for
+MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run
+FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
 
 
-class Path:
-    """Where the rig was, in memory that is there from the start; when it is full, every second point is forgotten."""
+class ThinnedPath:
+    """Path of the rig in preallocated memory; when it is full, every second point is dropped."""
 
     def __init__(self, limit: int) -> None:
-        self._points = np.full((limit + 1, 2), np.nan)  # written, so that no page of it is new in the hours to come
+        self._points = np.full((limit + 1, 2), np.nan)  # written now, so that its pages are resident from the start
         self._kept, self._step, self._seen = 0, 1, 0
         self._last: tuple[float, float] | None = None
 
     def add(self, x_m: float, y_m: float) -> None:
-        """Takes the next point."""
+        """Add the next point."""
         self._last = (x_m, y_m)
         if self._seen % self._step == 0:
             self._points[self._kept] = self._last
@@ -38,30 +38,30 @@ class Path:
             self._points[: self._kept] = thinned
 
     def xy(self) -> Array:
-        """The points (N, 2) kept, and the last one."""
+        """Return the points (N, 2) kept, and the last one."""
         ends = np.zeros((0, 2)) if self._last is None else np.array([self._last])
         return np.concatenate([self._points[: self._kept], ends])
 
 
 class Mapping:
-    """Fuses the points that are certain enough, at poses that are; the map comes at the end, and every so often."""
+    """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
     def __init__(self, config: MappingConfig, every_s: float = 0.0) -> None:
-        """every_s: by the stamps, between two maps; 0: only at the end."""
+        """every_s: between two maps, by the stamps; 0: one map, at the end."""
         self._config = config
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
-        self._path = Path(config.path_poses)
+        self._path = ThinnedPath(config.path_poses)
         self._newest: tuple[int, int] | None = None
         self._frames = 0
 
     @property
     def counts(self) -> dict[str, int]:
-        """Voxels held, voxels given up for want of room, points that were no use."""
+        """Voxels of the map, voxels evicted for space, points that could not be mapped."""
         return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
 
     def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
-        """Takes the points of a pair, and gives the map when it is due."""
+        """Add the points of a pair; return the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
         self._frames += 1
         self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
@@ -76,10 +76,10 @@ class Mapping:
         return self._update(odometry.seq, odometry.stamp_ns)
 
     def finish(self) -> list[MapUpdate]:
-        """The whole map, if there was a pair at all."""
+        """Return the final map, if there was a pair."""
         return [] if self._newest is None else [self._update(*self._newest)]
 
     def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
-        """What enough frames agree about: false matches are seldom made twice in the same place."""
-        enough = min(self._config.min_frames, max(LEAST_FRAMES, self._frames // SHORT_RUN))
+        """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
+        enough = min(self._config.min_frames, max(MIN_VOXEL_FRAMES, self._frames // FRAMES_PER_VOXEL_FRAME))
         return MapUpdate(seq, stamp_ns, self._map.points(enough), self._path.xy())

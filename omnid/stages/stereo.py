@@ -1,4 +1,4 @@
-"""Depth of a pair: matching along the columns, then triangulation (Dang et al. 2012, section III)."""
+"""Stereo depth of a pair: matching along the columns, then triangulation (Dang et al. 2012, section III)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
 
-PAIRS_COMPARED, POINTS_TO_COMPARE = 2, 200
-STEP_PX, SPARE_ROWS = 32, 16  # the semi-global prior searches in such steps, and wants rows to spare
+EXCHANGE_PAIRS = 2  # first pairs that are also matched with the cameras exchanged
+MIN_EXCHANGED_POINTS = 200  # of these pairs, for the warning
+DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
+SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 
 
 class Stereo:
-    """Locates the edges of the lower panorama."""
+    """Computes disparities and points of the edges of the lower panorama."""
 
     def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
         self._geometry, self._config = geometry, config
@@ -33,18 +35,18 @@ class Stereo:
 
     @property
     def exchanged(self) -> bool:
-        """Whether more points of the first pairs match when the upper image is taken for the lower one.
+        """True if more points of the first pairs match with the cameras exchanged: they are likely confused.
 
-        With a disparity of the wrong sign there is no true match, but walls that repeat themselves give false ones:
-        on rendered rooms 0.1 to 0.8 times as many the right way round, 1.1 to 3.6 times as many the wrong way.
+        With a disparity of the wrong sign there is no true match, but repeated textures give false ones. In rendered
+        rooms, exchanging gives 0.1 to 0.8 times as many points with a right rig, 1.1 to 3.6 times with a wrong one.
         """
-        return self._exchanged_points > max(POINTS_TO_COMPARE, self._points)
+        return self._exchanged_points > max(MIN_EXCHANGED_POINTS, self._points)
 
     def process(self, panoramas: Panoramas) -> StereoDepth:
-        """The disparities, and their points in the rig frame."""
+        """Return disparities and their points in the rig frame."""
         columns, rows, found = self._match(panoramas)
-        if self._compared < PAIRS_COMPARED:
-            self._compare(panoramas, len(found))
+        if self._compared < EXCHANGE_PAIRS:
+            self._match_exchanged(panoramas, len(found))
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = found
         views = np.column_stack([columns, rows, rows + found]).astype(float)
@@ -57,41 +59,44 @@ class Stereo:
         )
 
     def _match(self, panoramas: Panoramas) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-        """Columns (N,), rows (N,) and disparities (N,) [px] of the located pixels."""
+        """Return columns (N,), rows (N,) and disparities (N,) [px] of the matched pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
         if self._matcher is None:
-            self._matcher = Matcher(lower.image.shape[:2], self._fitting(lower.image.shape[0]))
+            self._matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
         pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
 
-    def _compare(self, panoramas: Panoramas, points: int) -> None:
+    def _match_exchanged(self, panoramas: Panoramas, points: int) -> None:
         self._compared += 1
         self._points += points
         self._exchanged_points += len(self._match(replace(panoramas, lower=panoramas.upper, upper=panoramas.lower))[0])
 
     def _variance_m2(self, points: Array) -> Array:
-        """Variances (N,) along the rays to points (N, 3) in the rectified frame: depth goes with 1 / disparity."""
+        """Return variances (N,) along the rays to points (N, 3) in the rectified frame.
+
+        The distance from the axis is r = f t / d, so sigma_r = r^2 / (f t) * sigma_d; along the ray it is
+        sqrt(1 + z^2 / r^2) times as large.
+        """
         r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
         per_px = r2 / (self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m)
         return np.asarray((1 + z2 / r2) * (per_px * self._config.noise_px) ** 2)
 
-
-    def _fitting(self, height: int) -> MatchingSettings:
-        """The matching whose disparities reach the nearest points wanted, in panoramas of so many rows."""
+    def _matching(self, height: int) -> MatchingSettings:
+        """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
         nearest_px = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m / self._config.min_range_m
-        wanted = math.ceil(nearest_px / STEP_PX) * STEP_PX
+        needed = math.ceil(nearest_px / DISPARITY_STEP_PX) * DISPARITY_STEP_PX
         matching = self._config.matching
-        return _limited(replace(matching, disparities=min(matching.disparities, wanted)), height)
+        return _limited(replace(matching, disparities=min(matching.disparities, needed)), height)
 
 
 def _limited(matching: MatchingSettings, height: int) -> MatchingSettings:
-    """The matching for panoramas of so many rows: a larger disparity than they are high cannot be."""
-    most = (height - SPARE_ROWS) // STEP_PX * STEP_PX
-    if most < STEP_PX:
+    """Return the settings with no more disparities than panoramas of height rows allow."""
+    limit = (height - SPARE_ROWS) // DISPARITY_STEP_PX * DISPARITY_STEP_PX
+    if limit < DISPARITY_STEP_PX:
         raise OmnidError(
-            f"the panoramas are only {height} px high, {STEP_PX + SPARE_ROWS} px are needed for stereo: larger "
-            "images, or a rig whose cameras share more of their view"
+            f"the panoramas are {height} px high, stereo needs at least {DISPARITY_STEP_PX + SPARE_ROWS} px: use "
+            "larger images, or a rig whose cameras share more of their view"
         )
-    return replace(matching, disparities=min(matching.disparities, most))
+    return replace(matching, disparities=min(matching.disparities, limit))

@@ -1,6 +1,6 @@
-"""The map of a whole run in bounded memory: points of all frames, in the world frame, fused in voxels.
+"""Voxel map in bounded memory: points of all frames, in the world frame, fused in voxels.
 
-Dang et al. 2012, § IV.G: points reconstructed at each frame are moved by the estimated motion into one
+Dang et al. 2012, section IV.G: points reconstructed at each frame are transformed by the estimated motion into one
 frame and merged.
 """
 
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from omnid.errors import OmnidError
 
-_AXIS_BITS = 21
+_AXIS_BITS = 21  # of a packed key per axis
 _HALF_SPAN = 1 << (_AXIS_BITS - 1)  # voxel indices run from -2^20 to 2^20 - 1 on each axis
 _EMPTY = np.int64(-1)  # packed keys are never negative
-_MAX_LOAD, _LOAD_AFTER_EVICTION = 0.7, 0.5
-_BATCH_SHARE = 8  # at most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing always ends
-_OLD_FRAMES = 30  # a point seen once and not again for so many frames was most likely a false match
-_VARIANCE_RANGE_M2 = (1e-8, 1e8)  # no point claims better than 0.1 mm; sums of weights stay far from overflow
-_BLOCK = 4096  # points of a snapshot worked out at once: in passing it takes little more than what it gives
+_MAX_LOAD = 0.7  # part of the table in use at which voxels are evicted
+_LOAD_AFTER_EVICTION = 0.5
+_BATCHES = 8  # at most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing ends
+_OLD_FRAMES = 30  # a voxel seen once and not again for so many frames is most likely a false match
+_VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
+_BLOCK_POINTS = 4096  # of a snapshot, computed at a time, so that it needs little extra memory
 _HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
 
 
@@ -35,7 +36,7 @@ class MapPoints:
 
 
 class VoxelMap:
-    """A hash table of voxels in preallocated arrays: 52 bytes a slot, however long the run.
+    """Hash table of voxels in preallocated arrays of 52 bytes per slot.
 
     Each voxel keeps the mean position weighted by information (1 / variance), its sum of weights, the number of frames
     that saw it and the last of them. `evicted` counts voxels dropped for space, `refused` points that were not mapped:
@@ -44,13 +45,13 @@ class VoxelMap:
 
     def __init__(self, voxel_m: float = 0.05, capacity: int = 1 << 18) -> None:
         if not (np.isfinite(voxel_m) and voxel_m > 0.0):
-            raise OmnidError(f"a voxel edge above 0 m was expected, {voxel_m} found: name one such as 0.05")
+            raise OmnidError(f"voxel edge: expected a length above 0 m, such as 0.05, found {voxel_m}")
         if capacity < 16 or capacity & (capacity - 1):
-            raise OmnidError(f"a capacity of 16, 32, 64 ... voxels was expected, {capacity} found: try {1 << 18}")
+            raise OmnidError(f"capacity: expected a power of two from 16 on, such as {1 << 18}, found {capacity}")
         self.evicted = 0
         self.refused = 0
         self._voxel_m = voxel_m
-        self._shift = np.uint64(65 - capacity.bit_length())  # the hash's top bits are its best mixed
+        self._shift = np.uint64(65 - capacity.bit_length())  # the top bits of a multiplicative hash are the best mixed
         self._count = 0
         self._newest_seq = 0
         self._keys = np.full(capacity, _EMPTY, dtype=np.int64)
@@ -67,26 +68,26 @@ class VoxelMap:
         self.refused += len(points) - int(usable.sum())
         keys, sums = self._reduce(points[usable], variance_m2[usable])
         self._newest_seq = max(self._newest_seq, seq)
-        batch = len(self._keys) // _BATCH_SHARE
+        batch = len(self._keys) // _BATCHES
         for start in range(0, len(keys), batch):
             self._fuse(keys[start : start + batch], sums[start : start + batch], seq)
             if self._count > _MAX_LOAD * len(self._keys):
                 self._evict()
 
     def points(self, min_frames: int = 2) -> MapPoints:
-        """The voxels seen in at least `min_frames` frames, as their mean positions in the order of their keys."""
-        slots = np.flatnonzero(self._frames >= max(1, min_frames))  # an empty one has no frames
+        """Return the voxels seen in at least `min_frames` frames, with their mean positions, sorted by key."""
+        slots = np.flatnonzero(self._frames >= max(1, min_frames))  # empty slots have none
         slots = slots[np.argsort(self._keys[slots])]
         count = len(slots)
         points = MapPoints(np.empty((count, 3), np.float32), np.empty(count, np.float32), self._frames[slots],
                            np.empty(count, np.int32))
-        for start in range(0, count, _BLOCK):
-            at = slice(start, start + _BLOCK)
+        for start in range(0, count, _BLOCK_POINTS):
+            at = slice(start, start + _BLOCK_POINTS)
             self._describe(slots[at], points.xyz[at], points.confidence[at], points.age[at])
         return points
 
     def _describe(self, slots: NDArray[np.int64], *into: NDArray[np.generic]) -> None:
-        """Writes the mean positions (N, 3), the confidence (N,) and the age (N,) of some slots."""
+        """Write mean positions (N, 3), confidence (N,) and age (N,) of some slots into arrays."""
         sums = self._sums[slots]
         age = self._newest_seq - self._last_seq[slots]
         found = (sums[:, 1:] / sums[:, :1], self._confidence(slots), np.minimum(age, np.iinfo(np.int32).max))
@@ -94,13 +95,13 @@ class VoxelMap:
             target[...] = values
 
     def _usable(self, points: NDArray[np.float64], variance_m2: NDArray[np.float64]) -> NDArray[np.bool_]:
-        inside = (np.abs(points) < _HALF_SPAN * self._voxel_m).all(axis=1)  # false for NaN and infinity too
+        inside = (np.abs(points) < _HALF_SPAN * self._voxel_m).all(axis=1)  # False for NaN and infinity
         return np.asarray(inside & np.isfinite(variance_m2) & (variance_m2 > 0.0))
 
     def _reduce(
         self, points: NDArray[np.float64], variance_m2: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """One frame's voxels: sorted packed keys (U,) and sums (U, 4)."""
+        """Return the voxels of one frame: sorted packed keys (U,) and sums (U, 4)."""
         keys, voxel = np.unique(self._pack(points), return_inverse=True)
         weight = 1.0 / np.clip(variance_m2, *_VARIANCE_RANGE_M2)
         columns = (weight, *(weight[:, None] * points).T)
@@ -108,7 +109,7 @@ class VoxelMap:
 
     def _pack(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         index = np.floor(points / self._voxel_m).astype(np.int64) + _HALF_SPAN
-        index = np.clip(index, 0, 2 * _HALF_SPAN - 1)  # rounding at the very border
+        index = np.clip(index, 0, 2 * _HALF_SPAN - 1)  # rounding at the border
         return np.asarray((index[:, 0] << (2 * _AXIS_BITS)) | (index[:, 1] << _AXIS_BITS) | index[:, 2])
 
     def _fuse(self, keys: NDArray[np.int64], sums: NDArray[np.float64], seq: int) -> None:
@@ -120,7 +121,7 @@ class VoxelMap:
         self._last_seq[slots] = np.where(known, np.maximum(self._last_seq[slots], seq), seq)
 
     def _place(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The slot of each of the keys, all different; free slots are claimed.
+        """Return the slot of each of the distinct keys; free slots are claimed.
 
         Triangular probing visits every slot of a table of 2^n, and the table is never full: the loop ends.
         """
@@ -130,22 +131,23 @@ class VoxelMap:
         while pending.size:
             tried = slots[pending]
             free = self._keys[tried] == _EMPTY
-            self._keys[tried[free]] = keys[pending[free]]  # of two that want one slot, one stays; the other goes on
+            self._keys[tried[free]] = keys[pending[free]]  # of two keys for one slot, the last one stays
             pending = pending[self._keys[tried] != keys[pending]]
             step += 1
             slots[pending] = (slots[pending] + step) & (len(self._keys) - 1)
         return slots
 
     def _confidence(self, slots: NDArray[np.int64]) -> NDArray[np.float64]:
-        """0..1, growing with both witnesses: n / (n + 1) of n frames; 1 / (1 + variance of the mean / voxel^2)."""
+        """Return confidences 0..1: n / (n + 1) for n frames times 1 / (1 + variance of the mean / voxel^2)."""
         frames, weight = self._frames[slots].astype(np.float64), self._sums[slots, 0]
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
 
     def _evict(self) -> None:
-        """Rebuild the table with its best half: voxels seen once and long ago go first, then the least confident."""
+        """Drop voxels down to _LOAD_AFTER_EVICTION: those seen once and long ago first, then the least confident."""
         slots = np.flatnonzero(self._keys != _EMPTY)
         old_single = (self._frames[slots] == 1) & (self._newest_seq - self._last_seq[slots] > _OLD_FRAMES)
-        order = np.lexsort((self._keys[slots], self._confidence(slots), ~old_single))  # the key makes ties repeatable
+        # The key makes the order of ties deterministic.
+        order = np.lexsort((self._keys[slots], self._confidence(slots), ~old_single))
         kept = slots[order[len(slots) - int(_LOAD_AFTER_EVICTION * len(self._keys)) :]]
         self.evicted += len(slots) - len(kept)
         self._rebuild(kept)

@@ -24,8 +24,7 @@ from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, Ster
 from omnid.runs.pipeline import Sinks, wire
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.mapping import Mapping
-from omnid.stages.mapping import Path as Way
+from omnid.stages.mapping import Mapping, ThinnedPath
 from omnid.stages.odometry import in_axes, of_base
 from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
@@ -44,38 +43,38 @@ def frames(scene: Path) -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def place(scene: Path) -> Geometry:
+def rig_geometry(scene: Path) -> Geometry:
     return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
 
 
 def stamped(frames: list[Frame], *order: tuple[Camera, int]) -> list[Frame]:
-    """Frames of these cameras at these stamps [ms]."""
+    """Return frames of these cameras with these stamps [ms]."""
     first = {frame.camera: frame for frame in reversed(frames)}
     return [replace(first[camera], stamp_ns=stamp * MS) for camera, stamp in order]
 
 
-def run_pairs(place: Geometry, frames: list[Frame]) -> tuple[list[FramePair], dict[str, int]]:
-    sync = Synchronise(place.rig, PairConfig())
+def run_pairs(rig_geometry: Geometry, frames: list[Frame]) -> tuple[list[FramePair], dict[str, int]]:
+    sync = Synchronise(rig_geometry.rig, PairConfig())
     made = [pair for frame in frames if (pair := sync.process(frame)) is not None]
     sync.finish()
     return made, sync.counts
 
 
-def test_pair_keeps_the_cameras_apart(place: Geometry, frames: list[Frame]) -> None:
-    (pair,), _ = run_pairs(place, stamped(frames, ("upper", 0), ("lower", 1)))
-    (other,), _ = run_pairs(place, stamped(frames, ("lower", 0), ("upper", 1)))
+def test_a_pair_has_the_image_of_each_camera(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    (pair,), _ = run_pairs(rig_geometry, stamped(frames, ("upper", 0), ("lower", 1)))
+    (other,), _ = run_pairs(rig_geometry, stamped(frames, ("lower", 0), ("upper", 1)))
     assert np.array_equal(pair.lower, other.lower) and np.array_equal(pair.upper, other.upper)
     assert not np.array_equal(pair.lower, pair.upper)
 
 
-def depth_of(place: Geometry, frames: list[Frame]) -> StereoDepth:
-    (pair,), _ = run_pairs(place, frames[:2])
-    return Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
+def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
+    (pair,), _ = run_pairs(rig_geometry, frames[:2])
+    return Stereo(rig_geometry, CONFIG.stereo).process(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
 
 
-def test_points_lie_on_the_world(scene: Path, place: Geometry, frames: list[Frame]) -> None:
-    """The floor of the rendered corridor is z = 0: points below the rig must lie on it, others above."""
-    depth = depth_of(place, frames)
+def test_points_lie_on_the_surfaces_of_the_world(scene: Path, rig_geometry: Geometry, frames: list[Frame]) -> None:
+    """The floor of the rendered corridor is z = 0: no points may lie below it."""
+    depth = depth_of(rig_geometry, frames)
     points = se3.apply(read_tum(scene / "truth.txt").T[0], depth.points)
     sure = depth.variance_m2 < 0.05**2
     assert sure.sum() > 500
@@ -84,54 +83,54 @@ def test_points_lie_on_the_world(scene: Path, place: Geometry, frames: list[Fram
     assert np.isfinite(depth.disparity).sum() >= len(depth.points)
 
 
-def test_points_are_seen_where_they_were_found() -> None:
-    """In a misaligned rig whose frame is neither camera's: back in both images, a point is where the tables say."""
+def test_points_project_to_the_pixels_they_were_matched_at() -> None:
+    """In a misaligned rig, points project into both images where the remap tables have their pixels."""
     run = build("misaligned", seed=1, size=256, pairs=1)
-    place = geometry(run.rig, CONFIG.panorama)
+    rig_geometry = geometry(run.rig, CONFIG.panorama)
     pair = FramePair(0, 0, *(render_grey(run.scene, m, run.poses[0]) for m in (run.rig.lower, run.rig.upper)))
-    depth = Stereo(place, CONFIG.stereo).process(Dewarp(place, CONFIG.panorama).process(pair))
+    depth = Stereo(rig_geometry, CONFIG.stereo).process(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
     column, row = depth.pixels.astype(int).T
     below = row + depth.disparity[row, column]
     assert len(column) > 300
     for mounted, rows in ((run.rig.lower, row), (run.rig.upper, below)):
         seen = mounted.camera.project(se3.apply(mounted.T_cam_rig, depth.points))
-        tables = remap_tables(run.rig, mounted, place.cylinder)
+        tables = remap_tables(run.rig, mounted, rig_geometry.cylinder)
         expected = np.column_stack([cv2.remap(t, column.astype(np.float32), rows.astype(np.float32),
                                               cv2.INTER_LINEAR).ravel() for t in tables])
         assert np.abs(seen - expected).max() < 0.05
 
 
 @pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
-def test_the_search_reaches_the_nearest_points_wanted(min_range_m: float, found: bool) -> None:
+def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) -> None:
     """A wall whose disparity is 60 px stands 0.6 m away."""
-    place = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
-    shape = (place.cylinder.height, place.cylinder.width)
+    rig_geometry = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
+    shape = (rig_geometry.cylinder.height, rig_geometry.cylinder.width)
     lower = texture(1, shape, sigma_px=3)
     upper = np.roll(lower, 60, axis=0)
     inner = np.zeros(shape, bool)
     inner[10:-80] = True
-    depth = Stereo(place, replace(CONFIG.stereo, min_range_m=min_range_m)).process(
+    depth = Stereo(rig_geometry, replace(CONFIG.stereo, min_range_m=min_range_m)).process(
         Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
     right = np.abs(depth.disparity - 60) < 1
     assert (right.sum() > 5000) == found
 
 
-def test_what_is_visible_keeps_a_margin(place: Geometry, frames: list[Frame]) -> None:
+def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Frame]) -> None:
     margin = CONFIG.panorama.margin_px
-    visible = depth_of(place, frames).panoramas.visible
+    visible = depth_of(rig_geometry, frames).panoramas.visible
     assert not visible[: margin + 1].any() and not visible[-margin - 1 :].any() and visible.any()
-    none, wide = (Dewarp(place, replace(CONFIG.panorama, margin_px=m)) for m in (0, 20))
-    (pair,), _ = run_pairs(place, frames[:2])
+    none, wide = (Dewarp(rig_geometry, replace(CONFIG.panorama, margin_px=m)) for m in (0, 20))
+    (pair,), _ = run_pairs(rig_geometry, frames[:2])
     shares = [dewarp.process(pair).visible.mean() for dewarp in (none, wide)]
     assert shares[0] > visible.mean() > shares[1]
 
 
-def test_variance_is_that_of_the_disparity(place: Geometry, frames: list[Frame]) -> None:
-    """Half a pixel more or less of disparity moves a point by about its deviation."""
-    depth = depth_of(place, frames)
-    rect = se3.apply(place.rig.T_rect_rig, depth.points)
+def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    """Half a pixel of disparity moves a point by about its standard deviation."""
+    depth = depth_of(rig_geometry, frames)
+    rect = se3.apply(rig_geometry.rig.T_rect_rig, depth.points)
     range_m = np.linalg.norm(rect, axis=1)
-    disparity = place.cylinder.focal_px * place.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
+    disparity = rig_geometry.cylinder.focal_px * rig_geometry.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
     moved = range_m * CONFIG.stereo.noise_px / disparity
     np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
 
@@ -144,8 +143,8 @@ def odometry(T: np.ndarray, *, state: str = "tracking", covariance: np.ndarray |
     return OdometryUpdate(seq, seq * 100 * MS, T, cov, velocity, zero, state, 0, 0, 0, depth)  # type: ignore[arg-type]
 
 
-def test_covariance_of_the_base_is_what_the_rigs_motion_makes_it() -> None:
-    """Random small motions of the rig, carried over to the base: their spread is the covariance that is published."""
+def test_covariance_of_the_base_equals_the_scatter_of_its_motions() -> None:
+    """Random small motions of the rig, transformed to the base, scatter by the covariance of the base."""
     rng = np.random.default_rng(0)
     T_odom_rig, T_base_rig = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
     root = rng.normal(0, 1e-4, (6, 6))
@@ -168,8 +167,8 @@ def test_base_starts_at_the_origin() -> None:
     np.testing.assert_allclose(of_base(odometry(np.eye(4)), T_base_rig)[0], np.eye(4), atol=1e-12)
 
 
-def test_map_takes_only_what_is_sure(place: Geometry, frames: list[Frame]) -> None:
-    depth = depth_of(place, frames)
+def test_maps_certain_points_at_tracked_poses_only(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    depth = depth_of(rig_geometry, frames)
     for state, kept in (("tracking", True), ("degraded", False), ("lost", False)):
         mapping = Mapping(MappingConfig(min_frames=1))
         mapping.process(odometry(np.eye(4), state=state, depth=depth))
@@ -181,63 +180,63 @@ def test_map_takes_only_what_is_sure(place: Geometry, frames: list[Frame]) -> No
     assert Mapping(MappingConfig()).finish() == []
 
 
-def test_a_map_too_small_for_the_world_says_what_it_gave_up(place: Geometry, frames: list[Frame]) -> None:
-    depth = depth_of(place, frames)
-    for log2_voxels, gives_up in ((18, False), (10, True)):
+def test_a_full_map_counts_evicted_voxels(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    depth = depth_of(rig_geometry, frames)
+    for log2_voxels, evicts in ((18, False), (10, True)):
         mapping = Mapping(MappingConfig(voxel_m=0.01, log2_voxels=log2_voxels, max_sigma_m=10.0))
         for seq in range(3):
             mapping.process(odometry(np.eye(4), depth=depth, seq=seq))
-        assert (mapping.counts["evicted"] > 0) == gives_up
+        assert (mapping.counts["evicted"] > 0) == evicts
         assert 0 < mapping.counts["voxels"] <= 0.7 * 2**log2_voxels + len(depth.points)
 
 
-def test_path_is_thinned_but_keeps_its_ends() -> None:
-    way = Way(100)
+def test_thins_the_path_and_keeps_its_ends() -> None:
+    path = ThinnedPath(100)
     for k in range(10_000):
-        way.add(float(k), 0.0)
-    x = way.xy()[:, 0]
+        path.add(float(k), 0.0)
+    x = path.xy()[:, 0]
     assert len(x) <= 102 and x[0] == 0 and x[-1] == 9999 and (np.diff(x) <= 128).all()
 
 
-def test_a_path_takes_no_more_memory_as_it_gets_longer() -> None:
-    way = Way(10_000)
+def test_the_memory_of_a_path_is_constant() -> None:
+    path = ThinnedPath(10_000)
 
-    def go_on() -> None:
+    def extend() -> None:
         for k in range(9000):
-            way.add(float(k), 0.5)
+            path.add(float(k), 0.5)
 
-    assert taken(go_on).held < 1000
-    assert len(way.xy()) == 9001 and way.xy()[0].tolist() == [0.0, 0.5] and way.xy()[-2].tolist() == [8999.0, 0.5]
-    assert Way(100).xy().shape == (0, 2)
-
-
-def test_pace_keeps_time_until_woken(frames: list[Frame]) -> None:
-    apart = stamped(frames, ("lower", 0), ("lower", 3_600_000))
-    pace = PlaybackClock()
-    waiting = pace.frames(apart)
-    assert next(waiting) is apart[0]
-    pace.wake()
-    assert next(waiting) is apart[1]
+    assert taken(extend).held < 1000
+    assert len(path.xy()) == 9001 and path.xy()[0].tolist() == [0.0, 0.5] and path.xy()[-2].tolist() == [8999.0, 0.5]
+    assert ThinnedPath(100).xy().shape == (0, 2)
 
 
-def paired(graph: Graph, place: Geometry, frames: list[Frame]) -> tuple[Synchronise, Stream[FramePair]]:
-    pair = Synchronise(place.rig, CONFIG.pair)
+def test_playback_waits_for_the_stamps_until_woken(frames: list[Frame]) -> None:
+    frames_an_hour_apart = stamped(frames, ("lower", 0), ("lower", 3_600_000))
+    clock = PlaybackClock()
+    waiting = clock.frames(frames_an_hour_apart)
+    assert next(waiting) is frames_an_hour_apart[0]
+    clock.wake()
+    assert next(waiting) is frames_an_hour_apart[1]
+
+
+def paired(graph: Graph, rig_geometry: Geometry, frames: list[Frame]) -> tuple[Synchronise, Stream[FramePair]]:
+    pair = Synchronise(rig_geometry.rig, CONFIG.pair)
     return pair, graph.stage("pair", pair, graph.source("read", lambda: frames))
 
 
-def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: list[Frame]) -> None:
-    drops = dropped(place, frames, object)
+def test_a_slow_bus_drops_messages_and_delays_no_pose(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    drops = dropped(rig_geometry, frames, object)
     assert drops["bus"] > PAIRS // 2 and drops["bus-drive"] > PAIRS // 2
     assert sum(drops.values()) == sum(drops[name] for name in ("bus", "bus-drive", "bus-map"))
 
 
-def test_a_slow_map_drops_no_pose(place: Geometry, frames: list[Frame]) -> None:
+def test_a_slow_map_drops_no_pose(rig_geometry: Geometry, frames: list[Frame]) -> None:
     """Maps have their own inbox; a busy machine may still cost a pose or two."""
-    assert dropped(place, frames, MapUpdate)["bus"] <= 2
+    assert dropped(rig_geometry, frames, MapUpdate)["bus"] <= 2
 
 
-def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
-    """Return the messages dropped by each box, with a bus that holds messages of a type until all poses are there."""
+def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
+    """Return the messages dropped by each stage, with a bus that holds messages of a type until all poses are there."""
     graph, statistics, complete = Graph(), RunStatistics(), threading.Event()
 
     class Complete:
@@ -251,15 +250,14 @@ def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
                 assert complete.wait(60.0), "the poses waited for the bus"
 
     sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus(), map_every_s=0.5)
-    wire(graph, paired(graph, place, frames)[1], place, CONFIG, sinks)
+    wire(graph, paired(graph, rig_geometry, frames)[1], rig_geometry, CONFIG, sinks)
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
 
 
 @pytest.mark.parametrize("threaded", [True, False])
-def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> None:
-    """The pipeline needs no log: any iterable of frames will do."""
+def test_the_pipeline_reads_any_iterable_of_frames(rig_geometry: Geometry, frames: list[Frame], threaded: bool) -> None:
     poses: list[OdometryUpdate] = []
 
     class Keep:
@@ -267,7 +265,7 @@ def test_wired_by_hand(place: Geometry, frames: list[Frame], threaded: bool) -> 
             poses.append(message)
 
     graph = Graph(threaded=threaded)
-    pair, pairs = paired(graph, place, frames)
-    wire(graph, pairs, place, CONFIG, Sinks(poses={"keep": Keep()}))
+    pair, pairs = paired(graph, rig_geometry, frames)
+    wire(graph, pairs, rig_geometry, CONFIG, Sinks(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

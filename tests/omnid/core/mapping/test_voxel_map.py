@@ -1,4 +1,4 @@
-"""The voxel map: fusion by information, one count a frame, bounded memory, the same bytes every time."""
+"""Voxel map: fusion by information, frame counts, bounded memory, deterministic results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def var(count: int, variance_m2: float = 1e-4) -> Array:
 
 
 def row(start: int, count: int) -> Array:
-    """Points in the middle of `count` neighbouring voxels of 1 m."""
+    """Return the centres of `count` neighbouring voxels of 1 m."""
     return np.stack([np.arange(start, start + count) + 0.5, np.zeros(count), np.zeros(count)], axis=1)
 
 
@@ -39,7 +39,7 @@ def test_mean_is_weighted_by_information() -> None:
     assert (points.frames.tolist(), points.age.tolist()) == ([2], [0])
 
 
-def test_one_frame_counts_once() -> None:
+def test_counts_a_frame_once() -> None:
     voxels = VoxelMap(voxel_m=1.0, capacity=64)
     voxels.insert(np.repeat(one(0.5, 0.5, 0.5), 100, axis=0), var(100), seq=4)
     voxels.insert(one(0.1, 0.5, 0.5), var(1), seq=4)
@@ -48,7 +48,7 @@ def test_one_frame_counts_once() -> None:
     assert voxels.points(min_frames=1).xyz[0, 0] == pytest.approx(50.1 / 101)
 
 
-def test_against_a_dictionary() -> None:
+def test_agrees_with_a_dictionary() -> None:
     rng = np.random.default_rng(5)
     voxels = VoxelMap(voxel_m=0.1, capacity=4096)
     sums: dict[tuple[int, ...], Array] = {}
@@ -74,7 +74,7 @@ def test_min_frames_and_age() -> None:
         voxels.insert(row(0, 3 if seq < 4 else 1), var(3 if seq < 4 else 1), seq)
     assert voxels.points(5).age.tolist() == [0]
     assert voxels.points(4).age.tolist() == [0, 6, 6]
-    voxels.insert(row(0, 2), var(2), 7)  # a late frame makes nothing older, and nothing younger than itself
+    voxels.insert(row(0, 2), var(2), 7)  # a late frame
     assert voxels.points(4).age.tolist() == [0, 2, 6]
 
 
@@ -90,7 +90,7 @@ def test_confidence_grows_with_frames_and_precision() -> None:
     assert sharp.points(1).confidence[0] > history[0]
 
 
-def test_refused_points_are_counted_and_leave_no_trace() -> None:
+def test_counts_refused_points_and_leaves_them_out() -> None:
     voxels = VoxelMap(voxel_m=1.0, capacity=64)
     points = np.repeat(one(0.5, 0.5, 0.5), 9, axis=0)
     points[0, 1], points[1, 2], points[2, 0], points[3, 0] = np.nan, np.inf, float(1 << 20), -1e300
@@ -100,7 +100,7 @@ def test_refused_points_are_counted_and_leave_no_trace() -> None:
     assert (voxels.refused, len(voxels)) == (8, 1)
 
 
-def test_the_border_of_space_is_kept_apart() -> None:
+def test_maps_the_corners_of_its_range() -> None:
     voxels = VoxelMap(voxel_m=1.0, capacity=64)
     edge = float(1 << 20)
     corners = np.array([[s * (edge - 0.5) for s in signs] for signs in np.ndindex(2, 2, 2)]) * 2 - edge + 0.5
@@ -108,7 +108,7 @@ def test_the_border_of_space_is_kept_apart() -> None:
     assert (voxels.refused, len(voxels)) == (0, 8)
 
 
-def test_nothing_to_insert() -> None:
+def test_inserts_an_empty_frame() -> None:
     voxels = VoxelMap()
     voxels.insert(np.empty((0, 3)), np.empty(0), 0)
     points = voxels.points()
@@ -123,12 +123,12 @@ def test_tiny_variance_does_not_overflow() -> None:
     assert ((points.confidence > 0.0) & (points.confidence < 1.0)).all()
 
 
-def test_old_single_sightings_go_first_then_the_least_confident() -> None:
+def test_evicts_old_single_voxels_then_the_least_confident() -> None:
     voxels = VoxelMap(voxel_m=1.0, capacity=64)
     voxels.insert(row(0, 15), var(15, 1e-8), seq=0)  # precise, but seen once and long ago
     for seq in (100, 101):
         voxels.insert(row(100, 15), var(15, 1e-2), seq)
-        voxels.insert(row(200, 10), var(10, 1e2), seq)  # seen as often, yet vague
+        voxels.insert(row(200, 10), var(10, 1e2), seq)  # seen as often, but uncertain
     voxels.insert(row(300, 5), var(5, 1e-2), seq=102)  # seen once, just now: 45 voxels, more than 0.7 * 64
     assert (voxels.evicted, len(voxels)) == (13, 32)
     survivors = voxels.points(1).xyz[:, 0] // 100
@@ -149,7 +149,7 @@ def test_memory_stays_bounded(capacity: int) -> None:
     assert len(voxels.points(1).xyz) == len(voxels)
 
 
-def test_a_place_seen_again_survives_the_flood() -> None:
+def test_keeps_voxels_that_are_seen_again() -> None:
     rng = np.random.default_rng(4)
     voxels = VoxelMap(voxel_m=1.0, capacity=1024)
     for seq in range(200):
@@ -182,8 +182,8 @@ def test_snapshot_is_a_copy() -> None:
     assert as_bytes(before) == kept
 
 
-def test_a_snapshot_takes_little_more_than_it_gives() -> None:
-    """A live map gives one every two seconds and grows for hours; what it takes in passing stays with the process."""
+def test_a_snapshot_needs_little_extra_memory() -> None:
+    """A live run takes one every two seconds for hours; its peak memory stays with the process."""
     rng = np.random.default_rng(3)
     voxels = VoxelMap(voxel_m=0.05)
     voxels.insert(rng.uniform(-4.0, 4.0, (100_000, 3)), var(100_000), 0)
@@ -192,7 +192,7 @@ def test_a_snapshot_takes_little_more_than_it_gives() -> None:
 
 
 @pytest.mark.parametrize("count", [4095, 4096, 4097, 8193])
-def test_no_point_is_lost_where_a_snapshot_is_worked_out_in_parts(count: int) -> None:
+def test_a_snapshot_has_all_points_of_several_blocks(count: int) -> None:
     voxels = VoxelMap(voxel_m=1.0)
     voxels.insert(row(0, count), var(count), 0)
     points = voxels.points(1)
@@ -201,6 +201,6 @@ def test_no_point_is_lost_where_a_snapshot_is_worked_out_in_parts(count: int) ->
 
 
 @pytest.mark.parametrize(("voxel_m", "capacity"), [(0.0, 64), (np.nan, 64), (-1.0, 64), (0.1, 0), (0.1, 100), (0.1, 8)])
-def test_bad_settings(voxel_m: float, capacity: int) -> None:
+def test_refuses_wrong_settings(voxel_m: float, capacity: int) -> None:
     with pytest.raises(OmnidError, match="expected"):
         VoxelMap(voxel_m, capacity)
