@@ -1,4 +1,4 @@
-"""The command line: finds the command, runs it, and turns what the user can put right into one line and exit code 2."""
+"""The command line: runs a command and turns errors that the user can correct into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -15,39 +15,43 @@ from omnid import __version__
 
 COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "report", "log",
             "diff", "doctor", "config")
-MODULES = {"eval": "evaluate"}  # eval is a name that Python has taken
-WRONG = 2
+MODULES = {"eval": "evaluate"}  # eval is a name of Python itself
+WRONG_INPUT = 2
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Ends the program."""
-        self.exit(WRONG, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
+        """Print the error and end the program."""
+        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The exit code: 0 all is well, 1 found wanting, 2 the input is wrong, 130 stopped by Ctrl-C."""
-    _open_what_is_closed()
+    """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 130 Ctrl-C."""
+    _open_closed_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     args = _parser(words).parse_args(words)
     return _guarded(args)
 
 
-def _open_what_is_closed() -> None:
-    """Whoever starts us may have closed stdout or stderr: the next file would take its number, and what is said."""
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - as long as the program
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - as long as the program
+def _open_closed_streams() -> None:
+    """Open stdout and stderr if they were closed, else the next file would get their number and all prints."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
 
 
 def _parser(words: Sequence[str]) -> Parser:
-    """Only the command that is asked for is loaded: some take a second to be."""
+    """Return a parser of the named command only, because the import of some takes a second; else of all."""
     parser = Parser(prog="omnid", description="Odometry, map and guidance from two stacked omnidirectional cameras.")
     parser.add_argument("--version", action="version", version=f"omnid {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="command", parser_class=Parser)
-    asked = next((word for word in words if not word.startswith("-")), "")
-    for name in (asked,) if asked in COMMANDS else COMMANDS if "--version" not in words else ():
+    named = next((word for word in words if not word.startswith("-")), "")
+    if named in COMMANDS:
+        names: Sequence[str] = (named,)
+    else:
+        names = () if "--version" in words else COMMANDS
+    for name in names:
         import_module(f"omnid.commands.{MODULES.get(name, name)}").add_parser(subparsers)
     return parser
 
@@ -65,19 +69,19 @@ def _guarded(args: argparse.Namespace) -> int:
         return code
     except (OmnidError, DriverError, CalibError) as error:
         log_unlimited(logging.ERROR, str(error))
-        return WRONG
+        return WRONG_INPUT
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # whoever read our output has gone, as `head` does
-        _hush()
+    except BrokenPipeError:  # the reader of the output has gone, such as `head`
+        _discard_stdout()
         return 141
-    except OSError as error:  # what no command has foreseen: a disk that is full, a name that is too long
+    except OSError as error:  # not handled by the command: a full disk, a file name that is too long
         log_unlimited(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
-        _hush()
-        return WRONG
+        _discard_stdout()
+        return WRONG_INPUT
 
 
-def _hush() -> None:
-    """What is still to be written to the standard output goes nowhere."""
-    with suppress(OSError):  # it may be no file at all
+def _discard_stdout() -> None:
+    """Discard the buffered standard output."""
+    with suppress(OSError):  # it may have no file descriptor
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""`omnid cameras`: which cameras are there, what they offer, and the udev rule that gives them names that stay."""
+"""`omnid cameras`: list the cameras, their modes, and a udev rule that gives them persistent names."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-ROOT = Path("/")  # where sys and dev are
+ROOT = Path("/")  # folder of sys and dev
 _ADVICE = """
-To call them /dev/omnid/lower and /dev/omnid/upper whatever is plugged in first, put this into {file}
-(exchange lower and upper where they are the other way round), then run
+To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
+(exchange lower and upper if they are the other way round), then run
 `udevadm control --reload && udevadm trigger --subsystem-match=video4linux`:
 """
 
@@ -21,12 +21,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the list; 1 if there is none."""
+    """Print the list; return 1 if there is no camera."""
     from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, describe_device, udev_rules
 
     devices = capture_devices(ROOT)
     if not devices:
-        print("omnid: no cameras: the kernel knows no capture device; check the cables, and what `dmesg` says of them",
+        print("omnid: no cameras: the kernel has no capture device; check the cables and the output of `dmesg`",
               file=sys.stderr)
         return 1
     print("\n\n".join("\n".join(describe_device(device)) for device in devices))

@@ -1,4 +1,4 @@
-"""`omnid demo`: the sample log of the package in real time, with everything on, and how far it is from the truth."""
+"""`omnid demo`: replay the sample log in real time with all outputs, and compare with the ground truth."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from omnid.commands.replay import replay_and_print
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `demo` to the command line."""
     parser = subparsers.add_parser("demo", help="replay a sample in real time: files, bus and a simulated motor")
-    parser.add_argument("--output", type=Path, default=Path("omnid-demo"), metavar="FOLDER", help="where files go")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument("--output", type=Path, default=Path("omnid-demo"), metavar="FOLDER",
+                        help="folder of the output files; default %(default)s")
+    parser.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replays the sample and prints its errors."""
+    """Replay the sample and print its errors against the truth."""
     from omnid.config import load_config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
     from omnid.runs.replay import ReplayOptions
 
-    _make(args.output)
+    _make_folder(args.output)
     tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
     options = ReplayOptions(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
                             bus_optional=True, realtime=True, settings=args.config)
@@ -41,10 +42,10 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     from omnid.errors import OmnidError
 
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another") from error
+        raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another folder") from error

@@ -1,4 +1,4 @@
-"""`omnid doctor`: whether everything is there that the daemon needs, and what to do about what is not."""
+"""`omnid doctor`: check all that the daemon needs, with advice where something is missing."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from omnid.config import Config
     from omnid.doctor.finding import Finding
 
-ROOT = Path("/")  # where sys, dev and proc are
-BYTES_PER_PIXEL = 0.3  # of a JPEG of a textured image, on the safe side
+ROOT = Path("/")  # folder of sys, dev and proc
+BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints a line for each check; 1 if something is wrong."""
+    """Print a line for each check; return 1 if something is wrong."""
     from omnid.config import load_config
     from omnid.doctor.finding import verdict
 
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def examine(config: Config) -> Iterator[Finding]:
-    """All checks, the quick ones first."""
+    """Return the findings of all checks, the quick ones first."""
     from drivers.cameras.v4l2_devices import capture_devices
     from omnid.doctor import cameras, devices, machine, wiring
 

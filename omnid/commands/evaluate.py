@@ -1,4 +1,4 @@
-"""`omnid eval`: how far an estimated trajectory is from the truth."""
+"""`omnid eval`: errors of an estimated trajectory against the ground truth."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `eval` to the command line."""
     parser = subparsers.add_parser("eval", help="compare a trajectory with the truth, both in the TUM format")
     parser.add_argument("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig")
-    parser.add_argument("truth", type=Path, metavar="TRUTH", help="likewise, of the same rig frame in any world")
-    parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS", help="largest difference of stamps")
+    parser.add_argument("truth", type=Path, metavar="TRUTH",
+                        help="the same format, of the same rig frame in any world frame")
+    parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS",
+                        help="largest difference between the stamps of two poses; default %(default)s")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the errors."""
+    """Print the errors."""
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
 

@@ -1,4 +1,4 @@
-"""`omnid listen`: how a robot is, from here or from anywhere, line by line or as a table that stays in its place."""
+"""`omnid listen`: show the state of a robot, local or remote, line by line or as a table."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from omnid.commands.config import add_settings
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `listen` to the command line."""
-    parser = subparsers.add_parser("listen", help="watch a robot: pose, state, rates and latencies, and keep them")
+    parser = subparsers.add_parser("listen", help="show pose, state, rates and latencies of a robot, and record them")
     parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
     parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
                         "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
     parser.add_argument("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format")
-    parser.add_argument("--mcap", type=Path, metavar="FILE", help="write all that is heard to a log")
-    parser.add_argument("--seconds", type=float, metavar="N", help="end after so long; default: with Ctrl-C")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="record all received messages to a log")
+    parser.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Listens; 1 where not one pose came."""
+    """Show the robot until the end; return 1 if no pose was received."""
     from dataclasses import replace
 
     from omnid.config import load_config
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.monitor.follow import listen
 
     if args.seconds is not None and not 0 < args.seconds < 1e9:
-        raise OmnidError(f"--seconds {args.seconds} is no time to listen for; give seconds above 0, or leave it out")
+        raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
     bus = load_config(args.config, args.overrides).bus
     bus = replace(bus, robot=args.robot or bus.robot, connect=tuple(args.connect or bus.connect))
     return listen(bus, args.tum, args.mcap, args.seconds)

@@ -1,4 +1,4 @@
-"""`omnid log`: what is in a recording, and a whole one out of one that is cut or corrupt."""
+"""`omnid log`: show the content of a recording, and recover one that is cut or corrupt."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ if TYPE_CHECKING:
     from drivers.logs.mcap_info import LogInfo
     from drivers.logs.mcap_recovery import Recovery
 
-WIDEST = 60  # characters of a topic or a type in a column
+MAX_COLUMN = 60  # characters of a topic or a type
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `log` to the command line."""
-    parser = subparsers.add_parser("log", help="look into MCAP logs, and make broken ones whole")
+    parser = subparsers.add_parser("log", help="show the content of MCAP logs, and recover broken ones")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    info = actions.add_parser("info", help="topics, types, counts, times, attachments; whole or broken")
+    info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
     info.add_argument("logs", type=Path, nargs="+", metavar="FILE", help=".mcap or .mcap.part")
     info.set_defaults(run=run_info)
-    mend = actions.add_parser("recover", help="write what can be read of a cut or corrupt log to a new, whole one")
-    mend.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any maker")
-    mend.add_argument("-o", "--output", type=Path, metavar="OUT", help="default: FILE without .part, or "
+    recover = actions.add_parser("recover", help="write all readable messages of a cut or corrupt log to a new one")
+    recover.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any program")
+    recover.add_argument("-o", "--output", type=Path, metavar="OUT", help="default: FILE without .part, or "
                       "FILE.recovered.mcap; nothing is overwritten")
-    mend.set_defaults(run=run_recover)
+    recover.set_defaults(run=run_recover)
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Prints what is in each log; 1 if one is broken, 2 if one is none."""
+    """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
     from drivers.errors import DriverError
     from drivers.logs.mcap_info import LogState, read_log_info
 
@@ -48,15 +48,15 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def run_recover(args: argparse.Namespace) -> int:
-    """Makes a log whole."""
+    """Recover a log."""
     from drivers.logs.mcap_recovery import recover
 
-    out = args.output or _mended(args.log)
+    out = args.output or _default_output(args.log)
     print("\n".join(_reported(recover(args.log, out), args.log, out)))
     return 0
 
 
-def _mended(path: Path) -> Path:
+def _default_output(path: Path) -> Path:
     from drivers.logs.log_folder import PART_SUFFIX, complete_path
 
     return complete_path(path) if path.name.endswith(PART_SUFFIX) else path.with_name(f"{path.stem}.recovered.mcap")
@@ -65,15 +65,15 @@ def _mended(path: Path) -> Path:
 def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
     yield f"{out}: {found.messages} messages and {found.attachments} attachments saved"
     if found.whole:
-        yield f"{path} was whole already"
+        yield f"{path} was already whole"
         return
     if found.lost:
         yield f"lost: {found.lost} messages"
     elif found.lost is None:
-        yield "lost: the log does not say how many messages there were"
+        yield "lost: unknown, the log has no count of its messages"
     if found.broken:
         yield f"skipped: {found.broken} corrupt chunks or records"
-    yield f"{path} could be read up to byte {found.end} of {path.stat().st_size}; it was left as it is"
+    yield f"{path} is readable up to byte {found.end} of {path.stat().st_size}; it was not changed"
 
 
 def _described(found: LogInfo) -> Iterator[str]:
@@ -99,16 +99,16 @@ def _state(found: LogInfo) -> str:
     if found.state is LogState.BROKEN:
         corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
         position = f"byte {found.readable_bytes} of {found.size_bytes}"
-        return f"cut or corrupt after {position}{corrupt}: {advice} saves what is whole"
+        return f"cut or corrupt after {position}{corrupt}: {advice} saves the readable messages"
     if found.state is LogState.UNINDEXED:
-        return f"{found.state.value}, so some readers refuse it: {advice} gives it one"
+        return f"{found.state.value}, so some readers refuse it: {advice} adds one"
     return str(found.state.value)
 
 
 def _table(found: LogInfo, duration_s: float) -> Iterator[str]:
     rows = [(_shown(name), _shown(kind) or "-", count) for name, (kind, count) in found.topics.items()]
-    wide = min(WIDEST, max(len(name) for name, _, _ in rows))
-    wide_kind = min(WIDEST, max(len(kind) for _, kind, _ in rows))
+    wide = min(MAX_COLUMN, max(len(name) for name, _, _ in rows))
+    wide_kind = min(MAX_COLUMN, max(len(kind) for _, kind, _ in rows))
     yield ""
     yield f"{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}"
     for name, kind, count in rows:
@@ -117,7 +117,7 @@ def _table(found: LogInfo, duration_s: float) -> Iterator[str]:
 
 
 def _shown(text: str) -> str:
-    """What a terminal should not print, made visible."""
+    """Return the text with non-printable characters escaped."""
     return text if text.isprintable() else ascii(text)
 
 
@@ -129,7 +129,7 @@ def _bytes(size: int) -> str:
 
 
 def _utc(stamp_ns: int) -> str:
-    """The time of day, or the bare seconds where the stamps are no Unix time of this age."""
+    """Return the time of day, or the seconds if the stamp is not a plausible Unix time."""
     from datetime import UTC, datetime
 
     seconds, rest_ns = divmod(stamp_ns, 10**9)

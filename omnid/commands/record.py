@@ -1,4 +1,4 @@
-"""`omnid record`: the images of both cameras into a folder, for a calibration, or to be replayed."""
+"""`omnid record`: record the images of both cameras, for a calibration or a replay."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 
-if TYPE_CHECKING:  # whoever asks for another command does not load all this
+if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `record` to the command line."""
-    parser = subparsers.add_parser("record", help="record both cameras to MCAP files until Ctrl-C, and nothing else")
-    parser.add_argument("folder", type=Path, nargs="?", help="where to; default: record.folder of the settings")
+    parser = subparsers.add_parser("record", help="record both cameras to MCAP files until Ctrl-C")
+    parser.add_argument("folder", type=Path, nargs="?",
+                        help="folder of the files; default: record.folder of the settings")
     parser.add_argument("--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it "
-                        "is there")
+                        "exists")
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Records; 1 where nothing was recorded."""
+    """Record until a signal comes; return 1 if nothing was recorded."""
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
     from omnid.config import load_config
@@ -45,12 +46,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _rig(config: Config, *, wanted: bool) -> str:
-    """The rig's TOML; "" where there is none: the recording may be for its calibration."""
+    """Return the rig's TOML; "" if there is none, because the recording may be for its calibration."""
     from calib.rig_file import read_rig, rig_toml
 
     path = Path(config.cameras.rig)
     if not (wanted or path.exists()):
-        _log(logging.WARNING, f"no rig is attached, {path} is missing: replay will ask for one with --rig")
+        _log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
         return ""
     return rig_toml(read_rig(path))
 

@@ -1,4 +1,4 @@
-"""`omnid replay`: a recorded log becomes a trajectory, a map and motor commands."""
+"""`omnid replay`: compute trajectory, map and velocity commands of a recorded log."""
 
 from __future__ import annotations
 
@@ -19,35 +19,36 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `replay` to the command line."""
     parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
     parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap file, or the folder of ros2 bag record -s mcap")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
-    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's images; default: by name")
-    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's images; default: by name")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+    parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
+    parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
     _add_outputs(parser)
-    _add_manner(parser)
+    _add_computation(parser)
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what comes out")
+    group = parser.add_argument_group("outputs")
     group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
     group.add_argument("--map", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
-    group.add_argument("--publish", action="store_true", help="speak on the bus as `<robot>/odom` and so on; off by "
-                       "default, because on a robot that voice belongs to its daemon")
-    group.add_argument("--motor", metavar="PORT", help="send commands to the controller on a serial port (the wheels "
-                       "will turn!), or to a 'simulated' one")
+    group.add_argument("--publish", action="store_true", help="publish on the bus as `<robot>/odom` and so on; off by "
+                       "default, because a robot's daemon publishes there")
+    group.add_argument("--motor", metavar="PORT", help="send commands to the motor controller on a serial port (the "
+                       "wheels will turn!), or to a 'simulated' one")
 
 
-def _add_manner(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("how")
-    group.add_argument("--method", choices=("default", "paper"), help="paper: the paper's odometry on its "
-                       "enhanced SAD, to compare")
+def _add_computation(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("computation")
+    group.add_argument("--method", choices=("default", "paper"), help="paper: the odometry of the paper on its "
+                       "enhanced SAD, for comparison")
     group.add_argument("--tracker", choices=("improved", "klt"), help="feature tracker of the paper's method")
-    group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same numbers")
-    group.add_argument("--realtime", action="store_true", help="at the pace of the log; what comes too late is dropped")
-    group.add_argument("--quiet", action="store_true", help="no progress")
+    group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same results")
+    group.add_argument("--realtime", action="store_true",
+                       help="at the speed of the recording; late messages are dropped")
+    group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,6 +94,6 @@ def _print_result(result: RunResult, options: ReplayOptions) -> None:
 
 
 def _shortcuts(args: argparse.Namespace) -> list[str]:
-    """The options that are settings as well."""
+    """Return the settings that have an option of their own."""
     named = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
     return [f"{key}={value}" for key, value in named.items() if value is not None]

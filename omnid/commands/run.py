@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 
-if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
+if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
     from omnid.config import Config
     from omnid.runs.live import OpenCamera
@@ -19,23 +19,24 @@ if TYPE_CHECKING:  # whoever asks for another command does not load the daemon
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `run` to the command line."""
-    parser = subparsers.add_parser("run", help="the daemon: two live cameras, poses on the bus, commands to the wheels")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log, "
-                        "without a log cameras.rig of the settings")
+    parser = subparsers.add_parser("run", help="the daemon: live cameras in, poses on the bus, commands to the wheels")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log, or "
+                        "without --log cameras.rig of the settings")
     parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
-    parser.add_argument("--log", type=Path, metavar="LOG", help="images of a log in the place of cameras, to try it "
-                        "out: in real time, forwards and backwards until it is stopped")
-    parser.add_argument("--pace", type=float, default=1.0, help="how many times as fast as it was recorded")
-    parser.add_argument("--once", action="store_true", help="end with the log")
+    parser.add_argument("--log", type=Path, metavar="LOG", help="use the images of a log instead of cameras, for a "
+                        "trial: in real time, forwards and backwards until it is stopped")
+    parser.add_argument("--pace", type=float, default=1.0,
+                        help="speed of the log relative to its recording; default %(default)s")
+    parser.add_argument("--once", action="store_true", help="stop at the end of the log")
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs until it is told to end."""
+    """Run until a signal comes."""
     from omnid.engine.malloc_settings import use_one_malloc_arena
 
-    use_one_malloc_arena()  # before anything else: the next line loads numpy, which starts threads
+    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config import load_config, unused_settings
     from omnid.engine.logging_setup import log
     from omnid.runs.live import LiveRun
@@ -46,16 +47,16 @@ def run(args: argparse.Namespace) -> int:
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     if args.log is None:
-        _refuse_what_needs_a_log(args)
+        _require_no_log_options(args)
         return LiveRun(config, _devices(config), log).run()
     return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log)).run()
 
 
-def _refuse_what_needs_a_log(args: argparse.Namespace) -> None:
+def _require_no_log_options(args: argparse.Namespace) -> None:
     from omnid.errors import OmnidError
 
     if args.once or args.pace != 1.0:
-        raise OmnidError("--once and --pace are for the images of a log: give one with --log, or leave them out")
+        raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
 
 
 def _devices(config: Config) -> OpenCamera:

@@ -1,57 +1,47 @@
-"""Table of errors against the truth: `python -m tests.benchmark.accuracy FOLDER ... [-- OPTION OF omnid replay ...]`.
+"""A table of errors against the truth: `python -m tests.benchmark.accuracy FOLDER ... [--set SECTION.KEY=VALUE ...]`.
 
 Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.simulation` writes them.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
-import subprocess
-import sys
-import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from omnid.formats.tum import read_tum
-from omnid.recordings.evaluation import Metrics, evaluate
+import omnid
+from calib.kalibr import import_kalibr
+from calib.rig_file import read_rig
+from omnid.diagnostics.run_summary import summary_entries
+from omnid.formats.tum import Trajectory, read_tum
+from omnid.recordings.evaluation import evaluate
 
 HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\n|---|---|---|---|---|---|---|---|"
 
 
-def omnid(*arguments: str | Path) -> str:
-    """Run the command and return its stdout; raise CalledProcessError if it fails."""
-    command = [sys.executable, "-m", "omnid", *map(str, arguments)]
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-
-
-def measure(folder: Path, options: list[str]) -> tuple[Metrics, str]:
-    """Return the errors of one log and the shares of its tracking states."""
-    with tempfile.TemporaryDirectory() as work:
-        rig, estimate = Path(work) / "rig.toml", Path(work) / "estimate.txt"
-        if (folder / "camchain.yaml").exists():
-            omnid("calibrate", "import", folder / "camchain.yaml", "-o", rig)
-        else:
-            rig = folder / "rig.toml"
-        printed = omnid("replay", folder / "log.mcap", "--rig", rig, "--tum", estimate, "--quiet", *options)
-        states = next(line for line in printed.splitlines() if line.startswith("states"))
-        return evaluate(read_tum(estimate), read_tum(folder / "truth.txt")), states.removeprefix("states").strip()
-
-
-def row(folder: Path, options: list[str]) -> str:
-    """Return one row of the table."""
-    m, states = measure(folder, options)
-    shown = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
+def row(folder: Path, overrides: Sequence[str]) -> str:
+    """Return one row of the table: the errors of one log, and the shares of its states."""
+    camchain = folder / "camchain.yaml"
+    rig = import_kalibr(camchain) if camchain.exists() else read_rig(folder / "rig.toml")
+    result = omnid.replay(folder / "log.mcap", rig, overrides=overrides)
+    m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
+    cells = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
              f"{1e3 * m.end_error_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
-             f"{1e3 * m.rpe_translation_rmse_m:.2f} mm", states]
-    return f"| {' | '.join(shown)} |"
+             f"{1e3 * m.rpe_translation_rmse_m:.2f} mm", summary_entries(result.counters)["states"]]
+    return f"| {' | '.join(cells)} |"
 
 
-def main(arguments: list[str]) -> None:
-    """Print the table, each row as soon as it is known."""
-    split = arguments.index("--") if "--" in arguments else len(arguments)
+def main() -> None:
+    """Print the table, each row as soon as it is measured."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
+    args = parser.parse_args()
     print(HEAD)
-    for folder in arguments[:split]:
-        print(row(Path(folder), arguments[split + 1 :]), flush=True)
+    for folder in args.folders:
+        print(row(folder, args.overrides), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -141,7 +141,7 @@ def test_a_log_that_is_being_written_is_said_to_be(omnid: Command, tmp_path: Pat
 
 def test_recover_says_what_it_did_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(30), [("rig.toml", b"1")])
-    assert "was whole already" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
+    assert "was already whole" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
     os.truncate(path, path.stat().st_size - 1)
     code, out, err = omnid("log", "recover", path)
     assert (code, err) == (0, "") and "60 messages and 1 attachments saved" in out and "does not say" in out
