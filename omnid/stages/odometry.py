@@ -1,4 +1,4 @@
-"""The rig's motion, from the rectified frame of the numerics to the rig's own."""
+"""Odometry stage: poses of the rectified frame become poses of the rig, and of the base."""
 
 from __future__ import annotations
 
@@ -19,50 +19,50 @@ Array = NDArray[np.float64]
 
 
 class OdometryMethod(Protocol):
-    """Whatever follows the rectified frame through sights."""
+    """A method that estimates the pose of the rectified frame from pair to pair."""
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
-        """The pose at a sight, dt_s after the one before (0 for the first)."""
+        """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
 
 
 class OdometryStage:
-    """Poses in odom, which is the rig frame of the first pair."""
+    """Estimate poses in odom, which is the rig frame of the first pair."""
 
     def __init__(self, geometry: Geometry, config: OdometryConfig) -> None:
-        self._follower = _follower(geometry, config)
+        self._method = _method(geometry, config)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
 
     def process(self, depth: StereoDepth) -> OdometryUpdate:
-        """The pose at a pair."""
+        """Return the pose at a pair."""
         dt_s = 0.0 if self._last_ns is None else (depth.stamp_ns - self._last_ns) * 1e-9
         self._last_ns = depth.stamp_ns
-        seen = depth.panoramas
-        ego = self._follower.process(
-            StereoFrame(depth.seq, seen.lower, seen.upper, depth.disparity, seen.visible), dt_s
+        pair = depth.panoramas
+        frame = StereoFrame(depth.seq, pair.lower, pair.upper, depth.disparity, pair.visible)
+        estimate = self._method.process(frame, dt_s)
+        T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
+        covariance = in_axes(T_odom_rig, self._in_rig(estimate.covariance))
+        velocity = self._to_rig @ estimate.velocity
+        return OdometryUpdate(
+            depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity, self._in_rig(estimate.velocity_covariance),
+            estimate.state, estimate.resets, estimate.inliers, estimate.tracked, depth, estimate.features,
         )
-        T_odom_rig = self._T_rig_rect @ ego.T_odom_rect @ se3.inverse(self._T_rig_rect)
-        covariance = in_axes(T_odom_rig, self._in_rig(ego.covariance))
-        velocity = self._to_rig @ ego.velocity
-        return OdometryUpdate(depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity,
-                        self._in_rig(ego.velocity_covariance), ego.state, ego.resets, ego.inliers, ego.tracked, depth,
-                        ego.features)
 
     def _in_rig(self, covariance: Array) -> Array:
-        """Covariance (6, 6) of a small motion of the rectified frame, as one of the rig frame."""
+        """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""
         return np.asarray(self._to_rig @ covariance @ self._to_rig.T)
 
 
 def in_axes(T_a_b: Array, covariance: Array) -> Array:
-    """Covariance (6, 6) [t; r] of a pose T_a_b, given in the axes of b, in the axes of a."""
+    """Return the covariance (6, 6) [t; r] of a pose T_a_b, given in the axes of b, in the axes of a."""
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T_a_b[:3, :3]
     return np.asarray(R @ covariance @ R.T)
 
 
 def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, Array, Array]:
-    """What a base that carries the rig does: T_odom_base, its covariance in odom axes, velocity and its covariance.
+    """Return T_odom_base of the base that carries the rig, its covariance in odom axes, velocity and its covariance.
 
     odom is here the base's frame at the first pair; the velocity is in the base frame.
     """
@@ -74,10 +74,10 @@ def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, 
     return T_odom_base, covariance, A @ odometry.velocity, A @ odometry.velocity_covariance @ A.T
 
 
-def _follower(geometry: Geometry, config: OdometryConfig) -> OdometryMethod:
+def _method(geometry: Geometry, config: OdometryConfig) -> OdometryMethod:
     model = geometry.model(config.noise_px)
     if config.method == "default":
         return VisualOdometry(model, config.klt, config.limits)
-    from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # only whoever asks for it pays for it
+    from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

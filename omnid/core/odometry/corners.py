@@ -1,4 +1,4 @@
-"""Corners to track: strong, apart from each other, and spread all around the panorama."""
+"""Detection of corners spread over the panorama, and their disparity in the pair."""
 
 from __future__ import annotations
 
@@ -12,28 +12,34 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 CELL_PX = 48  # side of the cells among which the corners are shared out evenly
+MAX_CELLS = 4096  # more cells than a row of any panorama has: one index for row and column
+BLOCK_PX = 5  # window over which the gradients of a corner are summed
+APART_PX = 9  # side of the square in which a corner is the maximum
+MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
+CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration
+REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
 
-def corners(lower: PaddedPanorama, usable: Flags, most: int, apart_px: int = 9, weakest: float = 2e-4) -> Array:
-    """Up to `most` corners (N, 2) = (column, row) of the panorama where usable (H, W), strongest first in each cell.
+def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
+    """Return up to `most` corners (N, 2) = (column, row) of the panorama where usable (H, W), strongest first per cell.
 
-    A corner is a maximum of the smaller eigenvalue (Shi and Tomasi 1994) within apart_px. Cells of CELL_PX take turns,
+    A corner is a maximum of the smaller eigenvalue (Shi and Tomasi 1994) within APART_PX. Cells of CELL_PX take turns,
     so that one poster full of contrast does not take all.
     """
-    response = cv2.cornerMinEigenVal(lower.image, 5)
-    peaks = cv2.dilate(response, np.ones((apart_px, apart_px), np.uint8))
+    response = cv2.cornerMinEigenVal(lower.image, BLOCK_PX)
+    peaks = cv2.dilate(response, np.ones((APART_PX, APART_PX), np.uint8))
     inner = slice(lower.pad_px, lower.pad_px + lower.width)
-    is_peak = (response[:, inner] >= peaks[:, inner]) & (response[:, inner] > weakest) & usable
+    is_peak = (response[:, inner] >= peaks[:, inner]) & (response[:, inner] > MIN_RESPONSE) & usable
     rows, columns = np.nonzero(is_peak)
     strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
     rows, columns = rows[strongest], columns[strongest]
-    turn = _rank_within((rows // CELL_PX) * 4096 + columns // CELL_PX)
-    chosen = np.argsort(turn, kind="stable")[: max(0, most)]
+    rank = _rank_within((rows // CELL_PX) * MAX_CELLS + columns // CELL_PX)
+    chosen = np.argsort(rank, kind="stable")[: max(0, most)]
     return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
 
 
 def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The position (N,) of each element among those of its own group, in the order given."""
+    """Return the rank (N,) of each element among those of its own group, in the order given."""
     order = np.argsort(group, kind="stable")
     sorted_group = group[order]
     first = np.searchsorted(sorted_group, sorted_group, side="left")
@@ -43,7 +49,7 @@ def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
-    """usable (H, W) without the discs about points (N, 2), so that no landmark is taken twice."""
+    """Return usable (H, W) without the discs around points (N, 2), so that no landmark is detected twice."""
     free = usable.astype(np.uint8)
     for column, row in np.rint(points).astype(int).tolist():
         cv2.circle(free, (column, row), radius_px, 0, -1)
@@ -51,25 +57,26 @@ def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
 
 
 def rows_in_upper(
-    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings, cross_px: float = 0.7
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings
 ) -> Array:
-    """Rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN where they do not match.
+    """Return rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN without a match.
 
-    guess (N,) rows. A match must lie in the same column within cross_px, not above the point, and come back.
+    guess (N,) rows. A match passes the forward-backward check and lies in the same column within CROSS_PX, below the
+    point.
     """
     lower, upper = pair
     start = np.column_stack([points[:, 0], guess])
     finite = np.flatnonzero(np.isfinite(guess))
     there, good = track(lower, upper, points[finite], start[finite], klt)
     aside = (there[:, 0] - points[finite, 0] + lower.width / 2) % lower.width - lower.width / 2
-    good &= (np.abs(aside) < cross_px) & (there[:, 1] > points[finite, 1])
+    good &= (np.abs(aside) < CROSS_PX) & (there[:, 1] > points[finite, 1])
     rows = np.full(len(points), np.nan)
     rows[finite[good]] = there[good, 1]
     return rows
 
 
-def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: int = 3) -> Array:
-    """Median disparity (N,) of the located pixels within reach_px of points (N, 2); NaN where there is none.
+def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: int = REACH_PX) -> Array:
+    """Return the median disparity (N,) of the located pixels within reach_px of points (N, 2); NaN where there is none.
 
     A feature counts as located if a located point lies close to it: Dang et al. 2012, eq. (8).
     """
@@ -82,7 +89,7 @@ def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: in
 
 
 def _nanmedian(values: NDArray[np.float32]) -> Array:
-    """Lower median (N,) of the numbers in each row of (N, K); NaN where there are none."""
+    """Return the lower median (N,) of the numbers in each row of (N, K); NaN where there are none."""
     ordered = np.sort(values, axis=1)  # NaN last
     count = np.isfinite(ordered).sum(axis=1)
     return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2], float)

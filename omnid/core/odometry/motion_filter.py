@@ -1,4 +1,4 @@
-"""The Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11))."""
+"""Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11))."""
 
 from __future__ import annotations
 
@@ -11,15 +11,21 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
+# Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz: what a wheeled robot does.
+JERK_PSD = (10.0, 40.0)
+START_VELOCITY_VARIANCE = 1.0  # of a motion that is not known yet, (m/s)^2 and (rad/s)^2
+START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2
+MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
+
 
 class MotionFilter:
-    """Filters twists [m/s; rad/s] in the rig frame; state (v, a), v <- v + dt a, measured v = (t, r) / dt.
+    """Filter of twists [m/s; rad/s] in the rig frame; state (v, a), v <- v + dt a, measured v = (t, r) / dt.
 
     jerk_psd: spectral density of the jerk, for translation and rotation [(m/s^3)^2/Hz, (rad/s^3)^2/Hz].
     """
 
-    def __init__(self, jerk_psd: tuple[float, float] = (10.0, 40.0)) -> None:
-        from filterpy.kalman import KalmanFilter  # a second of imports, and only odometry needs it
+    def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD) -> None:
+        from filterpy.kalman import KalmanFilter  # its import takes a second, and only odometry needs it
 
         self._filter: Any = KalmanFilter(dim_x=12, dim_z=6)
         self._filter.H = np.hstack([np.eye(6), np.zeros((6, 6))])
@@ -27,13 +33,13 @@ class MotionFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the motion: standing still, within what a robot can do."""
+        """Reset to standstill, with the uncertainty of what a robot can do."""
         self._filter.x = np.zeros((12, 1))
-        self._filter.P = np.diag(np.repeat([1.0, 4.0], 6))
+        self._filter.P = np.diag(np.repeat([START_VELOCITY_VARIANCE, START_ACCELERATION_VARIANCE], 6))
 
     @property
     def velocity(self) -> Array:
-        """Velocity (6,) [m/s, rad/s]."""
+        """Velocity (6,) [m/s; rad/s]."""
         return np.array(self._filter.x[:6, 0])
 
     @property
@@ -43,7 +49,7 @@ class MotionFilter:
         return np.asarray((P + P.T) / 2)
 
     def predict(self, dt_s: float) -> Array:
-        """Moves the state on by dt and returns the motion T_prev_curr (4, 4) to expect."""
+        """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
         F = np.eye(12)
         F[:6, 6:] = dt_s * np.eye(6)
         noise = np.diag(self._psd)
@@ -52,11 +58,12 @@ class MotionFilter:
         return se3.exp(self.velocity * dt_s)
 
     def update(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> Array:
-        """Takes a measured motion with its covariance (6, 6) and returns the filtered one, T_prev_curr (4, 4)."""
-        self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=covariance / dt_s**2 + 1e-10 * np.eye(6))
+        """Update with a measured motion and its covariance (6, 6); return the filtered motion T_prev_curr (4, 4)."""
+        R = covariance / dt_s**2 + MIN_VELOCITY_VARIANCE * np.eye(6)
+        self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=R)
         self._filter.P = (self._filter.P + self._filter.P.T) / 2
         return se3.exp(self.velocity * dt_s)
 
     def slow_down(self, factor: float) -> None:
-        """Believes less in the last motion: what a robot does when nobody watches."""
+        """Multiply velocity and acceleration by a factor below 1, while no motion is measured."""
         self._filter.x *= factor

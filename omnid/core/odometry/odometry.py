@@ -157,7 +157,7 @@ class VisualOdometry:
             return self._result(0, 0)
         self._map.clear()
         self._previous = None
-        self._relocaliser.forget()
+        self._relocaliser.clear()
         self._filter.reset()
         self._resets += 1
         return self._start_map(frame, usable, 0.0)
@@ -211,7 +211,7 @@ class VisualOdometry:
         slopes = disparity_slopes(frame.disparity, points[located], (rows - points[:, 1])[located])
         self._map.add_keyframe(keyframe, np.column_stack([points, rows])[located], slopes)
         if len(self._map) >= self._limits.min_inliers:
-            self._relocaliser.remember(frame, keyframe)
+            self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames_since_keyframe = 0
         return points[located]
 

@@ -1,6 +1,6 @@
-"""The last hundredths of a pixel: landmarks' patches, bent as the new viewpoint sees them, aligned once more.
+"""Alignment of landmarks' patches, warped to the new viewpoint, to hundredths of a pixel.
 
-Plain Lucas-Kanade shifts a window but does not bend it, and errs by tenths of a pixel as soon as the camera has moved
+Plain Lucas-Kanade shifts a window but does not warp it, and errs by tenths of a pixel as soon as the camera has moved
 some decimetres. Here each keyframe patch is warped by the affine map that pose, depth and local slope predict; all
 patches lie side by side in one image, so that a single call aligns them.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.odometry.tracking import MIN_EIGENVALUE, PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
@@ -22,16 +22,21 @@ Image = NDArray[np.uint8]
 
 CELL_PX = 24  # holds the window, the largest shift and the gradient's border
 WINDOW_PX = 13
-MOST_PX = 2.0  # a patch that has to move farther was predicted wrongly
-CELLS_A_ROW = 32
-HALF_PX = 4.0  # half the base over which the warp is taken
+MAX_SHIFT_PX = 2.0  # a patch that has to move farther was predicted wrongly
+ITERATIONS, CONVERGED_PX = 20, 0.003  # of Lucas-Kanade
+CELLS_PER_ROW = 32  # of the image in which the patches lie side by side
+HALF_BASE_PX = 4.0  # half the base of the difference quotients that give the warp
+MAX_STRETCH, MIN_AREA = 2.0, 0.25  # of a warp: largest element and smallest determinant
+SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the disparity is measured
+SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface
+SLOPE_PRIOR = 50.0  # px^2, weight of slope zero (an upright surface facing the camera) in the least squares
 
 
-def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: int = 8) -> Array:
-    """Slopes (N, 2) of the disparity [px/px] along column and row about points (N, 2) with disparity centre (N,).
+def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: int = SLOPE_REACH_PX) -> Array:
+    """Return slopes (N, 2) of the disparity [px/px] along column and row at points (N, 2) with disparity centre (N,).
 
-    A plane through the centre, by least squares with a pull to zero (an upright surface facing the camera); neighbours
-    that lie more than two pixels off belong to something else.
+    A plane through the centre by regularised least squares; neighbours that differ by more than SAME_SURFACE_PX are
+    left out.
     """
     height, width = disparity.shape
     offsets = np.arange(-reach_px, reach_px + 1)
@@ -39,20 +44,20 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
     columns = (np.rint(points[:, :1]).astype(int) + dx) % width
     rows = np.clip(np.rint(points[:, 1:]).astype(int) + dy, 0, height - 1)
     change = disparity[rows, columns] - centre[:, None]
-    near = np.abs(change) < 2.0
+    near = np.abs(change) < SAME_SURFACE_PX
     change = np.where(near, change, 0.0)
-    xx, yy, xy = near @ (dx * dx) + 50.0, near @ (dy * dy) + 50.0, near @ (dx * dy)
+    xx, yy, xy = near @ (dx * dx) + SLOPE_PRIOR, near @ (dy * dy) + SLOPE_PRIOR, near @ (dx * dy)
     x, y = change @ dx, change @ dy
     return np.asarray(np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None])
 
 
 def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
-    """Matrices (N, 2, 2): by how much a pixel moves in the current panorama per pixel in the keyframe's.
+    """Return matrices (N, 2, 2): pixels moved in the current panorama per pixel moved in the keyframe's.
 
-    views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. A warp that would more than halve
-    or double is taken as none.
+    views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. The identity replaces a warp that
+    stretches or shrinks too much.
     """
-    steps = HALF_PX * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])  # (column, row)
+    steps = HALF_BASE_PX * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])  # (column, row)
     moved = views[:, None] + steps[:, [0, 1, 1]]
     moved[..., 2] += slopes @ steps.T
     points = triangulate(moved.reshape(-1, 3), model.cylinder, model.baseline_m).reshape(-1, 4, 3)
@@ -60,44 +65,47 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     ends = seen[:, :2].reshape(-1, 4, 2)
     difference = ends[:, 0::2] - ends[:, 1::2]
     difference[..., 0] = model.cylinder.wrap(difference[..., 0])
-    warps = np.swapaxes(difference, 1, 2) / (2 * HALF_PX)
+    warps = np.swapaxes(difference, 1, 2) / (2 * HALF_BASE_PX)
     area = np.abs(warps[:, 0, 0] * warps[:, 1, 1] - warps[:, 0, 1] * warps[:, 1, 0])
-    sane = (np.abs(warps) < 2).all(axis=(1, 2)) & (area > 0.25)  # false for NaN as well
+    sane = (np.abs(warps) < MAX_STRETCH).all(axis=(1, 2)) & (area > MIN_AREA)  # false for NaN as well
     return np.where(sane[:, None, None], warps, np.eye(2))
 
 
 def align(templates: Image, current: PaddedPanorama, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where patches (N, CELL, CELL), centred on predicted (N, 2), really are, and which of them moved little enough."""
+    """Align patches (N, CELL, CELL), centred on predicted (N, 2), with the current panorama.
+
+    Returns their pixels (N, 2), and flags (N,) of those that moved less than MAX_SHIFT_PX.
+    """
     cells = _cut(current, np.rint(predicted))
     centres = _centres(len(predicted))
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         _atlas(templates), _atlas(cells), centres, centres.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=0,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.003), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-4)
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, CONVERGED_PX),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE)
     shift = (there - centres)[:, 0].astype(float)
-    close = (found.ravel() > 0) & (np.abs(shift).max(axis=1, initial=0.0) < MOST_PX)
+    close = (found.ravel() > 0) & (np.abs(shift).max(axis=1, initial=0.0) < MAX_SHIFT_PX)
     return predicted + shift, close
 
 
 def warped_templates(keyframe: PaddedPanorama, pixels: Array, warps: Array, predicted: Array) -> Image:
-    """Patches (N, CELL, CELL) uint8 of a keyframe about pixels (N, 2), as seen about predicted (N, 2) after warps."""
+    """Return patches (N, CELL, CELL) of a keyframe around pixels (N, 2), warped, to be compared at predicted (N, 2)."""
     offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
     return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2).astype(np.float32))
 
 
 def _cut(image: PaddedPanorama, centres: Array) -> Image:
-    """Patches (N, CELL, CELL) about whole pixels (N, 2)."""
+    """Return patches (N, CELL, CELL) around whole pixels (N, 2)."""
     return _sample(image, centres, _cell_offsets()[None])
 
 
 def _cell_offsets() -> Floats:
-    """Positions (CELL * CELL, 2) of a cell's pixels relative to its centre."""
+    """Return the positions (CELL * CELL, 2) of a cell's pixels relative to its centre."""
     side = np.arange(CELL_PX, dtype=np.float32) - CELL_PX // 2
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
 def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
-    """Patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), across the seam if need be."""
+    """Return patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), also across the seam."""
     columns = (centres[:, :1] % image.width + image.pad_px).astype(np.float32) + offsets[..., 0]
     rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
     patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -105,16 +113,16 @@ def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
 
 
 def _atlas(patches: Image) -> Image:
-    """Patches laid out in rows of CELLS_A_ROW, one image."""
-    rows = -(-len(patches) // CELLS_A_ROW)
-    filled = np.zeros((rows * CELLS_A_ROW, CELL_PX, CELL_PX), np.uint8)
+    """Return one image of patches, laid out in rows of CELLS_PER_ROW."""
+    rows = -(-len(patches) // CELLS_PER_ROW)
+    filled = np.zeros((rows * CELLS_PER_ROW, CELL_PX, CELL_PX), np.uint8)
     filled[: len(patches)] = patches
-    grid = filled.reshape(rows, CELLS_A_ROW, CELL_PX, CELL_PX)
-    return np.ascontiguousarray(grid.transpose(0, 2, 1, 3)).reshape(rows * CELL_PX, CELLS_A_ROW * CELL_PX)
+    grid = filled.reshape(rows, CELLS_PER_ROW, CELL_PX, CELL_PX)
+    return np.ascontiguousarray(grid.transpose(0, 2, 1, 3)).reshape(rows * CELL_PX, CELLS_PER_ROW * CELL_PX)
 
 
 def _centres(count: int) -> Floats:
-    """Centres (N, 1, 2) of the cells in the atlas."""
+    """Return the centres (N, 1, 2) of the cells in the atlas."""
     number = np.arange(count)
-    corner = np.column_stack([number % CELLS_A_ROW, number // CELLS_A_ROW]) * CELL_PX
+    corner = np.column_stack([number % CELLS_PER_ROW, number // CELLS_PER_ROW]) * CELL_PX
     return np.ascontiguousarray((corner + CELL_PX // 2)[:, None], np.float32)

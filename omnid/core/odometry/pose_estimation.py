@@ -1,4 +1,4 @@
-"""OdometryEstimate-motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
+"""Motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -14,21 +14,25 @@ from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-BATCH, MOST_BATCHES = 50, 10  # RANSAC hypotheses
-KERNEL_WIDTH = 2.5  # deviations, beyond which an error loses its say
-MISSED = 1e-6  # probability that none of them was free of outliers
+RANSAC_BATCH, RANSAC_BATCHES = 50, 10  # hypotheses drawn at once, and how often at most
+RANSAC_THRESHOLD_PX = 2.0  # largest error of a view in the consensus set
+RANSAC_MISSED = 1e-6  # probability that no hypothesis was free of outliers, at which the search ends
+KERNEL_WIDTH = 2.5  # standard deviations at which the Cauchy kernel halves the weight of an error
+GAUSS_NEWTON_STEPS = 6  # at most
+CONVERGED = 1e-6  # m and rad: a smaller step is the last one
+DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
 
 
 @dataclass(frozen=True, slots=True)
 class StereoModel:
-    """What turns points into views: the panorama's cylinder, the baseline, and the noise of a tracked corner."""
+    """Projection of points into views: the panorama's cylinder, the baseline, and the noise of a tracked corner."""
 
     cylinder: Cylinder
     baseline_m: float
-    sigma_px: float = 0.1
+    sigma_px: float = 0.1  # standard deviation
 
     def residual(self, points: Array, views: Array) -> Array:
-        """Views minus predictions (..., N, 3) [px], columns wrapped; views (N, 3), NaN in column 2 without upper."""
+        """Return views minus predictions (..., N, 3) [px], columns wrapped; views (N, 3), NaN without an upper row."""
         flat = points.reshape(-1, 3)
         error = views - view(flat, self.cylinder, self.baseline_m).reshape(points.shape)
         error[..., 0] = self.cylinder.wrap(error[..., 0])
@@ -36,7 +40,7 @@ class StereoModel:
 
 
 def rigid_fit(a: Array, b: Array) -> Array:
-    """T_b_a (..., 4, 4) that moves points a (..., N, 3) onto b with least squares (Kabsch), no reflection."""
+    """Return T_b_a (..., 4, 4) that moves points a (..., N, 3) onto b with least squares (Kabsch), no reflection."""
     mean_a, mean_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
     U, _, Vt = np.linalg.svd(np.swapaxes(b - mean_b, -1, -2) @ (a - mean_a))
     U[..., :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
@@ -45,33 +49,33 @@ def rigid_fit(a: Array, b: Array) -> Array:
 
 
 def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Generator,
-           threshold_px: float = 2.0) -> tuple[Array, Flags]:
-    """The motion T_curr_ref that most landmarks (N, 3) agree with, and which do (N,).
+           threshold_px: float = RANSAC_THRESHOLD_PX) -> tuple[Array, Flags]:
+    """Return the motion T_curr_ref with the largest consensus set of landmarks (N, 3), and the set's flags (N,).
 
-    Three points of those seen in both cameras make a motion; consensus by the views' errors [px]. Dang et al. 2012,
-    section IV.B, with the distance measured in the images, where the noise is even. Hypotheses are drawn in batches
-    until three of the consensus have almost surely been among them.
+    Three of the points seen in both cameras give a hypothesis; the errors of the views [px] give its consensus set:
+    Dang et al. 2012, section IV.B, with the distance measured in the images, where the noise is even. Hypotheses are
+    drawn in batches until three inliers have almost certainly been among them.
     """
     seen = triangulate(views, model.cylinder, model.baseline_m)
     usable = np.flatnonzero(np.isfinite(seen).all(axis=1))
     if len(usable) < 3:
         return np.eye(4), np.zeros(len(landmarks), bool)
     best, consensus = np.eye(4), np.zeros(len(landmarks), bool)
-    for batch in range(1, MOST_BATCHES + 1):
-        triples = usable[rng.random((BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
+    for batch in range(1, RANSAC_BATCHES + 1):
+        triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
         motions = rigid_fit(landmarks[triples], seen[triples])
         errors = model.residual(se3.apply(motions, landmarks), views)
         agree = np.nanmax(np.abs(errors), axis=-1) < threshold_px
         first = int(agree.sum(axis=1).argmax())
         if agree[first].sum() > consensus.sum():
             best, consensus = motions[first], agree[first]
-        if (1 - consensus.mean() ** 3) ** (batch * BATCH) < MISSED:
+        if (1 - consensus.mean() ** 3) ** (batch * RANSAC_BATCH) < RANSAC_MISSED:
             break
     return best, consensus
 
 
 def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel) -> Array:
-    """Matrices (N, 3, 3) W with W S W^T = I for the covariance S of each view's error: corner noise and landmark noise.
+    """Return W (N, 3, 3) with W S W^T = I for the covariance S of each view's error: corner and landmark noise.
 
     A view without the upper row (NaN) gets a row of zeros there.
     """
@@ -87,19 +91,19 @@ def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonResult:
-    """A motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and each view's squared error in deviations."""
+    """Motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and the squared error of each view."""
 
     T: Array
     covariance: Array
-    squared: Array  # (N,) Mahalanobis distance squared
+    squared: Array  # (N,) squared Mahalanobis distance
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 steps: int = 6) -> GaussNewtonResult:
-    """The motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
+                 steps: int = GAUSS_NEWTON_STEPS) -> GaussNewtonResult:
+    """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
-    corner and landmark. Stands where Dang et al. 2012 has eq. (9), which measures in 3-D and is biased short.
+    corner and landmark. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is biased short.
     """
     W = whitening(landmarks, covariance, views, T, model)
     clean = np.where(np.isnan(views), 0.0, views)
@@ -107,7 +111,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
         H, g, _ = _normal_equations(landmarks, clean, T, W, model)
         step = np.linalg.solve(H, g)
         T = se3.exp(step) @ T
-        if np.abs(step).max() < 1e-6:
+        if np.abs(step).max() < CONVERGED:
             break
     H, _, squared = _normal_equations(landmarks, clean, T, W, model)
     return GaussNewtonResult(T, np.asarray(np.linalg.inv(H), float), squared)
@@ -115,6 +119,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
 
 def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel
                       ) -> tuple[Array, Array, Array]:
+    """Return H (6, 6), g (6,) of H step = g for a step [t; r] on the left of T, and the squared errors (N,)."""
     points = se3.apply(T, landmarks)
     error = (W @ model.residual(points, views)[:, :, None])[:, :, 0]
     squared = (error**2).sum(axis=1)
@@ -123,4 +128,4 @@ def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model:
     J = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=2)
     J = J.reshape(-1, 6)
     weighted = J * np.repeat(weight, 3)[:, None]
-    return weighted.T @ J + 1e-9 * np.eye(6), weighted.T @ error.ravel(), squared
+    return weighted.T @ J + DAMPING * np.eye(6), weighted.T @ error.ravel(), squared

@@ -1,4 +1,4 @@
-"""What the ego-motion sees at one instant."""
+"""Input of the odometry at one instant, and its features as shown by viewers."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from omnid.core.odometry.tracking import PaddedPanorama
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """Both panoramas, the disparity image (H, W) float32 [px] of the lower one (NaN unknown), and what is the world."""
+    """Both panoramas, and the disparity image (H, W) float32 [px] of the lower one, NaN: unknown."""
 
     seq: int
     lower: PaddedPanorama
     upper: PaddedPanorama
     disparity: NDArray[np.float32]
-    usable: NDArray[np.bool_]  # (H, W)
+    usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
 
 
-def _nowhere() -> NDArray[np.float64]:
+def _no_pixels() -> NDArray[np.float64]:
     return np.zeros((0, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """What became of the features of a sight: pixels (N, 2) column, row in the lower panorama, to be looked at."""
+    """Pixels (N, 2) = (column, row) in the lower panorama of the features of a frame, for display."""
 
-    inliers: NDArray[np.float64] = field(default_factory=_nowhere)  # landmarks that the pose rests on
-    rejected: NDArray[np.float64] = field(default_factory=_nowhere)  # found, but where the pose does not have them
-    new: NDArray[np.float64] = field(default_factory=_nowhere)  # landmarks from now on
+    inliers: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks that support the pose
+    rejected: NDArray[np.float64] = field(default_factory=_no_pixels)  # tracked landmarks, no inliers
+    new: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks added at this frame

@@ -14,9 +14,13 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 
+CONVERGED_PX = 0.01  # an iteration that moves the window less is the last one
+MIN_EIGENVALUE = 1e-4  # of the window's gradients, OpenCV's default: below it the window has no texture
+
+
 @dataclass(frozen=True, slots=True)
 class PaddedPanorama:
-    """A panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
+    """Panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
 
     image: Image  # (H, W + 2 pad) uint8
     pad_px: int
@@ -34,20 +38,21 @@ class PaddedPanorama:
 
 @dataclass(frozen=True, slots=True)
 class KltSettings:
-    """Window [px], pyramid levels above the image, largest forward-backward error [px]."""
+    """Settings of the pyramidal Lucas-Kanade tracker and of the forward-backward check."""
 
     window_px: int = knob(15, "side of the tracking window, px", low=5, high=61)
     levels: int = knob(3, "pyramid levels above the image", low=0, high=6)
-    max_error_px: float = knob(0.5, "largest error of the way back, px", low=0.01, high=10)
-    iterations: int = knob(20, "steps on each level", low=1, high=200)
+    max_error_px: float = knob(0.5, "largest forward-backward error of a track, px", low=0.01, high=10)
+    iterations: int = knob(20, "iterations on each pyramid level", low=1, high=200)
 
 
 def track(
     a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Where points (N, 2) of a are in b, from a guess (N, 2), and which of them come back to where they started.
+    """Track points (N, 2) of a into b, from a guess (N, 2), with the forward-backward check.
 
-    Columns may be given and are returned in [0, width). LK's own status is no evidence: only the way back counts.
+    Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
+    returned in [0, width). The status of Lucas-Kanade is no evidence: it only tells that the iteration ended.
     """
     if not len(points):
         return points.copy(), np.zeros(0, bool)
@@ -62,12 +67,15 @@ def track(
 def flow(
     a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """One way of pyramidal Lucas-Kanade from a guess; found (N,) where it converged inside the image."""
+    """Track points (N, 2) of a into b by pyramidal Lucas-Kanade, from a guess (N, 2), without the check.
+
+    Returns the pixels (N, 2) in b and flags (N,) of those that ended inside the image.
+    """
     start, target = _padded(points, a), _padded(guess, b)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, 0.01)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, CONVERGED_PX)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         a.image, b.image, start, target, winSize=(klt.window_px, klt.window_px), maxLevel=klt.levels,
-        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4)
+        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE)
     moved = there.reshape(-1, 2).astype(float)
     inside = (moved[:, 1] >= 0) & (moved[:, 1] <= b.image.shape[0] - 1)
     moved[:, 0] = (moved[:, 0] - b.pad_px) % b.width
@@ -75,6 +83,6 @@ def flow(
 
 
 def _padded(points: Array, wrapped: PaddedPanorama) -> NDArray[np.float32]:
-    """Points (N, 1, 2) float32 in the padded image, columns first brought into [0, width)."""
+    """Return points (N, 1, 2) float32 in the padded image, their columns first brought into [0, width)."""
     columns = points[:, 0] % wrapped.width + wrapped.pad_px
     return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)

@@ -1,4 +1,4 @@
-"""Guesses of a turn between two panoramas: on a cylinder a turn is a shift of the columns."""
+"""Hypotheses of the yaw between two panoramas: on a cylinder a rotation is a shift of the columns."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
+PEAKS = 3  # of the correlation
+PEAKS_APART = 36  # two peaks are at least a 36th of a full turn (10 degrees) apart
+MAX_GRADIENT = 100.0  # grey levels, Sobel: stronger edges are cut, so that none dominates the correlation
+ROW_STEP = 2  # every second row is enough for the correlation
 
 
 def steps() -> list[float]:
@@ -23,16 +27,16 @@ def steps() -> list[float]:
     return [0.0, *both, 10 * STEP_RAD]
 
 
-def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = 3) -> list[float]:
-    """The likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, within [-pi, pi).
+def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PEAKS) -> list[float]:
+    """Return the likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, in [-pi, pi).
 
-    Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded; what
-    turns with the camera must be left out by usable (H, W), for it holds the peak at zero.
+    Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded.
+    Structure that is fixed to the rig must be left out by usable (H, W), because it holds the peak at zero.
     """
     spectrum = np.conj(_spectrum(before, usable)) * _spectrum(after, usable)
     width = before.shape[1]
     score = np.fft.irfft(spectrum.sum(axis=0), width)
-    apart = width // 36
+    apart = width // PEAKS_APART
     peaks = []
     for _ in range(most):
         shift = int(score.argmax())
@@ -42,8 +46,8 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = 3)
 
 
 def _spectrum(image: Image, usable: Flags) -> NDArray[np.complex64]:
-    """Spectrum over azimuth of the horizontal gradient, half the rows, strong edges cut so that none rules alone."""
+    """Return the spectrum (H / ROW_STEP, W / 2 + 1) over azimuth of the horizontal gradient."""
     wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
     gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
-    limited = np.clip(gradient, -100, 100) * usable
-    return np.fft.rfft(limited[::2], axis=1).astype(np.complex64)
+    limited = np.clip(gradient, -MAX_GRADIENT, MAX_GRADIENT) * usable
+    return np.fft.rfft(limited[::ROW_STEP], axis=1).astype(np.complex64)

@@ -1,4 +1,4 @@
-"""Where am I? After darkness or a blow, keyframes are recognised by SIFT features (Lowe 2004) and matched in 3-D."""
+"""Relocalisation: after a break, keyframes are recognised by SIFT features (Lowe 2004) and matched in 3-D."""
 
 from __future__ import annotations
 
@@ -20,14 +20,19 @@ from omnid.core.stereo.triangulation import point_covariance, triangulate
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-RATIO = 0.8  # a match must be this much nearer than the second best (Lowe 2004)
-FEATURES = 1500
-SIGMA_PX = 0.7  # deviation of SIFT positions and of the disparities beside them
+RATIO = 0.8  # largest distance of a match, as a share of the second best one's (Lowe 2004)
+FEATURES = 1500  # SIFT features detected in a frame
+SIGMA_PX = 0.7  # standard deviation of SIFT positions and of the disparities beside them
+THRESHOLD_PX = 3.0  # largest error of a view in the consensus set
+MIN_MATCHES = 12  # matches, and inliers among them, below which a keyframe is not recognised
+OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
+MAX_KEYFRAMES = 8  # kept in memory
+KEYFRAMES_APART_M = 0.3  # a keyframe nearer to the last one replaces it
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeDescriptor:
-    """Recognisable points of a keyframe: SIFT descriptors (N, 128), views (N, 3) px, points (N, 3) m in its frame."""
+    """SIFT features of a keyframe: descriptors (N, 128), views (N, 3) [px], points (N, 3) [m] in its frame."""
 
     descriptors: NDArray[np.float32]
     views: Array
@@ -35,60 +40,64 @@ class KeyframeDescriptor:
 
 
 class Relocaliser:
-    """Remembers a bounded number of keyframes, and finds the pose of a new sight among them."""
+    """Keep at most max_keyframes keyframes, and find the pose of a frame relative to them."""
 
-    def __init__(self, model: StereoModel, places: int = 8, apart_m: float = 0.3) -> None:
+    def __init__(
+        self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES, apart_m: float = KEYFRAMES_APART_M
+    ) -> None:
         self._model = StereoModel(model.cylinder, model.baseline_m, SIGMA_PX)
         self._apart_m = apart_m
-        self._sights: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=places)
-        self._places: dict[int, KeyframeDescriptor] = {}
+        self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
+        self._descriptors: dict[int, KeyframeDescriptor] = {}
 
-    def remember(self, frame: StereoFrame, keyframe: Keyframe) -> None:
-        """Keeps a sight and its pose; one close to the last replaces it. Nothing is computed until it is needed."""
-        if self._sights and _distance_m(self._sights[-1][1], keyframe) < self._apart_m:
-            self._sights.pop()
-        self._sights.append((frame, keyframe))
-        kept = {frame.seq for frame, _ in self._sights}
-        self._places = {seq: place for seq, place in self._places.items() if seq in kept}
+    def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
+        """Keep a frame and its keyframe; one near the last keyframe replaces it. Features are computed when needed."""
+        if self._kept and _distance_m(self._kept[-1][1], keyframe) < self._apart_m:
+            self._kept.pop()
+        self._kept.append((frame, keyframe))
+        kept = {frame.seq for frame, _ in self._kept}
+        self._descriptors = {seq: features for seq, features in self._descriptors.items() if seq in kept}
 
-    def forget(self) -> None:
-        """Forgets all keyframes."""
-        self._sights.clear()
-        self._places.clear()
+    def clear(self) -> None:
+        """Remove all keyframes."""
+        self._kept.clear()
+        self._descriptors.clear()
 
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
-        """The best supported pose of a sight relative to the keyframes, newest first; None where none fits."""
+        """Return the pose with the most inliers among all keyframes, None where no keyframe is recognised."""
         here = _describe(frame, self._model)
-        fits = (self._match(here, *remembered, frame.seq) for remembered in reversed(self._sights))
-        return max((fit for fit in fits if fit), key=lambda fit: fit.inliers, default=None)
+        found = (self._match(here, frame.seq, *kept) for kept in reversed(self._kept))
+        return max((pose for pose in found if pose), key=lambda pose: pose.inliers, default=None)
 
     def _match(
-        self, here: KeyframeDescriptor, remembered: StereoFrame, keyframe: Keyframe, seed: int
+        self, here: KeyframeDescriptor, seed: int, kept: StereoFrame, keyframe: Keyframe
     ) -> PoseEstimate | None:
-        if remembered.seq not in self._places:
-            self._places[remembered.seq] = _describe(remembered, self._model)
-        there = self._places[remembered.seq]
-        a, b = _pairs(there.descriptors, here.descriptors)
-        if len(a) < 12:
+        """Return the pose relative to one keyframe, with the complete covariance; None where it is not recognised."""
+        if kept.seq not in self._descriptors:
+            self._descriptors[kept.seq] = _describe(kept, self._model)
+        there = self._descriptors[kept.seq]
+        a, b = _matches(there.descriptors, here.descriptors)
+        if len(a) < MIN_MATCHES:
             return None
         points, views = there.points[a], here.views[b]
-        T_curr_ref, agree = ransac(points, views, self._model, np.random.default_rng(seed), 3.0)
-        if agree.sum() < 12:
+        T_curr_ref, is_inlier = ransac(points, views, self._model, np.random.default_rng(seed), THRESHOLD_PX)
+        if is_inlier.sum() < MIN_MATCHES:
             return None
-        spread = point_covariance(points[agree], self._model.cylinder, self._model.baseline_m, SIGMA_PX)
-        estimate = gauss_newton(points[agree], spread, views[agree], T_curr_ref, self._model)
-        inliers = int((estimate.squared < 16).sum())
+        spread = point_covariance(points[is_inlier], self._model.cylinder, self._model.baseline_m, SIGMA_PX)
+        estimate = gauss_newton(points[is_inlier], spread, views[is_inlier], T_curr_ref, self._model)
+        inliers = int((estimate.squared < OUTLIER_SQUARED).sum())
         A = se3.adjoint(estimate.T)
         covariance = estimate.covariance + A @ keyframe.covariance @ A.T
         return PoseEstimate(keyframe.T_odom_rect @ se3.inverse(estimate.T), covariance, len(a), len(a), inliers)
 
 
 def _distance_m(a: Keyframe, b: Keyframe) -> float:
+    """Return the distance between the poses of two keyframes."""
     return float(np.linalg.norm(a.T_odom_rect[:3, 3] - b.T_odom_rect[:3, 3]))
 
 
 def _describe(frame: StereoFrame, model: StereoModel) -> KeyframeDescriptor:
-    """The SIFT features of the lower panorama whose disparity is known."""
+    """Return the SIFT features of the lower panorama whose disparity is known."""
     mask = np.where(frame.usable, 255, 0).astype(np.uint8)
     image = np.ascontiguousarray(frame.lower.panorama)
     keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(image, mask)
@@ -101,8 +110,8 @@ def _describe(frame: StereoFrame, model: StereoModel) -> KeyframeDescriptor:
     return KeyframeDescriptor(np.asarray(descriptors, np.float32)[known], views[known], points[known])
 
 
-def _pairs(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices into a and b of descriptors that are each other's clear nearest."""
+def _matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return indices (M,) into a and b of descriptors that are mutual nearest neighbours and pass the ratio test."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)[None] - 2 * a @ b.T

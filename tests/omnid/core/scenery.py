@@ -1,4 +1,4 @@
-"""Small images for the tests of the core: random panoramas, and what a rendered rig sees of a corridor."""
+"""Small images for the tests of the core: random panoramas, and frames of a rendered rig in a corridor."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ def wrapped(panorama: Image) -> PaddedPanorama:
 
 
 def turned(panorama: Image, columns: float) -> Image:
-    """The panorama moved right by that many columns, to sub-pixels, around the seam: what a turn to the left does."""
+    """The panorama shifted right by that many columns, to sub-pixels, around the seam, as by a turn to the left."""
     spectrum = np.fft.rfft(panorama.astype(float), axis=1)
     phase = np.exp(-2j * np.pi * columns * np.arange(spectrum.shape[1]) / panorama.shape[1])
     return np.clip(np.rint(np.fft.irfft(spectrum * phase, panorama.shape[1], axis=1)), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
-class Eyes:
-    """A rig in a scene, and all that turns its images into sights; the rig stands at T_world_rig."""
+class RenderedCameras:
+    """A rig in a scene, and the processing of its images to stereo frames; its pose is T_world_rig."""
 
     rig: Rig
     scene: Scene
@@ -57,14 +57,14 @@ class Eyes:
     matcher: Matcher
 
     @staticmethod
-    def of(rig: Rig, scene: Scene) -> Eyes:
-        """The eyes of a rig; no sensor fault but noise and blur."""
+    def of(rig: Rig, scene: Scene) -> RenderedCameras:
+        """Return the cameras of a rig, with noise and blur as their only sensor faults."""
         cylinder = fit_cylinder(rig)
         maps = remap_tables(rig, rig.lower, cylinder, PAD_PX), remap_tables(rig, rig.upper, cylinder, PAD_PX)
         seen = visible(rig.lower, maps[0], 2) & visible(rig.upper, maps[1], 2)
         seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
         sensors = [Exposure.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
-        return Eyes(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
+        return RenderedCameras(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
                     Matcher(seen.shape, MatchingSettings(disparities=32)))
 
     @property
@@ -73,19 +73,19 @@ class Eyes:
         return StereoModel(self.cylinder, self.rig.baseline_m)
 
     def frame(self, seq: int, T_world_rig: Array) -> StereoFrame:
-        """What is seen from a pose."""
+        """Return the frame seen from a pose."""
         rng = np.random.default_rng([seq, 99])
         mounted = (self.rig.lower, self.rig.upper)
         images = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
                     for e, m in zip(self.exposures, mounted, strict=True)]
-        return self._sight(seq, images[0], images[1])
+        return self._stereo_frame(seq, images[0], images[1])
 
     def darkness(self, seq: int) -> StereoFrame:
-        """What is seen with the light off."""
+        """Return the frame seen with the light off."""
         black = np.zeros(self.rig.lower.camera.size[::-1], np.uint8)
-        return self._sight(seq, black, black)
+        return self._stereo_frame(seq, black, black)
 
-    def _sight(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
+    def _stereo_frame(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
         panoramas = [np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
                      for image, maps in zip((lower, upper), self.maps, strict=True)]
         padded = np.zeros(panoramas[0].shape, bool)

@@ -1,4 +1,4 @@
-"""Corners spread over the panorama, and what stereo knows about them."""
+"""Corners spread over the panorama, and their disparity in the pair."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.omnid.core.scenery import texture, turned, wrapped
 ALL = np.ones((120, 480), bool)
 
 
-def test_a_poster_full_of_contrast_does_not_take_all() -> None:
+def test_a_poster_full_of_contrast_does_not_take_all_corners() -> None:
     faint = (texture(1) // 5 + 100).astype(np.uint8)
     faint[:, 200:280] = texture(2)[:, 200:280]
     found = corners(wrapped(faint), ALL, 100)
@@ -30,7 +30,7 @@ def test_within_a_cell_the_strongest_come_first() -> None:
     assert all(np.min(np.hypot(*(first - (c + 2.5, r + 2.5)).T)) < 6 for c, r in strong)
 
 
-def test_corners_keep_apart_and_to_what_is_usable() -> None:
+def test_corners_are_apart_and_within_the_usable_pixels() -> None:
     usable = ALL.copy()
     usable[:, 100:300] = False
     found = corners(wrapped(texture(4)), usable, 1000)
@@ -41,8 +41,8 @@ def test_corners_keep_apart_and_to_what_is_usable() -> None:
     assert len(corners(wrapped(texture(4)), ALL, 7)) == 7
 
 
-def test_the_seam_is_like_any_other_place() -> None:
-    """The same corners, turned with the image."""
+def test_the_seam_changes_nothing() -> None:
+    """The same corners are found in the rotated panorama."""
     found = corners(wrapped(texture(5)), ALL, 1000)
     after = corners(wrapped(turned(texture(5), 200)), ALL, 1000)
     assert set(map(tuple, (found + np.array([200, 0])) % (480, 1000))) == set(map(tuple, after))
@@ -52,7 +52,7 @@ def test_a_blank_wall_has_no_corners() -> None:
     assert corners(wrapped(np.full((120, 480), 80, np.uint8)), ALL, 100).shape == (0, 2)
 
 
-def test_discs_about_known_points_are_taken_out() -> None:
+def test_discs_around_known_points_are_left_out() -> None:
     free = clear_around(ALL, np.array([[50.2, 60.0], [0.0, 0.0]]), 9)
     rows, columns = np.nonzero(~free)
     assert np.minimum(np.hypot(columns - 50, rows - 60), np.hypot(columns, rows)).max() <= 9.5
@@ -60,7 +60,7 @@ def test_discs_about_known_points_are_taken_out() -> None:
     assert ALL.all()
 
 
-def test_the_disparity_is_the_median_of_what_is_near_also_across_the_seam() -> None:
+def test_the_disparity_is_the_median_of_near_pixels_also_across_the_seam() -> None:
     disparity = np.full((120, 480), np.nan, np.float32)
     disparity[60, [100, 101, 102]] = 7.0, 9.0, 30.0
     disparity[80, 479] = 5.0
@@ -71,7 +71,7 @@ def test_the_disparity_is_the_median_of_what_is_near_also_across_the_seam() -> N
     assert nearby_disparity(disparity, np.zeros((0, 2))).shape == (0,)
 
 
-def test_rows_in_the_upper_panorama_to_sub_pixels_or_not_at_all() -> None:
+def test_rows_in_the_upper_panorama_are_found_to_sub_pixels() -> None:
     lower = texture(6)
     upper = np.rot90(turned(np.ascontiguousarray(np.rot90(lower)), 10.4), -1)  # 10.4 rows down
     points = corners(wrapped(lower), np.arange(120)[:, None] * np.ones((1, 480)) < 90, 200)
@@ -84,7 +84,7 @@ def test_rows_in_the_upper_panorama_to_sub_pixels_or_not_at_all() -> None:
     assert np.isnan(rows_in_upper(pair, points, guess, KltSettings(levels=1))[::2]).all()
 
 
-def test_a_match_beside_its_column_or_above_the_point_is_none() -> None:
+def test_refuses_a_match_in_another_column_or_above_the_point() -> None:
     lower = texture(7)
     points = corners(wrapped(lower), ALL, 100)
     aside = wrapped(np.roll(turned(lower, 1.5), 6, axis=0))

@@ -13,7 +13,7 @@ TWIST = np.array([0.5, -0.1, 0.02, 0.05, -0.03, 0.8])  # m/s, rad/s
 NOISE = np.diag(np.repeat([0.002, 0.001], 3) ** 2)  # of a motion, m^2 and rad^2
 
 
-def test_constant_velocity_is_learnt_and_smoothed_though_the_steps_differ() -> None:
+def test_constant_velocity_is_estimated_and_smoothed_with_irregular_steps() -> None:
     motion, rng = MotionFilter(), np.random.default_rng(1)
     raw, filtered = [], []
     for _ in range(60):
@@ -37,7 +37,7 @@ def test_the_prediction_is_the_motion_in_that_time() -> None:
         assert distance < 2e-3 * dt_s / 0.05 and angle < 2e-3 * dt_s / 0.05
 
 
-def test_acceleration_is_carried_on() -> None:
+def test_acceleration_is_predicted() -> None:
     motion = MotionFilter()
     for k in range(40):
         motion.predict(0.1)
@@ -45,7 +45,7 @@ def test_acceleration_is_carried_on() -> None:
     assert se3.log(motion.predict(0.1))[0] == pytest.approx(0.1 * 0.2 * 40 * 0.1, rel=0.02)
 
 
-def test_a_jump_within_what_the_noise_allows_is_believed_at_once() -> None:
+def test_follows_a_jump_within_the_process_noise_at_once() -> None:
     motion = MotionFilter()
     motion.predict(0.1)
     T = motion.update(se3.exp([0.05, 0, 0, 0, 0, 1.6]), NOISE, 0.1)
@@ -68,7 +68,7 @@ def test_the_covariance_is_symmetric_positive_and_shrinks_with_measurements() ->
     assert (np.diag(motion.velocity_covariance) > 10 * np.diag(P)).all()
 
 
-def test_slowing_down_and_forgetting() -> None:
+def test_slows_down_and_resets() -> None:
     motion = MotionFilter()
     for _ in range(20):
         motion.predict(0.1)

@@ -1,4 +1,4 @@
-"""Short rendered runs: exact enough, also through a turn; honest in the dark; refusing what cannot be."""
+"""Short rendered runs: accuracy, also through a turn; darkness, relocalisation, refused poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.tracking_state import TrackingState
-from tests.omnid.core.scenery import Eyes, motion_errors
+from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor
 from tests.simulation.paths import planar_poses
 
@@ -32,84 +32,84 @@ def truth(k: int) -> Array:
 
 
 @pytest.fixture(scope="module")
-def frames(cameras: Eyes) -> list[StereoFrame]:
+def frames(cameras: RenderedCameras) -> list[StereoFrame]:
     return [cameras.frame(k, T) for k, T in enumerate(PATH)]
 
 
-def follow(motion: VisualOdometry, frames: list[StereoFrame], first: bool = True) -> list[OdometryEstimate]:
-    """What the ego-motion says of sights, PERIOD_S apart."""
-    return [motion.process(frame, 0.0 if first and k == 0 else PERIOD_S) for k, frame in enumerate(frames)]
+def run(odometry: VisualOdometry, frames: list[StereoFrame], first: bool = True) -> list[OdometryEstimate]:
+    """Return the estimates of frames that are PERIOD_S apart."""
+    return [odometry.process(frame, 0.0 if first and k == 0 else PERIOD_S) for k, frame in enumerate(frames)]
 
 
 @pytest.fixture
-def motion(cameras: Eyes) -> VisualOdometry:
+def odometry(cameras: RenderedCameras) -> VisualOdometry:
     return VisualOdometry(cameras.model, KltSettings(), OdometryLimits())
 
 
-def test_the_path_is_followed_through_a_right_angle(motion: VisualOdometry, frames: list[StereoFrame]) -> None:
-    for k, ego in enumerate(follow(motion, frames)):
-        distance, angle = motion_errors(ego.T_odom_rect, truth(k))
+def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
+    for k, estimate in enumerate(run(odometry, frames)):
+        distance, angle = motion_errors(estimate.T_odom_rect, truth(k))
         assert distance < 4e-3 and angle < 2e-3, k
-        assert (ego.state, ego.resets) == (TrackingState.TRACKING, 0)
-        assert ego.tracked >= ego.inliers >= 50
+        assert (estimate.state, estimate.resets) == (TrackingState.TRACKING, 0)
+        assert estimate.tracked >= estimate.inliers >= 50
 
 
-def test_with_one_keyframe_every_sight_is_measured_against_the_one_before(
-    cameras: Eyes, frames: list[StereoFrame]
+def test_with_one_keyframe_every_frame_is_measured_against_the_previous_one(
+    cameras: RenderedCameras, frames: list[StereoFrame]
 ) -> None:
     traces = {}
     for keyframes in (1, 8):
-        egos = follow(VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=keyframes)), frames)
-        assert motion_errors(egos[-1].T_odom_rect, truth(len(frames) - 1))[0] < 6e-3
-        assert min(ego.inliers for ego in egos) >= 50
-        traces[keyframes] = np.array([np.trace(ego.covariance[:3, :3]) for ego in egos])
+        estimates = run(VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=keyframes)), frames)
+        assert motion_errors(estimates[-1].T_odom_rect, truth(len(frames) - 1))[0] < 6e-3
+        assert min(estimate.inliers for estimate in estimates) >= 50
+        traces[keyframes] = np.array([np.trace(estimate.covariance[:3, :3]) for estimate in estimates])
     assert (np.diff(traces[1]) > 0).all()
-    assert traces[1][3] > 2 * traces[8][3]  # what is added with every sight is never taken away
+    assert traces[1][3] > 2 * traces[8][3]  # the error of every step stays
 
 
-def test_the_covariance_tells_how_wrong_it_may_be(motion: VisualOdometry, frames: list[StereoFrame]) -> None:
-    for k, ego in enumerate(follow(motion, frames)[1:], 1):
-        np.testing.assert_allclose(ego.covariance, ego.covariance.T, atol=1e-12)
-        error = se3.log(se3.inverse(ego.T_odom_rect) @ truth(k))
-        assert error @ np.linalg.solve(ego.covariance, error) < 30  # six squares that should each be about one
-        assert np.sqrt(np.diag(ego.covariance)).max() < 5e-3
+def test_the_covariance_matches_the_error(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
+    for k, estimate in enumerate(run(odometry, frames)[1:], 1):
+        np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, atol=1e-12)
+        error = se3.log(se3.inverse(estimate.T_odom_rect) @ truth(k))
+        assert error @ np.linalg.solve(estimate.covariance, error) < 30  # a chi-square of six degrees of freedom
+        assert np.sqrt(np.diag(estimate.covariance)).max() < 5e-3
 
 
-def test_the_velocity_is_the_rigs_own(motion: VisualOdometry, frames: list[StereoFrame]) -> None:
+def test_the_velocity_is_in_the_rig_frame(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
     """Ahead at half a metre a second, before the turn and some time after it."""
-    egos = follow(motion, frames[:5])
-    np.testing.assert_allclose(egos[4].velocity, [0.5, 0, 0, 0, 0, 0], atol=0.06)
-    assert (np.linalg.eigvalsh(egos[4].velocity_covariance) > 0).all()
+    estimates = run(odometry, frames[:5])
+    np.testing.assert_allclose(estimates[4].velocity, [0.5, 0, 0, 0, 0, 0], atol=0.06)
+    assert (np.linalg.eigvalsh(estimates[4].velocity_covariance) > 0).all()
 
 
-def test_standing_still_does_not_drift(motion: VisualOdometry, cameras: Eyes) -> None:
-    egos = follow(motion, [cameras.frame(k, PATH[0]) for k in range(8)])
-    distances = [motion_errors(ego.T_odom_rect, np.eye(4))[0] for ego in egos]
+def test_standing_still_does_not_drift(odometry: VisualOdometry, cameras: RenderedCameras) -> None:
+    estimates = run(odometry, [cameras.frame(k, PATH[0]) for k in range(8)])
+    distances = [motion_errors(estimate.T_odom_rect, np.eye(4))[0] for estimate in estimates]
     assert max(distances) < 1.5e-3
-    assert all(ego.state == TrackingState.TRACKING for ego in egos)
+    assert all(estimate.state == TrackingState.TRACKING for estimate in estimates)
 
 
-def test_a_dark_pair_is_a_doubt_and_the_pose_goes_on(
-    motion: VisualOdometry, frames: list[StereoFrame], cameras: Eyes
+def test_one_dark_pair_is_degraded_and_the_pose_is_predicted(
+    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
 ) -> None:
-    before = follow(motion, frames[:4])[-1]
-    dark = motion.process(cameras.darkness(100), PERIOD_S)
+    before = run(odometry, frames[:4])[-1]
+    dark = odometry.process(cameras.darkness(100), PERIOD_S)
     assert dark.state == TrackingState.DEGRADED and dark.inliers == 0
     assert np.trace(dark.covariance) > 2 * np.trace(before.covariance)
     ahead = (se3.inverse(before.T_odom_rect) @ dark.T_odom_rect)[:3, 3]
-    np.testing.assert_allclose(ahead, [0.05, 0, 0], atol=0.015)  # as before
-    back = follow(motion, [frames[4], frames[5], frames[6]], first=False)
+    np.testing.assert_allclose(ahead, [0.05, 0, 0], atol=0.015)  # the motion before
+    back = run(odometry, [frames[4], frames[5], frames[6]], first=False)
     assert back[0].state == TrackingState.DEGRADED and back[-1].state == TrackingState.TRACKING
     distance, angle = motion_errors(back[-1].T_odom_rect, truth(6))
     assert distance < 4e-3 and angle < 2e-3 and back[-1].resets == 0
 
 
-def test_a_long_darkness_is_lost_and_the_place_known_again(
-    motion: VisualOdometry, frames: list[StereoFrame], cameras: Eyes
+def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
+    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
 ) -> None:
-    follow(motion, frames[:4])
-    dark = follow(motion, [cameras.darkness(100 + k) for k in range(6)], first=False)
-    assert [ego.state for ego in dark] == [
+    run(odometry, frames[:4])
+    dark = run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
+    assert [estimate.state for estimate in dark] == [
         TrackingState.DEGRADED,
         TrackingState.DEGRADED,
         TrackingState.LOST,
@@ -117,66 +117,70 @@ def test_a_long_darkness_is_lost_and_the_place_known_again(
         TrackingState.LOST,
         TrackingState.LOST,
     ]
-    assert (np.diff([np.trace(ego.covariance) for ego in dark]) > 0).all()
-    steps = np.linalg.norm(np.diff([ego.T_odom_rect[:3, 3] for ego in dark], axis=0), axis=1)
+    assert (np.diff([np.trace(estimate.covariance) for estimate in dark]) > 0).all()
+    steps = np.linalg.norm(np.diff([estimate.T_odom_rect[:3, 3] for estimate in dark], axis=0), axis=1)
     assert (np.diff(steps) < 0).all() and steps[-1] < 0.02  # slowing down
-    back = follow(motion, frames[3:6], first=False)
-    for k, ego in enumerate(back, 3):
-        distance, angle = motion_errors(ego.T_odom_rect, truth(k))
+    back = run(odometry, frames[3:6], first=False)
+    for k, estimate in enumerate(back, 3):
+        distance, angle = motion_errors(estimate.T_odom_rect, truth(k))
         assert distance < 0.02 and angle < 0.01, k
     assert (back[-1].state, back[-1].resets) == (TrackingState.TRACKING, 0)
 
 
-def test_a_robot_carried_back_in_the_dark_knows_a_place_that_the_local_map_has_forgotten(cameras: Eyes) -> None:
+def test_relocalises_at_a_keyframe_that_has_left_the_local_map(cameras: RenderedCameras) -> None:
     path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
-    motion = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=2))
-    follow(motion, [cameras.frame(k, T) for k, T in enumerate(path)])
-    follow(motion, [cameras.darkness(100 + k) for k in range(6)], first=False)
+    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=2))
+    run(odometry, [cameras.frame(k, T) for k, T in enumerate(path)])
+    run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
     (T_world_rig,) = planar_poses(np.array([[0.1, -0.1]]), np.array([2.0]))
-    back = follow(motion, [cameras.frame(200 + k, T_world_rig) for k in range(2)], first=False)
+    back = run(odometry, [cameras.frame(200 + k, T_world_rig) for k in range(2)], first=False)
     distance, angle = motion_errors(back[-1].T_odom_rect, se3.inverse(path[0]) @ T_world_rig)
     assert distance < 0.01 and angle < 0.005
-    assert [ego.state for ego in back] == [TrackingState.DEGRADED, TrackingState.TRACKING] and back[-1].resets == 0
+    assert [estimate.state for estimate in back] == [TrackingState.DEGRADED, TrackingState.TRACKING]
+    assert back[-1].resets == 0
 
 
-def test_what_fits_nowhere_is_refused_and_after_a_while_begun_anew(motion: VisualOdometry, frames: list[StereoFrame],
-                                                                  cameras: Eyes) -> None:
-    """The robot is carried into another corridor: no pose is made up, and then the reset counter says so."""
-    before = follow(motion, frames[:4])[-1]
+def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
+    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
+) -> None:
+    """The robot is carried into another corridor: no pose is accepted there, and then the reset counter rises."""
+    before = run(odometry, frames[:4])[-1]
     elsewhere = replace(cameras, scene=corridor(7))
-    there = follow(motion, [elsewhere.frame(50 + k, PATH[k % 4]) for k in range(16)], first=False)
+    there = run(odometry, [elsewhere.frame(50 + k, PATH[k % 4]) for k in range(16)], first=False)
     limits = OdometryLimits()
-    begun = limits.lost_after + limits.restart_after - 2
-    assert all(ego.inliers == 0 and ego.state != TrackingState.TRACKING for ego in there[:begun])
+    restarted = limits.lost_after + limits.restart_after - 2
+    assert all(estimate.inliers == 0 and estimate.state != TrackingState.TRACKING for estimate in there[:restarted])
     assert there[limits.lost_after].state == TrackingState.LOST
-    assert [ego.resets for ego in there[begun:]] == [1] * (16 - begun)
-    assert all(ego.state == TrackingState.TRACKING for ego in there[begun + 1 :])
+    assert [estimate.resets for estimate in there[restarted:]] == [1] * (16 - restarted)
+    assert all(estimate.state == TrackingState.TRACKING for estimate in there[restarted + 1 :])
     # Standing at a corner of that corridor, it moves there as it does here; the gap stays in the covariance.
     moved = se3.inverse(there[-2].T_odom_rect) @ there[-1].T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[2]) @ PATH[3])[0] < 5e-3
     assert np.sqrt(there[-1].covariance[0, 0]) > 0.1 > 10 * np.sqrt(before.covariance[0, 0])
 
 
-def test_a_robot_does_not_fly(cameras: Eyes, frames: list[StereoFrame]) -> None:
-    """The same images, said to be taken much closer in time than the robot can be fast."""
-    motion = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(max_speed_mps=0.5))
-    follow(motion, frames[:2])
-    ego = motion.process(frames[4], 0.05)  # 0.15 m in 0.05 s
-    assert ego.state != TrackingState.TRACKING and ego.inliers == 0
-    assert ego.T_odom_rect[0, 3] < 0.1
+def test_refuses_an_impossible_speed(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    """The stamps are so close that the robot would have had to be faster than its limit."""
+    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(max_speed_mps=0.5))
+    run(odometry, frames[:2])
+    estimate = odometry.process(frames[4], 0.05)  # 0.15 m in 0.05 s
+    assert estimate.state != TrackingState.TRACKING and estimate.inliers == 0
+    assert estimate.T_odom_rect[0, 3] < 0.1
 
 
-def test_dark_from_the_start_waits_for_light(motion: VisualOdometry, frames: list[StereoFrame], cameras: Eyes) -> None:
-    dark = follow(motion, [cameras.darkness(100), cameras.darkness(101)])
-    assert [ego.state for ego in dark] == [TrackingState.LOST, TrackingState.LOST]
-    light = follow(motion, frames[:3], first=False)
-    assert [ego.state for ego in light] == [TrackingState.TRACKING] * 3
+def test_dark_from_the_start_is_lost_until_there_is_light(
+    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
+) -> None:
+    dark = run(odometry, [cameras.darkness(100), cameras.darkness(101)])
+    assert [estimate.state for estimate in dark] == [TrackingState.LOST, TrackingState.LOST]
+    light = run(odometry, frames[:3], first=False)
+    assert [estimate.state for estimate in light] == [TrackingState.TRACKING] * 3
     assert motion_errors(light[-1].T_odom_rect, truth(2))[0] < 4e-3
 
 
-def test_the_same_sights_give_the_same_numbers(cameras: Eyes, frames: list[StereoFrame]) -> None:
+def test_the_same_frames_give_the_same_bytes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     first, second = (
-        follow(VisualOdometry(cameras.model, KltSettings(), OdometryLimits()), frames)[-1] for _ in range(2)
+        run(VisualOdometry(cameras.model, KltSettings(), OdometryLimits()), frames)[-1] for _ in range(2)
     )
     assert first.T_odom_rect.tobytes() == second.T_odom_rect.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()

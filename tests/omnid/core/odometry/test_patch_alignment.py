@@ -1,4 +1,4 @@
-"""Patches are bent as a wall really bends, and found again where they are."""
+"""Patches are warped as a plane in the scene is, and located to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def wall_slopes() -> Array:
     return np.column_stack([(disparity(PIXELS + step) - disparity(PIXELS - step)) / 2 for step in np.eye(2)])
 
 
-def test_the_warp_is_the_derivative_of_where_the_wall_is_seen() -> None:
+def test_the_warp_is_the_derivative_of_the_projection_of_the_wall() -> None:
     across, down = (moved(PIXELS + step) - moved(PIXELS - step) for step in (np.array([0.5, 0]), np.array([0, 0.5])))
     truth = np.stack([across, down], axis=2)
     warps = affine_warps(wall_views(PIXELS), wall_slopes(), np.broadcast_to(MOVED, (len(PIXELS), 4, 4)), MODEL)
-    assert np.abs(truth - np.eye(2)).max() > 0.1  # it bends at all
+    assert np.abs(truth - np.eye(2)).max() > 0.1  # the wall is seen distorted
     np.testing.assert_allclose(warps, truth, atol=0.01)
 
 
-def test_an_impossible_warp_is_taken_as_none() -> None:
+def test_the_identity_replaces_an_impossible_warp() -> None:
     onto_the_wall = np.broadcast_to(se3.exp([*(-1.4 * NORMAL), 0, 0, 0]), (4, 4, 4))
     warps = affine_warps(wall_views(PIXELS), wall_slopes(), onto_the_wall, MODEL)
     beyond = affine_warps(np.full((1, 3), np.nan), np.zeros((1, 2)), MOVED[None], MODEL)
@@ -64,17 +64,17 @@ def test_an_impossible_warp_is_taken_as_none() -> None:
     np.testing.assert_array_equal(beyond[0], np.eye(2))
 
 
-def test_slopes_of_a_plane_are_found_beside_a_step_and_with_gaps() -> None:
+def test_slopes_of_a_plane_beside_a_step_and_with_gaps() -> None:
     column, row = np.meshgrid(np.arange(200.0), np.arange(100.0))
     plane = (20 + 0.05 * (column - 100) - 0.02 * (row - 50)).astype(np.float32)
-    plane[:, 104:] += 9  # something nearer stands beside it
+    plane[:, 104:] += 9  # a nearer object beside it
     plane[::3] = np.nan
     slopes = disparity_slopes(plane, np.array([[98.0, 50.0], [5.0, 50.0]]), np.array([19.9, 15.25]))
     np.testing.assert_allclose(slopes[0], [0.05, -0.02], atol=0.004)
     np.testing.assert_allclose(disparity_slopes(plane * np.nan, np.array([[98.0, 50.0]]), np.array([20.0])), [[0, 0]])
 
 
-def bent(image: PaddedPanorama, warp: Array, center: Array) -> PaddedPanorama:
+def warped(image: PaddedPanorama, warp: Array, center: Array) -> PaddedPanorama:
     """The image as seen after a warp about a point: resampled by the inverse."""
     inverse = np.linalg.inv(warp)
     offset = center - inverse @ center
@@ -84,21 +84,21 @@ def bent(image: PaddedPanorama, warp: Array, center: Array) -> PaddedPanorama:
     return wrapped(cv2.remap(image.image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR))
 
 
-def test_a_bent_patch_is_found_to_hundredths_where_a_stiff_one_errs() -> None:
+def test_a_warped_patch_is_located_to_hundredths_where_a_rigid_one_errs() -> None:
     warp, center = np.array([[1.15, 0.08], [0.0, 0.92]]), np.array([240.0, 60.0])
     before = wrapped(texture(3))
-    after = bent(before, warp, center)
+    after = warped(before, warp, center)
     pixels = center + np.array([[-20.0, -10], [0, 0], [14, 9], [-8, 16], [22, -12], [6, -20]])
     truth = center + (pixels - center) @ warp.T
     predicted = truth + np.array([0.6, -0.4])
     errors = {}
-    for name, bend in (("bent", warp), ("stiff", np.eye(2))):
-        templates = warped_templates(before, pixels, np.broadcast_to(bend, (6, 2, 2)), predicted)
+    for name, applied in (("warped", warp), ("rigid", np.eye(2))):
+        templates = warped_templates(before, pixels, np.broadcast_to(applied, (6, 2, 2)), predicted)
         assert templates.shape == (6, CELL_PX, CELL_PX)
         found, close = align(templates, after, predicted)
         assert close.all()
         errors[name] = np.abs(found - truth).max()
-    assert errors["bent"] < 0.06 and errors["stiff"] > 3 * errors["bent"]
+    assert errors["warped"] < 0.06 and errors["rigid"] > 3 * errors["warped"]
 
 
 def test_patches_far_from_where_they_were_predicted_are_refused() -> None:

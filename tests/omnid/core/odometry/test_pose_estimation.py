@@ -1,4 +1,4 @@
-"""Motions from landmarks and views: the closed form, RANSAC with liars, Gauss-Newton and its covariance."""
+"""Motions from landmarks and views: the closed form, RANSAC with outliers, Gauss-Newton and its covariance."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_rigid_fit_never_reflects() -> None:
     assert np.linalg.det(rigid_fit(flat, se3.apply(MOTION, flat))[:3, :3]) == pytest.approx(1)
 
 
-def test_residuals_wrap_at_the_seam_and_keep_the_unknown() -> None:
+def test_residuals_wrap_at_the_seam_and_keep_nan() -> None:
     behind = np.array([[-2.0, 0.001, 0.1], [-2.0, 0.001, 0.1]])
     views = np.array([[0.0, 0, 0], [1303.5, 0, np.nan]])
     error = MODEL.residual(behind, views)
@@ -57,19 +57,19 @@ def test_residuals_wrap_at_the_seam_and_keep_the_unknown() -> None:
     assert np.isnan(error[1, 2]) and np.isfinite(error[0]).all()
 
 
-def test_ransac_finds_the_motion_among_liars() -> None:
+def test_ransac_finds_the_motion_among_outliers() -> None:
     points = landmarks(200)
     views = views_of(points) + np.random.default_rng(2).normal(0, 0.1, (200, 3))
-    liars = np.arange(200) % 5 < 3
-    views[liars] = views_of(landmarks(120, 5), np.eye(4))
+    outliers = np.arange(200) % 5 < 3
+    views[outliers] = views_of(landmarks(120, 5), np.eye(4))
     T, agree = ransac(points, views, MODEL, np.random.default_rng(3))
-    assert not agree[liars].sum() > 3
-    assert agree[~liars].sum() > 70
+    assert not agree[outliers].sum() > 3
+    assert agree[~outliers].sum() > 70
     distance, angle = motion_errors(T, MOTION)
     assert distance < 0.03 and angle < 0.02
 
 
-def test_ransac_takes_no_hypothesis_from_lower_views_but_lets_them_vote() -> None:
+def test_ransac_draws_stereo_views_only_but_counts_all() -> None:
     points = landmarks(40)
     views = views_of(points)
     views[6:, 2] = np.nan
@@ -88,7 +88,7 @@ def test_gauss_newton_is_exact_without_noise() -> None:
     assert estimate.squared.max() < 1e-8
 
 
-def test_gauss_newton_manages_with_a_row_missing() -> None:
+def test_gauss_newton_accepts_views_without_an_upper_row() -> None:
     points, views = landmarks(60), views_of(landmarks(60))
     views[::2, 2] = np.nan
     estimate = gauss_newton(points, certain(60), views, MOTION @ se3.exp(np.full(6, 0.01)), MODEL)
@@ -97,7 +97,7 @@ def test_gauss_newton_manages_with_a_row_missing() -> None:
     assert np.trace(estimate.covariance) > np.trace(both.covariance)
 
 
-def test_a_few_wrong_landmarks_hardly_matter() -> None:
+def test_gauss_newton_is_robust_to_a_few_outliers() -> None:
     points, views = landmarks(80), views_of(landmarks(80))
     views[:8] += 60
     estimate = gauss_newton(points, certain(80), views, MOTION @ se3.exp(np.full(6, 0.005)), MODEL)
@@ -106,7 +106,7 @@ def test_a_few_wrong_landmarks_hardly_matter() -> None:
     assert estimate.squared[:8].min() > 1e3 > estimate.squared[8:].max()
 
 
-def test_landmarks_with_a_large_covariance_say_less() -> None:
+def test_landmarks_with_a_large_covariance_have_less_weight() -> None:
     points, views = landmarks(60), views_of(landmarks(60))
     wrong = points.copy()
     wrong[::2] += (0.01, 0, 0)
@@ -116,7 +116,7 @@ def test_landmarks_with_a_large_covariance_say_less() -> None:
     assert motion_errors(gauss_newton(wrong, covariance, views, MOTION, MODEL).T, MOTION)[0] < even / 10
 
 
-def test_whitened_errors_have_deviation_one() -> None:
+def test_whitened_errors_have_unit_variance() -> None:
     points, rng = landmarks(4000), np.random.default_rng(6)
     covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
     noisy = points + (np.linalg.cholesky(covariance) @ rng.standard_normal((4000, 3, 1)))[:, :, 0]
@@ -130,17 +130,17 @@ def test_whitened_errors_have_deviation_one() -> None:
     np.testing.assert_allclose(lower_only.T @ lower_only / len(lower_only), np.diag([1, 1, 0]), atol=0.15)
 
 
-def test_the_covariance_is_what_noise_scatters() -> None:
-    """Every direction of the six, landmarks and views both noisy, within 30 % in deviation."""
+def test_the_covariance_matches_the_scatter() -> None:
+    """Every direction of the six, landmarks and views both noisy, within 30 % of the standard deviation."""
     points, rng = landmarks(60), np.random.default_rng(7)
     covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
-    roots, errors, said = np.linalg.cholesky(covariance), [], []
+    roots, errors, reported = np.linalg.cholesky(covariance), [], []
     for _ in range(300):
         noisy = points + (roots @ rng.standard_normal((60, 3, 1)))[:, :, 0]
         views = views_of(points) + MODEL.sigma_px * rng.standard_normal((60, 3))
         estimate = gauss_newton(noisy, covariance, views, MOTION, MODEL)
         errors.append(se3.log(estimate.T @ se3.inverse(MOTION)))
-        said.append(estimate.covariance)
-    W = np.linalg.inv(np.linalg.cholesky(np.mean(said, axis=0)))
+        reported.append(estimate.covariance)
+    W = np.linalg.inv(np.linalg.cholesky(np.mean(reported, axis=0)))
     spread = np.sqrt(np.linalg.eigvalsh(W @ np.cov(np.array(errors).T) @ W.T))
     assert spread.min() > 0.7 and spread.max() < 1.3

@@ -1,4 +1,4 @@
-"""Struts turn with the camera and are found out; the world does not."""
+"""Structure that is fixed to the rig is detected; the world is not."""
 
 from __future__ import annotations
 
@@ -28,58 +28,58 @@ def pose(k: int) -> NDArray[np.float64]:
     return se3.exp([0, 0, 0, 0, 0, BETWEEN_PX * k * 2 * np.pi / 480])
 
 
-def test_a_strut_is_found_and_the_moving_world_stays() -> None:
-    pattern = StaticMask()
+def test_a_strut_is_masked_and_the_moving_world_is_not() -> None:
+    mask = StaticMask()
     for k in range(12):
-        pattern.observe(seen(k), pose(k))
-    left = pattern.without(ALL)
+        mask.observe(seen(k), pose(k))
+    left = mask.without(ALL)
     assert left[STRUT].mean() < 0.02
     world = ALL.copy()
     world[:, 80:136], world[80:] = False, False
     assert left[world].mean() > 0.97
 
 
-def test_nothing_is_known_before_enough_was_seen_and_what_was_masked_stays_masked() -> None:
-    pattern, masked = StaticMask(), ALL.copy()
+def test_masks_nothing_before_enough_evidence_and_keeps_the_given_mask() -> None:
+    mask, masked = StaticMask(), ALL.copy()
     masked[:, 300:] = False
     for k in range(5):
-        pattern.observe(seen(k), pose(k))
-    assert pattern.without(ALL).all()
+        mask.observe(seen(k), pose(k))
+    assert mask.without(ALL).all()
     for k in range(5, 12):
-        pattern.observe(seen(k), pose(k))
-    left = pattern.without(masked)
+        mask.observe(seen(k), pose(k))
+    left = mask.without(masked)
     assert not left[:, 300:].any() and left[:, :90].any() and masked[:, :300].all()
 
 
-def test_standing_still_proves_nothing() -> None:
-    pattern = StaticMask()
+def test_standing_still_gives_no_evidence() -> None:
+    mask = StaticMask()
     for _ in range(30):
-        pattern.observe(seen(0), pose(0))
-    assert pattern.without(ALL).all()
+        mask.observe(seen(0), pose(0))
+    assert mask.without(ALL).all()
 
 
-def test_a_shift_is_motion_too() -> None:
-    pattern = StaticMask()
+def test_a_translation_counts_as_motion() -> None:
+    mask = StaticMask()
     for k in range(12):
-        pattern.observe(seen(k), se3.exp([0.3 * k, 0, 0, 0, 0, 0]))
-    assert not pattern.without(ALL)[:, 100:116].any()
+        mask.observe(seen(k), se3.exp([0.3 * k, 0, 0, 0, 0, 0]))
+    assert not mask.without(ALL)[:, 100:116].any()
 
 
-def test_bare_walls_keep_their_level_and_are_no_strut() -> None:
+def test_bare_walls_are_not_masked() -> None:
     """Images on white walls: nearly all of the panorama stays the same, and none of it is fixed."""
     room = np.full((120, 480), 200, np.uint8)
     for column in (30, 170, 330):
         room[40:80, column : column + 40] = texture(3)[40:80, column : column + 40]
-    pattern = StaticMask()
+    mask = StaticMask()
     for k in range(40):
-        pattern.observe(turned(room, BETWEEN_PX * k), pose(k))
-    assert pattern.without(ALL).mean() > 0.97
+        mask.observe(turned(room, BETWEEN_PX * k), pose(k))
+    assert mask.without(ALL).mean() > 0.97
 
 
-def test_what_was_taken_for_fixed_is_given_back_when_it_changes() -> None:
-    pattern = StaticMask()
+def test_pixels_that_change_are_released() -> None:
+    mask = StaticMask()
     for k in range(12):
-        pattern.observe(seen(k), pose(k))
+        mask.observe(seen(k), pose(k))
     for k in range(12, 30):
-        pattern.observe(turned(texture(1), BETWEEN_PX * k), pose(k))
-    assert pattern.without(ALL).mean() > 0.97
+        mask.observe(turned(texture(1), BETWEEN_PX * k), pose(k))
+    assert mask.without(ALL).mean() > 0.97

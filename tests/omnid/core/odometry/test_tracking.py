@@ -25,7 +25,7 @@ def column_error(found: Array, expected: Array, width: int = 480) -> Array:
 
 
 @pytest.mark.parametrize("columns", [0.0, 0.4, -3.3, 7.25])
-def test_a_shift_is_found_to_a_twentieth_of_a_pixel_also_across_the_seam(columns: float) -> None:
+def test_tracks_a_shift_to_a_twentieth_of_a_pixel_also_across_the_seam(columns: float) -> None:
     before, points = texture(1), grid()
     there, found = track(wrapped(before), wrapped(turned(before, columns)), points, points, KLT)
     assert found.mean() > 0.99
@@ -35,7 +35,7 @@ def test_a_shift_is_found_to_a_twentieth_of_a_pixel_also_across_the_seam(columns
     assert (there[:, 0] >= 0).all() and (there[:, 0] < 480).all()
 
 
-def test_a_guess_leads_to_what_is_out_of_reach() -> None:
+def test_a_guess_extends_the_range() -> None:
     before, points = texture(2), grid()
     after = turned(before, 171)
     there, found = track(wrapped(before), wrapped(after), points, points + np.array([170.0, 0]), KLT)
@@ -45,14 +45,14 @@ def test_a_guess_leads_to_what_is_out_of_reach() -> None:
     assert found.mean() < 0.2
 
 
-def test_any_turn_of_the_guess_is_the_same_place() -> None:
+def test_columns_of_the_guess_may_lie_outside_the_panorama() -> None:
     before, points = texture(3), grid()
     there, found = track(wrapped(before), wrapped(before), points, points - np.array([960.0, 0]), KLT)
     assert found.mean() > 0.99
     assert np.abs(column_error(there[found], points[found])).max() < 0.05
 
 
-def test_what_is_gone_is_called_gone_though_lucas_and_kanade_report_it() -> None:
+def test_the_forward_backward_check_refuses_points_that_have_disappeared() -> None:
     before, points = texture(4), grid()
     after = before.copy()
     after[:, 200:280] = texture(5)[:, 200:280]
@@ -64,7 +64,7 @@ def test_what_is_gone_is_called_gone_though_lucas_and_kanade_report_it() -> None
     assert found[(points[:, 0] < 180) | (points[:, 0] > 300)].mean() > 0.98
 
 
-def test_a_blank_image_gives_no_tracks_and_no_points_none() -> None:
+def test_a_blank_image_and_no_points_give_no_tracks() -> None:
     blank, points = wrapped(np.full((120, 480), 90, np.uint8)), grid()
     assert not track(wrapped(texture(6)), blank, points, points, KLT)[1].any()
     there, found = track(blank, blank, np.zeros((0, 2)), np.zeros((0, 2)), KLT)

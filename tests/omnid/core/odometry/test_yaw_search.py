@@ -1,4 +1,4 @@
-"""Turns between two panoramas by circular correlation."""
+"""Yaw hypotheses: circular correlation and the paper's steps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_any_turn_is_found_to_the_column(degrees: float) -> None:
 
 
 def test_a_turn_to_the_left_is_positive_and_moves_the_image_right() -> None:
-    """What stands ahead is on the robot's right after a turn to the left, so right of the middle."""
+    """A point ahead is on the robot's right after a turn to the left, so right of the middle of the panorama."""
     cylinder = Cylinder(480, 120, 60.0)
     T_before_after = se3.exp([0, 0, 0, 0, 0, 0.5])
     ahead = np.array([[2.0, 0, 0]])
@@ -34,7 +34,7 @@ def test_a_turn_to_the_left_is_positive_and_moves_the_image_right() -> None:
     assert correlation_peaks(texture(2), turned(texture(2), round(moved[0, 0])), ALL)[0] == pytest.approx(0.5, abs=0.01)
 
 
-def test_what_turns_with_the_camera_locks_the_peak_at_zero_unless_left_out() -> None:
+def test_structure_fixed_to_the_rig_holds_the_peak_at_zero_unless_left_out() -> None:
     before = np.asarray(texture(3) // 3 + 80, np.uint8)
     after = turned(before, 97)
     strut = np.zeros((120, 480), bool)

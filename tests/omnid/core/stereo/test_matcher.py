@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.stereo.edges import smooth
 from omnid.core.stereo.matcher import METHODS, Matcher, MatchingSettings
-from tests.omnid.core.scenery import PAD_PX, Eyes, texture, turned
+from tests.omnid.core.scenery import PAD_PX, RenderedCameras, texture, turned
 from tests.simulation import make_rig, room
 
 Image = NDArray[np.uint8]
@@ -119,7 +119,7 @@ class RenderedRoom:
 
     def __init__(self, *walls: str) -> None:
         rig = make_rig(size=512, baseline_m=0.2)
-        cameras = Eyes.of(rig, room(3, (2 * self.HALF_M, 2 * self.HALF_M), 0, (*walls, "tiles")))
+        cameras = RenderedCameras.of(rig, room(3, (2 * self.HALF_M, 2 * self.HALF_M), 0, (*walls, "tiles")))
         self._frame = cameras.frame(0, se3.transform(np.eye(3), np.array([0, 0, self.EYE_M])))
         height, width = self._frame.lower.image.shape
         self._shape, self._valid = (height, width), np.zeros((height, width), bool)

@@ -1,4 +1,4 @@
-"""The paper's own ego-motion: its algebra exactly, its trackers, and a short rendered run."""
+"""The paper's ego-motion: its equations, its trackers, step 4 of figure 5, and a short rendered run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
-from tests.omnid.core.scenery import Eyes, motion_errors, texture, turned, wrapped
+from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, turned, wrapped
 from tests.simulation.paths import planar_poses
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def test_the_matrix_is_rz_ry_rx_as_eq_7_writes_it() -> None:
     np.testing.assert_allclose(euler_parameters(euler_matrix(parameters)), parameters, atol=1e-12)
 
 
-def test_the_consensus_is_found_among_liars() -> None:
+def test_the_consensus_set_is_found_among_outliers() -> None:
     a = cloud(100)
     b = se3.apply(MOTION, a) + np.random.default_rng(1).normal(0, 0.005, (100, 3))
     b[:60] = cloud(60, 2)
@@ -56,7 +56,7 @@ def test_the_consensus_is_found_among_liars() -> None:
 
 
 def test_gauss_newton_on_eq_9_finds_the_least_squares() -> None:
-    """Exact without noise from far off, and with noise no small motion makes the sum smaller."""
+    """Exact without noise from a distant start; with noise no small motion makes the sum smaller."""
     a = cloud(40)
     exact = register(a, se3.apply(MOTION, a), MOTION @ se3.exp(np.full(6, 0.1)))
     np.testing.assert_allclose(exact.M, MOTION, atol=1e-8)
@@ -67,15 +67,15 @@ def test_gauss_newton_on_eq_9_finds_the_least_squares() -> None:
         assert ((b - se3.apply(se3.exp(1e-4 * axis) @ M, a)) ** 2).sum() > least
 
 
-def test_the_covariance_is_what_noise_scatters_though_far_points_have_more() -> None:
+def test_the_covariance_matches_the_scatter_though_far_points_are_noisier() -> None:
     a, rng = cloud(80), np.random.default_rng(5)
     sigma = 0.004 * (a**2).sum(axis=1, keepdims=True)
-    errors, said = [], []
+    errors, reported = [], []
     for _ in range(300):
         found = register(a, se3.apply(MOTION, a) + sigma * rng.standard_normal(a.shape), MOTION)
         errors.append(se3.log(found.M @ se3.inverse(MOTION)))
-        said.append(found.covariance)
-    W = np.linalg.inv(np.linalg.cholesky(np.mean(said, axis=0)))
+        reported.append(found.covariance)
+    W = np.linalg.inv(np.linalg.cholesky(np.mean(reported, axis=0)))
     spread = np.sqrt(np.linalg.eigvalsh(W @ np.cov(np.array(errors).T) @ W.T))
     assert spread.min() > 0.7 and spread.max() < 1.3
 
@@ -121,40 +121,40 @@ def test_where_no_turn_finds_enough_the_best_is_taken() -> None:
 
 
 @pytest.fixture(scope="module")
-def frames(cameras: Eyes) -> list[StereoFrame]:
+def frames(cameras: RenderedCameras) -> list[StereoFrame]:
     return [cameras.frame(k, T) for k, T in enumerate(PATH)]
 
 
-def test_a_path_through_a_right_angle(cameras: Eyes, frames: list[StereoFrame]) -> None:
-    motion = PaperOdometry(cameras.model, KltSettings())
+def test_a_path_through_a_right_angle(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    odometry = PaperOdometry(cameras.model, KltSettings())
     for k, frame in enumerate(frames):
-        ego = motion.process(frame, 0.1 if k else 0.0)
-        distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
+        estimate = odometry.process(frame, 0.1 if k else 0.0)
+        distance, angle = motion_errors(estimate.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
         assert distance < 0.025 and angle < 0.01, k
-        assert (ego.state, ego.resets) == (TrackingState.TRACKING, 0)
-    deviations = np.sqrt(np.diag(ego.covariance))
-    assert deviations.min() > 5e-4 and deviations.max() < 0.02
+        assert (estimate.state, estimate.resets) == (TrackingState.TRACKING, 0)
+    sigmas = np.sqrt(np.diag(estimate.covariance))
+    assert sigmas.min() > 5e-4 and sigmas.max() < 0.02
 
 
-def test_the_covariance_accumulates_frame_by_frame(cameras: Eyes, frames: list[StereoFrame]) -> None:
-    motion = PaperOdometry(cameras.model, KltSettings())
-    traces = [np.trace(motion.process(frame, 0.1).covariance[:3, :3]) for frame in frames[:4]]
+def test_the_covariance_accumulates_frame_by_frame(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    odometry = PaperOdometry(cameras.model, KltSettings())
+    traces = [np.trace(odometry.process(frame, 0.1).covariance[:3, :3]) for frame in frames[:4]]
     assert traces[0] == 0 and (np.diff(traces) > 0).all()
 
 
-def test_a_keyframe_is_kept_as_long_as_its_points_agree(cameras: Eyes, frames: list[StereoFrame]) -> None:
-    """So the covariance does not grow from sight to sight, as it does from frame to frame."""
-    motion = PaperOdometry(cameras.model, KltSettings(), reference="keyframe")
-    egos = [motion.process(frame, 0.1 if k else 0.0) for k, frame in enumerate(frames)]
-    for k, ego in enumerate(egos):
-        distance, angle = motion_errors(ego.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
+def test_a_keyframe_is_kept_while_its_points_are_inliers(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    """The covariance then does not grow with every frame."""
+    odometry = PaperOdometry(cameras.model, KltSettings(), reference="keyframe")
+    estimates = [odometry.process(frame, 0.1 if k else 0.0) for k, frame in enumerate(frames)]
+    for k, estimate in enumerate(estimates):
+        distance, angle = motion_errors(estimate.T_odom_rect, se3.inverse(PATH[0]) @ PATH[k])
         assert distance < 0.025 and angle < 0.01, k
     previous = PaperOdometry(cameras.model, KltSettings())
-    kept, carried = egos[3], [previous.process(frame, 0.1) for frame in frames[:4]][3]
+    kept, carried = estimates[3], [previous.process(frame, 0.1) for frame in frames[:4]][3]
     assert np.trace(kept.covariance[:3, :3]) < 0.8 * np.trace(carried.covariance[:3, :3])
 
 
-def test_step_4_refines_a_rough_motion(cameras: Eyes, frames: list[StereoFrame]) -> None:
+def test_step_4_refines_a_rough_motion(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     """Figure 5: KLT started at the predicted features; 15 mm and half a degree off become a few millimetres."""
     pair = frames[1], frames[2]
     truth = se3.inverse(PATH[2]) @ PATH[1]
@@ -166,7 +166,9 @@ def test_step_4_refines_a_rough_motion(cameras: Eyes, frames: list[StereoFrame])
     assert distance < 0.5 * motion_errors(rough, truth)[0]
 
 
-def test_step_4_keeps_the_motion_where_no_features_are_found(cameras: Eyes, frames: list[StereoFrame]) -> None:
+def test_step_4_keeps_the_motion_where_no_features_are_found(
+    cameras: RenderedCameras, frames: list[StereoFrame]
+) -> None:
     motion = Registration(np.eye(4), np.eye(6))
     features = corners(frames[0].lower, frames[0].usable, FEATURES)
     assert refine((frames[0], cameras.darkness(9)), features, motion, cameras.model, KltSettings()) is motion
@@ -174,22 +176,22 @@ def test_step_4_keeps_the_motion_where_no_features_are_found(cameras: Eyes, fram
 
 
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
-def test_darkness_is_lost_and_stays_where_it_was(cameras: Eyes, frames: list[StereoFrame], tracker: str) -> None:
-    motion = PaperOdometry(cameras.model, KltSettings(), tracker)
-    motion.process(frames[0], 0.0)
-    before = motion.process(frames[1], 0.1)
-    into, out = motion.process(cameras.darkness(9), 0.1), motion.process(frames[1], 0.1)
-    for ego in (into, out):
-        assert ego.state == TrackingState.LOST
-        np.testing.assert_array_equal(ego.T_odom_rect, before.T_odom_rect)
+def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: list[StereoFrame], tracker: str) -> None:
+    odometry = PaperOdometry(cameras.model, KltSettings(), tracker)
+    odometry.process(frames[0], 0.0)
+    before = odometry.process(frames[1], 0.1)
+    into, out = odometry.process(cameras.darkness(9), 0.1), odometry.process(frames[1], 0.1)
+    for estimate in (into, out):
+        assert estimate.state == TrackingState.LOST
+        np.testing.assert_array_equal(estimate.T_odom_rect, before.T_odom_rect)
     assert np.trace(out.covariance) > np.trace(into.covariance) > np.trace(before.covariance)
-    again = motion.process(frames[2], 0.1)
+    again = odometry.process(frames[2], 0.1)
     assert again.state == TrackingState.TRACKING
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
 
 
-def test_an_unknown_tracker_or_reference_is_refused(cameras: Eyes) -> None:
+def test_an_unknown_tracker_or_reference_is_refused(cameras: RenderedCameras) -> None:
     with pytest.raises(OmnidError, match="improved, klt, found 'sift'"):
         PaperOdometry(cameras.model, KltSettings(), "sift")
     with pytest.raises(OmnidError, match="previous, keyframe, found 'first'"):
