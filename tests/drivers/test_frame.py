@@ -41,14 +41,14 @@ def padded_rows(pixels: NDArray[Any], padding: int) -> tuple[bytes, int]:
     ],
 )
 @pytest.mark.parametrize("padding", [0, 5])
-def test_colours_are_weighed_as_opencv_does(encoding: str, channels: int, code: int, padding: int) -> None:
+def test_converts_colours_with_opencvs_weights(encoding: str, channels: int, code: int, padding: int) -> None:
     pixels = np.ascontiguousarray(COLOURS[..., :channels])
     data, step = padded_rows(pixels, padding)
     np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), cv2.cvtColor(pixels, code))
 
 
 @pytest.mark.parametrize("padding", [0, 3])
-def test_mono8_is_taken_as_it_is(padding: int) -> None:
+def test_does_not_change_mono8(padding: int) -> None:
     data, step = padded_rows(COLOURS[..., 0], padding)
     np.testing.assert_array_equal(gray(frame("mono8", memoryview(data), step=step)), COLOURS[..., 0])
 
@@ -60,7 +60,7 @@ def test_luma_of_packed_colours_is_every_second_byte(encoding: str, luma: int, p
     np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), COLOURS[..., luma])
 
 
-def test_packed_colours_agree_with_opencvs_reading() -> None:
+def test_packed_colours_agree_with_opencv() -> None:
     even = np.ascontiguousarray(COLOURS[:, :36, :2])
     for encoding, code in (("yuyv", cv2.COLOR_YUV2GRAY_YUYV), ("uyvy", cv2.COLOR_YUV2GRAY_UYVY)):
         np.testing.assert_array_equal(gray(frame(encoding, even.tobytes(), width=36)), cv2.cvtColor(even, code))
@@ -73,7 +73,7 @@ def test_luma_of_nv12_is_its_first_plane(padding: int) -> None:
     np.testing.assert_array_equal(gray(frame("nv12", data + chroma, step=step)), COLOURS[..., 0])
 
 
-def test_a_jpeg_of_a_camera_that_sends_no_huffman_tables_decodes() -> None:
+def test_decodes_jpeg_without_huffman_tables() -> None:
     """Motion JPEG leaves the standard tables out (USB Video Class 1.5, payload of MJPEG, 3.1)."""
     data, bare, at = encoded(".jpg"), b"\xff\xd8", 2
     while data[at + 1] != 0xDA:
@@ -107,7 +107,7 @@ def test_compressed_images_and_the_padding_of_cameras(suffix: str, padding: int)
     np.testing.assert_array_equal(gray(Frame(0, 0, "upper", encoding, data + bytes(padding))), expected)
 
 
-def test_an_orientation_in_exif_does_not_turn_the_image() -> None:
+def test_ignores_the_exif_orientation() -> None:
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     data = encoded(".jpg")
     turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:]
@@ -117,7 +117,7 @@ def test_an_orientation_in_exif_does_not_turn_the_image() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", "mono8", "mono16", "bgr8", "rgba8", "yuyv", "uyvy", "nv12"])
-def test_the_image_is_read_only_and_nobody_can_change_it_later(encoding: str) -> None:
+def test_the_image_is_read_only_and_independent_of_the_buffer(encoding: str) -> None:
     buffer = np.frombuffer(encoded(".jpg") if encoding == "jpeg" else COLOURS.tobytes(), np.uint8).copy()
     image = gray(frame(encoding, buffer))
     before = image.copy()
@@ -127,14 +127,14 @@ def test_the_image_is_read_only_and_nobody_can_change_it_later(encoding: str) ->
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_cut_image_is_broken_wherever_it_is_cut(suffix: str) -> None:
+def test_detects_truncation_at_any_byte(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
         with pytest.raises(FrameDecodeError):
             gray(frame(encoding, data[:size]))
 
 
-def test_the_padding_does_not_hide_a_cut() -> None:
+def test_detects_truncation_before_padding() -> None:
     with pytest.raises(FrameDecodeError, match="end is missing"):
         gray(frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)))
 
@@ -158,14 +158,14 @@ def test_the_padding_does_not_hide_a_cut() -> None:
         (frame("mono8", np.zeros((HEIGHT, 2 * WIDTH), np.uint8)[:, ::2]), "contiguous"),
     ],
 )
-def test_malformed_frames_are_broken_in_one_line(broken: Frame, reason: str) -> None:
+def test_refuses_malformed_frames_in_one_line(broken: Frame, reason: str) -> None:
     with pytest.raises(FrameDecodeError, match=reason) as caught:
         gray(broken)
     assert "\n" not in str(caught.value) and "lower frame 7" in str(caught.value)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_an_absurd_size_is_refused_before_it_is_decoded(suffix: str) -> None:
+def test_refuses_an_excessive_size_before_decoding(suffix: str) -> None:
     data = bytearray(encoded(suffix))
     if suffix == ".png":
         data[16:24] = struct.pack(">II", 60000, 60000)
@@ -177,7 +177,7 @@ def test_an_absurd_size_is_refused_before_it_is_decoded(suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_damaged_images_decode_or_are_broken_and_nothing_else(suffix: str) -> None:
+def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
     chance, whole = random.Random(3), encoded(suffix)
     for _ in range(300):
         data = bytearray(whole)

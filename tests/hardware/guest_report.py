@@ -1,4 +1,4 @@
-"""A pytest run in a guest, told of out here test by test."""
+"""Runs pytest in a guest and reports the result of each test to the host."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ FOLDER = "tests/hardware/guest"
 
 
 def names_in(script: str) -> list[str]:
-    """The tests of a script of the guest, in their order."""
+    """Return the tests of a script of the guest, in their order."""
     tree = ast.parse((Path(__file__).with_name("guest") / script).read_text("utf-8"))
     return [entry.name for entry in tree.body
             if isinstance(entry, ast.FunctionDef) and entry.name.startswith("test_")]
 
 
 def run_tests(script: str, guest: Guest, *options: str) -> Result:
-    """Runs a script of the guest by pytest there."""
+    """Run a script with pytest in the guest."""
     report = "--junitxml=/mnt/job/results/report.xml"
     command = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10", report, *options]
     return run_in_vm([*command, f"{FOLDER}/{script}"], guest)
 
 
 def passed(result: Result, name: str) -> None:
-    """AssertionError with the guest's own words unless the test was run there, with all its parameters, and passed."""
+    """Raise AssertionError, with the output of the guest, unless the test ran there and passed with all parameters."""
     cases = [case for case in ElementTree.fromstring(result.files["report.xml"]).iter("testcase")
              if str(case.get("name")).partition("[")[0] == name]
     assert cases, f"it was not run:\n{result.output[-4000:]}"

@@ -2,7 +2,7 @@
 
 A stock Debian kernel with the virtual cameras vivid and v4l2loopback, and a minimal Debian with systemd, udev and the
 daemon's own dependencies in the versions that are installed here. Build it by `python -m tests.hardware.image` (root,
-network, a few minutes); whoever finds it in the cache needs neither.
+network, a few minutes); a cached image needs neither.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 ROOTFS = Path(__file__).with_name("rootfs")
-RECIPE = 1  # to be raised when the functions below make another image of the same constants
+RECIPE = 1  # raise it when the functions below build another image from the same constants
 SUITE = "bookworm"
 PACKAGES = ("systemd", "systemd-sysv", "udev", "dbus", "libnss-systemd", "python3", "v4l-utils", "kmod", "procps",
             "busybox-static")
 GUEST_MODULES = ("v4l2loopback", "vivid", "uvcvideo", "vhci-hcd", "softdog", "9p", "9pnet_virtio", "autofs4")
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic", "9pnet_virtio", "9p")
-# what a guest without a screen, a clock server or a second boot only waits for
+# units that only delay a guest without a screen, a time server or a second boot
 MASKED = ("systemd-timesyncd.service", "systemd-logind.service", "systemd-random-seed.service",
           "systemd-update-utmp.service", "systemd-update-utmp-runlevel.service", "systemd-remount-fs.service",
           "systemd-pcrphase.service", "systemd-pcrphase-sysinit.service", "apt-daily.timer", "apt-daily-upgrade.timer",
@@ -40,12 +40,12 @@ BUILD_TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "depmod": "kmo
                "busybox": "busybox-static", "gcc-12": "gcc-12", "xz": "xz-utils"}
 
 
-class NoImage(Exception):  # noqa: N818 - it is told of the image, not of the program
-    """The image is not there and cannot be built here; the message says what to install or to run."""
+class ImageUnavailableError(Exception):
+    """The image does not exist and cannot be built here; the message names what to install or to run."""
 
 
-class BuildFailed(Exception):  # noqa: N818 - as above
-    """A step of the build went wrong."""
+class BuildError(Exception):
+    """A step of the build failed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,22 +56,25 @@ class Image:
 
     @property
     def kernel(self) -> Path:
-        """Unpacked, since the emulator would take seconds to unpack it."""
+        """The kernel, unpacked, since the emulator would need seconds to unpack it."""
         return self.folder / "vmlinux"
 
     @property
     def initramfs(self) -> Path:
-        """Finds the disk and hands over."""
+        """The initramfs, which mounts the disk."""
         return self.folder / "initramfs.cpio"
 
     @property
     def disk(self) -> Path:
-        """An ext4 file system; guests write to a snapshot of it."""
+        """The ext4 file system; guests write to a snapshot of it."""
         return self.folder / "root.ext4"
 
 
 def image() -> Image:
-    """The image for this kernel, these dependencies and this recipe, cached or built now; NoImage if neither."""
+    """Return the image for this kernel, these dependencies and this recipe, cached or built now.
+
+    Raises ImageUnavailableError where neither is possible.
+    """
     _require(TOOLS)
     pins, kernel = pinned(), kernel_package()
     folder = cache_folder() / f"{kernel.removeprefix('linux-image-')}-{_digest(pins)}"
@@ -82,30 +85,30 @@ def image() -> Image:
 
 
 def cache_folder() -> Path:
-    """$OMNID_VM_CACHE, else omnid-vm where the user's caches are."""
+    """Return $OMNID_VM_CACHE, else omnid-vm in the user's cache folder."""
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(os.environ.get("OMNID_VM_CACHE") or caches / "omnid-vm")
 
 
 def pinned() -> list[str]:
-    """The daemon's dependencies, and pytest, as they are installed here."""
+    """Return the daemon's dependencies, and pytest, in the versions installed here."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     names = [re.split(r"[^\w.-]", entry)[0] for entry in project["dependencies"]] + ["pytest"]
     return sorted(f"{name}=={version(name)}" for name in names)
 
 
 def kernel_package() -> str:
-    """The package that linux-image-amd64 stands for today, or the one that is cached where apt cannot say."""
+    """Return the package that linux-image-amd64 depends on, or the cached one where apt does not know it."""
     known = _run("apt-cache", "depends", "linux-image-amd64", check=False) if shutil.which("apt-cache") else ""
     names = re.findall(r"Depends: (linux-image-[\w.-]+)", known)
     names += [f"linux-image-{path.parent.name.rpartition('-')[0]}" for path in cache_folder().glob("*/root.ext4")]
     if not names:
-        raise NoImage("apt knows no linux-image-amd64: run `apt-get update` on a Debian machine")
+        raise ImageUnavailableError("apt knows no linux-image-amd64: run `apt-get update` on a Debian machine")
     return names[0]
 
 
 def _digest(pins: Iterable[str]) -> str:
-    """Eight letters that change with what the image holds."""
+    """Return eight letters that change with the content of the image."""
     digest = hashlib.sha256(repr((RECIPE, *pins, PACKAGES, GUEST_MODULES, BOOT_MODULES, MASKED)).encode())
     for path in sorted(path for path in ROOTFS.rglob("*") if path.is_file()):
         digest.update(path.read_bytes())
@@ -115,17 +118,18 @@ def _digest(pins: Iterable[str]) -> str:
 def _require(tools: dict[str, str]) -> None:
     missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
     if missing:
-        raise NoImage(f"missing tools: apt-get install {' '.join(missing)}")
+        raise ImageUnavailableError(f"missing tools: apt-get install {' '.join(missing)}")
 
 
 def _require_build() -> None:
     _require(BUILD_TOOLS)
     if os.geteuid() != 0:
-        raise NoImage(f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`")
+        raise ImageUnavailableError(f"no image in {cache_folder()}: build it once by "
+                                    f"`sudo {sys.executable} -m tests.hardware.image`")
 
 
 def _build(folder: Path, kernel: str, pins: list[str]) -> None:
-    """Everything in a folder beside the final one, so that a build that was cut short leaves nothing to be found."""
+    """Build in a temporary folder and rename it, so that an aborted build leaves no incomplete image."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="build-", dir=folder.parent) as name:
         work = Path(name)
@@ -141,7 +145,7 @@ def _build(folder: Path, kernel: str, pins: list[str]) -> None:
 
 
 def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
-    """The kernel's packages unpacked, with v4l2loopback built against its headers."""
+    """Unpack the kernel's packages and build v4l2loopback with its headers; return the folder."""
     debs, tree = work / "debs", work / "kernel"
     debs.mkdir()
     common = release.rsplit("-", 1)[0]
@@ -151,7 +155,7 @@ def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
     for deb in debs.iterdir():
         _run("dpkg", "-x", deb, tree)
     headers = tree / f"usr/src/linux-headers-{release}"
-    makefile = headers / "Makefile"  # includes the common headers by where they would be installed
+    makefile = headers / "Makefile"  # includes the common headers by their installed path
     makefile.write_text(makefile.read_text("utf-8").replace("/usr/src/", f"{tree}/usr/src/"), "utf-8")
     source = next((tree / "usr/src").glob("v4l2loopback-*"))
     _run("make", "-s", "-C", headers, f"M={source}", "modules")
@@ -185,7 +189,7 @@ def _write_root(root: Path, tree: Path, release: str, pins: list[str]) -> None:
 
 
 def _write_initramfs(work: Path, tree: Path, release: str) -> None:
-    """busybox, the drivers of the disk in the order they need each other, and `init`."""
+    """Write busybox, the drivers of the disk in the order of their dependencies, and `init`."""
     initramfs = work / "initramfs"
     for name in ("bin", "proc", "sys", "dev", "mnt", "modules"):
         (initramfs / name).mkdir(parents=True)
@@ -203,7 +207,7 @@ def _write_initramfs(work: Path, tree: Path, release: str) -> None:
 
 
 def _with_needed(tree: Path, release: str, names: Iterable[str]) -> Iterator[Path]:
-    """The files of the modules, each after those it depends on, none twice."""
+    """Return the files of the modules, each after its dependencies, without duplicates."""
     seen: dict[Path, None] = {}
     for name in names:
         lines = _run("modprobe", "-d", tree, "-S", release, "--show-depends", name).splitlines()
@@ -212,16 +216,16 @@ def _with_needed(tree: Path, release: str, names: Iterable[str]) -> Iterator[Pat
 
 
 def _apt_sources() -> str:
-    """This machine's own apt sources, so that a mirror that is configured here is used."""
+    """Return this machine's apt sources, so that a mirror configured here is used."""
     places = [Path("/etc/apt/sources.list"), *sorted(Path("/etc/apt/sources.list.d").glob("*.sources"))]
     return next((str(path) for path in places if path.is_file() and path.stat().st_size), "")
 
 
 def _unpacked(kernel: bytes) -> bytes:
-    """The ELF file within a bzImage, which QEMU starts by its PVH entry."""
+    """Return the ELF file in a bzImage, which QEMU starts by its PVH entry."""
     elf = lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(kernel[kernel.index(b"\xfd7zXZ\0") :])
     if not elf.startswith(b"\x7fELF"):
-        raise BuildFailed("the kernel is not packed by xz as Debian's is")
+        raise BuildError("the kernel is not packed by xz as Debian's is")
     return elf
 
 
@@ -229,7 +233,7 @@ def _run(*command: object, cwd: Path | None = None, check: bool = True) -> str:
     words = [str(word) for word in command]
     done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False)
     if check and done.returncode:
-        raise BuildFailed(f"{' '.join(words)[:200]} ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+        raise BuildError(f"{' '.join(words)[:200]} ended with {done.returncode}: {done.stderr.strip()[-500:]}")
     return done.stdout
 
 

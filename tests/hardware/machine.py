@@ -1,4 +1,4 @@
-"""A throw-away Debian guest with virtual cameras and UARTs, in which a command runs on a copy of the project."""
+"""A temporary Debian guest with virtual cameras and UARTs that runs a command on a copy of the project."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ KERNEL_OPTIONS = ("console=ttyS0 quiet panic=-1 tsc=reliable no_timer_check miti
 PANIC = "Kernel panic - not syncing"
 
 
-class GuestFailed(Exception):  # noqa: N818 - it is told of the guest, not of the program
-    """The guest ended without a result: its kernel panicked, or its time was over."""
+class GuestError(Exception):
+    """The guest ended without a result: by a kernel panic, or at the timeout."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guest:
-    """What a guest is made of.
+    """Configuration of a guest.
 
-    `files` are put into /mnt/job; the folder `share` is seen read-only as /mnt/share. /dev/ttyS1, ttyS2 and ttyS3 lead
-    to `serial`, in the words of QEMU's -serial: "unix:/path" for a socket that the caller listens on, "pty", "null".
+    `files` are copied to /mnt/job; the folder `share` is mounted read-only at /mnt/share. /dev/ttyS1, ttyS2 and ttyS3
+    are connected to `serial`, as QEMU's -serial: "unix:/path" for a socket on which the caller listens, "pty", "null".
     """
 
     systemd: bool = False  # PID 1; else only udev runs
@@ -41,19 +41,19 @@ class Guest:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How a command ended in the guest."""
+    """Result of a command in the guest."""
 
     code: int
     output: str  # stdout and stderr
-    console: str  # the kernel's words
-    files: Mapping[str, bytes]  # what lies in /mnt/job/results
+    console: str  # output of the kernel
+    files: Mapping[str, bytes]  # content of /mnt/job/results
     elapsed_s: float
 
 
 def run_in_vm(command: Sequence[str], guest: Guest | None = None) -> Result:
-    """Runs the command in the guest, in /opt/omnid, a copy of the project, and gives what came of it.
+    """Run a command in the guest, in /opt/omnid, a copy of the project, and return its result.
 
-    GuestFailed where the guest panicked or took too long; NoImage where there is no QEMU or no image.
+    GuestError where the guest panicked or took too long; ImageUnavailableError without QEMU or an image.
     """
     guest = guest or Guest()
     with tempfile.TemporaryDirectory(prefix="omnid-guest-") as name:
@@ -82,9 +82,9 @@ def _write_job(job: Path, command: Sequence[str], guest: Guest) -> None:
 
 
 def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
-    """The emulator by software alone: where KVM is offered within another machine, Debian's kernel may hang in it.
+    """Return QEMU's command line, without KVM: where it is nested in another machine, Debian's kernel may hang.
 
-    Without AVX2, which QEMU 7.2 emulates wrongly: numpy's argsort gives a wrong order by it, or crashes.
+    AVX2 is off, since QEMU 7.2 emulates it wrongly: numpy's argsort returns a wrong order with it, or crashes.
     """
     words = ["qemu-system-x86_64", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max,-avx2", "-smp", "2"]
     words += ["-m", str(guest.memory_mb), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
@@ -100,7 +100,7 @@ def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
 
 
 def _emulate(words: list[str], timeout_s: float) -> str:
-    """What the console said; after timeout_s the machine is switched off."""
+    """Run the machine for at most timeout_s and return the output of its console."""
     try:
         done = subprocess.run(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                               timeout=timeout_s, check=False)
@@ -113,6 +113,6 @@ def _result(job: Path, console: str, elapsed_s: float) -> Result:
     output = (job / "output").read_text("utf-8", "replace") if (job / "output").exists() else ""
     if not (job / "code").exists():
         reason = "the guest's kernel panicked" if PANIC in console else "the guest did not come to an end"
-        raise GuestFailed(f"{reason} after {elapsed_s:.0f} s\n{console[-4000:]}\n{output[-20000:]}")
+        raise GuestError(f"{reason} after {elapsed_s:.0f} s\n{console[-4000:]}\n{output[-20000:]}")
     files = {path.name: path.read_bytes() for path in (job / "results").iterdir() if path.is_file()}
     return Result(int((job / "code").read_text("ascii")), output, console, files, elapsed_s)

@@ -1,4 +1,4 @@
-"""The camera driver on real kernel devices: guest/cameras.py in one guest, each of its tests told of here by itself."""
+"""The camera driver on real kernel devices: guest/cameras.py in one guest, each of its tests reported here."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The whole of `omnid run` under its unit: guest/daemon.py in one guest, each of its tests told of here by itself.
+"""`omnid run` under its unit: guest/daemon.py in one guest, each of its tests reported here.
 
-The images are those of the sample log, shown by two loopback cameras; ttyS1 leads to a controller out here.
+The images of the sample log come from two loopback cameras; ttyS1 is connected to a simulated controller on the host.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ SAMPLE = ROOT / "omnid/sample/log.mcap"
 STEP_S = 0.01
 
 
-class Controller:
-    """A base at the far end of ttyS1, whose state is told to whoever sends a line over ttyS2."""
+class SimulatedBoard:
+    """A simulated controller at the other end of ttyS1; it reports its state for each line received from ttyS2."""
 
     def __init__(self, folder: Path) -> None:
         self.serial = tuple(f"unix:{folder / name}" for name in ("wheels", "questions"))
         self._line = SimulatedLine()
-        self._fastest_mps = 0.0  # that a wheel was told since the last question
+        self._fastest_mps = 0.0  # highest commanded speed of a wheel since the last report
         self._listeners = [_listener(folder / name) for name in ("wheels", "questions")]
         self._halt = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread; for a guest that never came, too."""
+        """End the thread, also where no guest was connected."""
         self._halt.set()
         self._thread.join()
         for listener in self._listeners:
@@ -58,7 +58,7 @@ class Controller:
     def _serve(self) -> None:
         answers: dict[socket.socket, Callable[[bytes], bytes]] = {}
         last_s = time.monotonic()
-        listeners = dict(zip(self._listeners, (self._obey, self._tell), strict=True))
+        listeners = dict(zip(self._listeners, (self._receive, self._report), strict=True))
         with ExitStack() as ends:
             while not self._halt.is_set():
                 readable, _, _ = select.select([*listeners, *answers], [], [], STEP_S)
@@ -73,12 +73,12 @@ class Controller:
                     else:
                         del answers[port]
 
-    def _obey(self, data: bytes) -> bytes:
+    def _receive(self, data: bytes) -> bytes:
         answer = self._line.feed(data)
         self._fastest_mps = max(self._fastest_mps, *map(abs, self._line.base.commanded_mps))
         return answer
 
-    def _tell(self, data: bytes) -> bytes:
+    def _report(self, data: bytes) -> bytes:
         if b"\n" not in data:
             return b""
         base = self._line.base
@@ -97,9 +97,9 @@ def _listener(path: Path) -> socket.socket:
 
 
 @contextmanager
-def controller(folder: Path) -> Iterator[Controller]:
-    """A controller, while it is wanted."""
-    made = Controller(folder)
+def simulated_board(folder: Path) -> Iterator[SimulatedBoard]:
+    """Yield a simulated board and close it."""
+    made = SimulatedBoard(folder)
     try:
         yield made
     finally:
@@ -107,7 +107,7 @@ def controller(folder: Path) -> Iterator[Controller]:
 
 
 def rig_of_the_sample() -> bytes:
-    """Its rig with the rims in it, which a daemon would look for in the first images."""
+    """Return the rig of the sample log with the rims of the mirrors, which a daemon detects in the first images."""
     reader = LogReader(SAMPLE)
     try:
         rig = attached_rig(reader, SAMPLE)
@@ -120,7 +120,7 @@ def rig_of_the_sample() -> bytes:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    with controller(tmp_path_factory.mktemp("ports")) as base:
+    with simulated_board(tmp_path_factory.mktemp("ports")) as base:
         guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=900)
         return run_tests(SCRIPT, guest, "-x")
 
@@ -135,15 +135,15 @@ def omnid(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_what_was_recorded_until_the_kill_is_made_whole(result: Result, tmp_path: Path) -> None:
-    """Nothing older than two seconds before the newest pose that was heard is lost."""
+def test_recovers_the_recording_of_a_killed_daemon(result: Result, tmp_path: Path) -> None:
+    """All images older than two seconds before the newest received pose are recovered."""
     cut, whole = tmp_path / "killed.mcap.part", tmp_path / "killed.mcap"
     cut.write_bytes(result.files["killed.mcap.part"])
     assert omnid("log", "info", cut).returncode == 1
-    mended = omnid("log", "recover", cut)
-    assert mended.returncode == 0, mended.stderr
+    recovered = omnid("log", "recover", cut)
+    assert recovered.returncode == 0, recovered.stderr
     assert omnid("log", "info", whole).returncode == 0
     guest = json.loads(result.files["killed.json"])
     found = LogImages.load(whole)
-    for eye in (found.lower, found.upper):
-        assert len(eye) > 5 and guest["killed_ns"] - eye[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000
+    for images in (found.lower, found.upper):
+        assert len(images) > 5 and guest["killed_ns"] - images[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000

@@ -1,4 +1,4 @@
-"""The guest itself: what goes in comes out, and what goes wrong is told apart."""
+"""The guest itself: its input, its results, and its failures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hardware.machine import Guest, GuestFailed, run_in_vm
+from tests.hardware.machine import Guest, GuestError, run_in_vm
 
 pytestmark = pytest.mark.vm
 SCRIPT = b"""
@@ -37,18 +37,18 @@ def test_a_guest_with_systemd_a_serial_port_and_files(tmp_path: Path) -> None:
 
 
 def _shout(listener: socket.socket) -> None:
-    """Sends everything back in capitals."""
+    """Send everything back in capitals."""
     port, _ = listener.accept()
     with port:
         while data := port.recv(100):
             port.sendall(data.upper())
 
 
-def test_a_kernel_that_panics_is_told_of() -> None:
-    with pytest.raises(GuestFailed, match="kernel panicked"):
+def test_a_kernel_panic_is_an_error() -> None:
+    with pytest.raises(GuestError, match="kernel panicked"):
         run_in_vm(["sh", "-c", "echo before; echo c >/proc/sysrq-trigger; sleep 60"])
 
 
-def test_a_command_without_end_is_told_of() -> None:
-    with pytest.raises(GuestFailed, match=r"did not come to an end(.|\n)*before"):
+def test_a_command_without_end_is_an_error() -> None:
+    with pytest.raises(GuestError, match=r"did not come to an end(.|\n)*before"):
         run_in_vm(["sh", "-c", "echo before; sleep 600"], Guest(timeout_s=45))

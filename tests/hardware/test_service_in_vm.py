@@ -1,4 +1,4 @@
-"""The unit under a real systemd: guest/service.py in one guest, each of its tests told of here by itself."""
+"""The unit under a real systemd: guest/service.py in one guest, each of its tests reported here."""
 
 from __future__ import annotations
 

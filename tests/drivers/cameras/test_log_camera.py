@@ -1,4 +1,4 @@
-"""A log in the place of two cameras: in time, in step however long it runs, and nothing kept back."""
+"""A log that replaces two cameras: timing, synchronisation over many passes, dropped frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def recorded(scene: Path) -> LogImages:
 
 
 def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
-    """The schedule of a camera at pace 1, without waiting for it."""
+    """Return the due times of a camera at pace 1 [ns], without waiting."""
     return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, 0)._schedule(), count)]
 
 
@@ -54,16 +54,16 @@ def test_no_frame_comes_before_its_stamp(recorded: LogImages) -> None:
     assert camera.state.status == "streaming" and camera.state.frames + camera.state.drops >= 2 * PAIRS + 5
 
 
-def test_forwards_and_backwards_in_even_steps(recorded: LogImages) -> None:
+def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> None:
     passes = 6
     lower, upper = (stamps(recorded, name, passes * PAIRS) for name in ("lower", "upper"))  # type: ignore[arg-type]
     steps_ns = [b - a for a, b in pairwise(lower)]
     assert min(steps_ns) > 80e6 and max(steps_ns) < 120e6
     apart_ns = [abs(a - b) for a, b in zip(lower, upper, strict=True)]
-    assert max(apart_ns) < 5e6, "both cameras turn at once"
+    assert max(apart_ns) < 5e6, "both cameras reverse at the same time"
 
 
-def test_cameras_stay_in_step_though_one_has_lost_images(tmp_path: Path, scene: Path) -> None:
+def test_cameras_stay_synchronised_where_one_has_lost_images(tmp_path: Path, scene: Path) -> None:
     taken = [p for p in images(scene / "log.mcap") if not (p.camera == "upper" and p.pair in (3, 4, 5, 6, 7))]
     holed = LogImages.load(save(tmp_path / "holed.mcap", taken))
     lower, upper = stamps(holed, "lower", 20 * PAIRS), stamps(holed, "upper", 20 * (PAIRS - 5))
@@ -72,7 +72,7 @@ def test_cameras_stay_in_step_though_one_has_lost_images(tmp_path: Path, scene: 
     assert max(nearest_ns) < 5e6
 
 
-def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: LogImages) -> None:
+def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
     frames = camera.frames()
     first = next(frames)
@@ -82,7 +82,7 @@ def test_what_is_not_taken_in_time_is_left_out_and_counted(recorded: LogImages) 
     assert camera.state.drops == later.seq - first.seq - 1 > 0
 
 
-def test_what_was_due_before_the_camera_was_made_is_not_a_drop(recorded: LogImages) -> None:
+def test_frames_due_before_construction_are_not_drops(recorded: LogImages) -> None:
     camera = LogCamera(recorded, "lower", time.monotonic_ns() - 10**9, pace=FAST)
     first = next(camera.frames())
     assert first.seq > 10 and camera.state.drops == 0
@@ -100,12 +100,12 @@ def test_close_ends_a_wait(recorded: LogImages) -> None:
 
 
 @pytest.mark.parametrize("pace", [0.0, -1.0, float("nan"), float("inf"), 1e-300])
-def test_a_pace_that_is_none_is_refused(recorded: LogImages, pace: float) -> None:
+def test_refuses_an_invalid_pace(recorded: LogImages, pace: float) -> None:
     with pytest.raises(DriverError, match="pace"):
         LogCamera(recorded, "lower", 0, pace=pace)
 
 
-def test_logs_that_show_nothing_are_refused(tmp_path: Path, scene: Path) -> None:
+def test_refuses_logs_without_images(tmp_path: Path, scene: Path) -> None:
     taken: list[Image] = images(scene / "log.mcap")
     few = [p for p in taken if p.camera == "lower" or p.pair == 0]
     with pytest.raises(DriverError, match="24 images of the lower and 1 of the upper"):

@@ -1,4 +1,4 @@
-"""Cameras found in trees of the same make as /sys and /dev, and opened where there is none."""
+"""Cameras found in trees with the layout of /sys and /dev, and devices that cannot be opened."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PORT = "pci-0000:00:14.0-usb-0:1:1.0"
 
 
 def plug(root: Path, node: str, *, name: str, port: str, index: int = 0) -> None:
-    """A camera as the kernel shows it; what answers to it is an ordinary file."""
+    """Create the entries of a camera as the kernel does; its device is an ordinary file."""
     device = root / "sys/devices" / port
     device.mkdir(parents=True, exist_ok=True)
     (root / "sys/bus/usb/drivers/uvcvideo").mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def link(root: Path, folder: str, name: str, node: str) -> None:
 
 @pytest.fixture
 def two_webcams(tmp_path: Path) -> Path:
-    """Two cameras of a kind, each with a node for metadata, and a newer udev that names a port twice."""
+    """Two cameras of one model, each with a metadata node, and the links of a newer udev, two for a port."""
     for number, port in ((2, PORT), (10, PORT.replace("0:1:", "0:2:"))):
         plug(tmp_path, f"video{number}", name="HD Webcam", port=port)
         plug(tmp_path, f"video{number + 1}", name="HD Webcam", port=port, index=1)
@@ -52,7 +52,7 @@ def two_webcams(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_cameras_are_found_by_number_without_their_metadata_nodes(two_webcams: Path) -> None:
+def test_finds_cameras_by_number_without_metadata_nodes(two_webcams: Path) -> None:
     found = capture_devices(two_webcams)
     assert [(device.node, device.name, device.driver) for device in found] == [
         ("/dev/video2", "HD Webcam", "uvcvideo"), ("/dev/video10", "HD Webcam", "uvcvideo"),
@@ -61,20 +61,20 @@ def test_cameras_are_found_by_number_without_their_metadata_nodes(two_webcams: P
     assert found[1].by_id == "/dev/v4l/by-id/usb-Maker_HD_Webcam-video-index0"
 
 
-def test_what_cannot_be_asked_says_why(two_webcams: Path) -> None:
+def test_reports_why_a_device_cannot_be_queried(two_webcams: Path) -> None:
     (two_webcams / "dev/video10").unlink()
     first, second = capture_devices(two_webcams)
     assert "is not a video device" in first.problem and "is not there" in second.problem
 
 
-def test_the_rules_name_the_ports(two_webcams: Path) -> None:
+def test_rules_match_the_ports(two_webcams: Path) -> None:
     rules = list(udev_rules(capture_devices(two_webcams)))
     expected = f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{PORT}", SYMLINK+="omnid/lower"'
     assert rules[0] == expected
     assert 'usb-0:2:1.0", SYMLINK+="omnid/upper"' in rules[1] and len(rules) == 2
 
 
-def test_cameras_on_one_port_are_told_apart_by_name(tmp_path: Path) -> None:
+def test_rules_distinguish_cameras_on_one_port_by_name(tmp_path: Path) -> None:
     for number in (0, 1):
         plug(tmp_path, f"video{number}", name=f"vivid-00{number}-vid-cap", port="platform-vivid.0")
     link(tmp_path, "by-path", "platform-vivid.0-video-index0", "video1")
@@ -85,7 +85,7 @@ def test_cameras_on_one_port_are_told_apart_by_name(tmp_path: Path) -> None:
     assert 'ATTR{name}=="vivid-001-vid-cap"' in rules[1]
 
 
-def test_the_modes_are_a_line_for_each_format() -> None:
+def test_description_has_a_line_for_each_format() -> None:
     one, any_of = Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0, 14.985)), SizeRange(16, 64)
     offered = (one, one, Mode("GREY", any_of, any_of))
     device = CaptureDevice("/dev/video0", "HD Webcam", "uvcvideo", "usb-0", "/by/path", "", "p", offered)
@@ -95,7 +95,7 @@ def test_the_modes_are_a_line_for_each_format() -> None:
     ]  # fmt: skip
 
 
-def test_the_command_lists_them(
+def test_the_command_lists_the_cameras(
     two_webcams: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cameras, "ROOT", two_webcams)
@@ -104,7 +104,7 @@ def test_the_command_lists_them(
     assert "/dev/video2  HD Webcam" in printed and "/etc/udev/rules.d/" in printed and "omnid/upper" in printed
 
 
-def test_no_camera_is_one_line_and_code_1(
+def test_without_a_camera_the_command_prints_one_line_and_exits_with_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cameras, "ROOT", tmp_path)
@@ -113,11 +113,11 @@ def test_no_camera_is_one_line_and_code_1(
     assert printed.out == "" and printed.err.startswith("omnid: no cameras") and printed.err.count("\n") == 1
 
 
-@pytest.mark.parametrize(("name", "said"), [("missing", "is not there"), ("file", "is not a video device")])
-def test_a_device_that_cannot_be_opened_is_refused_in_one_line(tmp_path: Path, name: str, said: str) -> None:
+@pytest.mark.parametrize(("name", "message"), [("missing", "is not there"), ("file", "is not a video device")])
+def test_refuses_a_device_that_cannot_be_opened_in_one_line(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "file").touch()
     before = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(DriverError, match=said) as caught:
+    with pytest.raises(DriverError, match=message) as caught:
         V4l2Camera(V4l2Settings(str(tmp_path / name)), "lower")
     assert "\n" not in str(caught.value) and str(tmp_path / name) in str(caught.value)
     assert len(os.listdir("/proc/self/fd")) <= before

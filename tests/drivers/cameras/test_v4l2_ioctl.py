@@ -1,4 +1,4 @@
-"""Sizes, offsets and numbers against what gcc 12 says of linux/videodev2.h (linux-libc-dev 6.1), with -m64 and -m32."""
+"""Sizes, offsets and numbers compared with gcc 12 and linux/videodev2.h (linux-libc-dev 6.1), with -m64 and -m32."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REQUESTS = {
 
 @pytest.fixture(params=[0, 1], ids=["64 bits", "32 bits"])
 def abi(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any], int]:
-    """The module's names as they are where a long has 64 bits, or 32; and which of them."""
+    """The module's names where a long has 64 or 32 bits, and the index of that case."""
     monkeypatch.setattr(ctypes, "c_long", (ctypes.c_int64, ctypes.c_int32)[request.param])
     return runpy.run_path(v4l2_ioctl.__file__), request.param
 
@@ -44,7 +44,7 @@ def test_the_structures_have_the_kernels_sizes(abi: tuple[dict[str, Any], int]) 
     assert {name: ctypes.sizeof(names[name]) for name in SIZES} == {name: sizes[bits] for name, sizes in SIZES.items()}
 
 
-def test_their_members_lie_where_the_kernel_has_them(abi: tuple[dict[str, Any], int]) -> None:
+def test_the_members_have_the_kernels_offsets(abi: tuple[dict[str, Any], int]) -> None:
     names, bits = abi
     found = {(struct, member): getattr(names[struct], member).offset for struct, member in OFFSETS}
     assert found == {member: offsets[bits] for member, offsets in OFFSETS.items()}
@@ -57,11 +57,11 @@ def test_the_requests_have_the_kernels_numbers(abi: tuple[dict[str, Any], int]) 
     }
 
 
-def test_formats_are_four_letters() -> None:
+def test_converts_formats_to_four_letters() -> None:
     assert v4l2_ioctl.fourcc_code("YUYV") == 0x56595559 and v4l2_ioctl.fourcc_code("Y16") == 0x20363159
     assert v4l2_ioctl.fourcc(0x47504A4D) == "MJPG" and v4l2_ioctl.fourcc(0x20363159) == "Y16"
 
 
-def test_a_file_that_is_no_camera_answers_with_an_error(tmp_path: Any) -> None:
+def test_an_ordinary_file_is_an_error(tmp_path: Any) -> None:
     with open(tmp_path / "file", "w") as file, pytest.raises(OSError, match="ioctl"):
         v4l2_ioctl.call(file.fileno(), v4l2_ioctl.QUERYCAP, v4l2_ioctl.Capability())

@@ -1,4 +1,4 @@
-"""What is asked of a camera: settings, the choice of the format, the plan of the controls."""
+"""Settings of a camera: validation, choice of the format, plan of the controls."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def settings(**fields: Any) -> V4l2Settings:
     [((640, 480), 30, "YUYV"), ((1280, 960), 30, "MJPG"), ((1280, 960), 5, "YUYV"), ((1280, 960), 0, "YUYV"),
      ((1280, 960), 30.1, "MJPG")],
 )  # fmt: skip
-def test_auto_takes_what_needs_no_decoding_if_it_comes_fast_enough(
+def test_auto_prefers_a_format_without_decoding_if_it_is_fast_enough(
     size: tuple[int, int], rate_hz: float, chosen: str
 ) -> None:
     assert choose_format(WEBCAM, "auto", size, rate_hz) == chosen
 
 
-def test_grey_comes_first_and_unknown_rates_are_trusted() -> None:
+def test_prefers_grey_and_accepts_unknown_rates() -> None:
     any_size = SizeRange(16, 4096, 16)
     offered = [Mode(name, any_size, any_size) for name in ("MJPG", "UYVY", "YUYV", "NV12", "GREY")]
     chosen = [choose_format(offered[:count], "auto", (640, 480), 90) for count in range(1, 6)]
@@ -67,7 +67,7 @@ def test_grey_comes_first_and_unknown_rates_are_trusted() -> None:
     ("name", "size", "rate_hz"),
     [("GREY", (640, 480), 30), ("YUYV", (640, 481), 30), ("YUYV", (640, 480), 31), ("auto", (1280, 960), 60)],
 )
-def test_what_is_not_offered_is_refused_with_what_is(name: str, size: tuple[int, int], rate_hz: float) -> None:
+def test_refuses_other_modes_and_lists_those_offered(name: str, size: tuple[int, int], rate_hz: float) -> None:
     with pytest.raises(DriverError, match=r"not offered; choose from: YUYV 640x480 at 30, 15 Hz; .*MJPG") as caught:
         choose_format(WEBCAM, name, size, rate_hz)
     assert "H264" not in str(caught.value) and "\n" not in str(caught.value)
@@ -78,7 +78,7 @@ def test_sizes_come_in_steps() -> None:
     assert 50 in SizeRange(16, 64, 0)
 
 
-def test_by_default_no_control_is_touched() -> None:
+def test_sets_no_control_by_default() -> None:
     assert plan_controls(settings(), OFFERED) == [] and plan_controls(settings(), {}) == []
 
 
@@ -86,14 +86,14 @@ def plan(**fields: Any) -> list[tuple[str, int]]:
     return [(control.name, value) for control, value in plan_controls(settings(**fields), OFFERED)]
 
 
-def test_a_fixed_value_has_its_automatic_switched_off_before() -> None:
+def test_switches_the_automatic_mode_off_before_a_fixed_value() -> None:
     assert plan(exposure_us=10_040, gain=15) == [
         ("auto_exposure", 1), ("exposure_dynamic_framerate", 0), ("gain_automatic", 0),
         ("exposure_time_absolute", 100), ("gain", 15),
     ]  # fmt: skip
 
 
-def test_automatic_exposure_is_the_one_the_camera_has_and_must_not_slow_it() -> None:
+def test_uses_the_cameras_automatic_exposure_and_keeps_the_rate() -> None:
     assert plan(auto_exposure="on") == [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]
     full = {
         AUTO_EXPOSURE: CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})
@@ -101,19 +101,19 @@ def test_automatic_exposure_is_the_one_the_camera_has_and_must_not_slow_it() -> 
     assert plan_controls(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
 
 
-def test_a_fixed_gain_needs_no_automatic_but_a_switched_one_does() -> None:
+def test_a_fixed_gain_needs_no_automatic_mode_but_switching_it_does() -> None:
     only_gain = {GAIN: OFFERED[GAIN]}
     assert plan_controls(settings(gain=15), only_gain) == [(OFFERED[GAIN], 15)]
     with pytest.raises(DriverError, match="no control of its automatic gain"):
         plan_controls(settings(auto_gain="off"), only_gain)
 
 
-def test_other_controls_are_set_by_name() -> None:
+def test_sets_other_controls_by_name() -> None:
     assert plan(power_line="50", controls=("contrast=-3",)) == [("power_line_frequency", 1), ("contrast", -3)]
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"gain": 101}, "gain: 101 was requested, it accepts 0 to 100 in steps of 5"),
         ({"gain": 13}, "steps of 5"),
@@ -125,8 +125,8 @@ def test_other_controls_are_set_by_name() -> None:
         ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: auto_exposure"),
     ],
 )
-def test_a_control_that_the_camera_does_not_take_is_refused(fields: dict[str, Any], said: str) -> None:
-    with pytest.raises(DriverError, match=said) as caught:
+def test_refuses_controls_that_the_camera_does_not_accept(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(DriverError, match=message) as caught:
         plan_controls(settings(**fields), OFFERED)
     assert "\n" not in str(caught.value)
 
@@ -138,7 +138,7 @@ def test_a_control_that_the_camera_does_not_take_is_refused(fields: dict[str, An
      {"gain": -2}, {"controls": ("gain",)}, {"controls": ("gain=high",)}, {"controls": ("=3",)},
      {"auto_gain": "on", "gain": 3}, {"auto_exposure": "on", "exposure_us": 100}, {"auto_focus": "on", "focus": 0}],
 )  # fmt: skip
-def test_settings_that_no_camera_takes_are_refused_in_one_line(fields: dict[str, Any]) -> None:
+def test_refuses_invalid_settings_in_one_line(fields: dict[str, Any]) -> None:
     with pytest.raises(DriverError, match=r"^camera /dev/omnid/lower: (.*) is .*; give ") as caught:
         settings(**fields)
     assert "\n" not in str(caught.value)

@@ -13,7 +13,7 @@ from tests.drivers.logs.mcap_logs import STORE, TYPES, header
 @pytest.mark.parametrize("frame_id", ["", "a", "abc", "lower_optical_frame"])
 @pytest.mark.parametrize("text", ["jpeg", "", "mono8", "bgr8; jpeg compressed bgr8"])
 @pytest.mark.parametrize("size", [0, 1, 6, 1001])
-def test_every_alignment_gives_what_rosbags_gives(little_endian: bool, frame_id: str, text: str, size: int) -> None:
+def test_agrees_with_rosbags_at_every_alignment(little_endian: bool, frame_id: str, text: str, size: int) -> None:
     data = np.random.default_rng(size).integers(0, 256, size, np.uint8)
     stamped = header(1_700_000_000_123_456_789, frame_id)
     messages = {

@@ -80,7 +80,7 @@ def test_a_real_log_gives_every_frame_in_order(name: str, count: int) -> None:
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
 @pytest.mark.parametrize("layout", [{}, {"use_chunking": False}, BARE, BARE | {"use_chunking": False}])
-def test_every_layout_of_the_file_gives_the_same_frames(
+def test_all_file_layouts_give_the_same_frames(
     tmp_path: Path, compression: CompressionType, layout: dict[str, Any]
 ) -> None:
     frames, reader = read(write_log(tmp_path / "log.mcap", pairs(20), compression=compression, **layout))
@@ -133,7 +133,7 @@ def test_sixteen_bits_in_both_byte_orders(tmp_path: Path, order: str, bigendian:
         (".jpg", "", "jpeg"),
     ],
 )
-def test_the_bytes_tell_the_compression(tmp_path: Path, suffix: str, format_: str, encoding: str) -> None:
+def test_first_bytes_decide_the_compression(tmp_path: Path, suffix: str, format_: str, encoding: str) -> None:
     data = compressed(START_NS, cv2.imencode(suffix, np.full((8, 8), 90, np.uint8))[1].tobytes(), format_)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, COMPRESSED, data, 0) for t in (LOWER, UPPER)]))
     assert [frame.encoding for frame in frames] == [encoding] * 2
@@ -146,7 +146,7 @@ def test_other_spellings_of_the_type(tmp_path: Path, name: str) -> None:
     assert places(frames) == in_order(2)
 
 
-def test_a_folder_stands_for_the_one_log_in_it(tmp_path: Path) -> None:
+def test_accepts_a_folder_with_one_log(tmp_path: Path) -> None:
     write_log(tmp_path / "bag_0.mcap", pairs(2))
     assert places(read(tmp_path)[0]) == in_order(2)
     write_log(tmp_path / "bag_1.mcap", pairs(2))
@@ -155,7 +155,7 @@ def test_a_folder_stands_for_the_one_log_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_frames_shuffled_within_the_window_come_out_sorted(tmp_path: Path, seed: int) -> None:
+def test_sorts_frames_within_the_window(tmp_path: Path, seed: int) -> None:
     chance, entries = random.Random(seed), pairs(60)
     moved = sorted(range(len(entries)), key=lambda index: index + chance.uniform(0, 16))
     assert moved != sorted(moved)
@@ -164,14 +164,14 @@ def test_frames_shuffled_within_the_window_come_out_sorted(tmp_path: Path, seed:
     assert not reader.warnings
 
 
-def test_waiting_frames_are_bounded_in_bytes_too() -> None:
+def test_limits_the_bytes_of_waiting_frames() -> None:
     data = memoryview(bytes(64 * 2**20))
     order = ReorderBuffer(32, Counter())
     given = [len(list(order.push("lower", RosImage(stamp, "mono8", data)))) for stamp in range(1, 8)]
     assert given == [0, 0, 0, 0, 1, 1, 1]
 
 
-def test_a_frame_that_comes_after_its_window_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_drops_and_counts_frames_after_their_window(tmp_path: Path) -> None:
     entries = pairs(20)
     frames, reader = read(write_log(tmp_path / "log.mcap", entries[2:] + entries[:2]), window=4)
     assert len(frames) == 38 and reader.counts["late"] == 2
@@ -179,7 +179,7 @@ def test_a_frame_that_comes_after_its_window_is_dropped_and_counted(tmp_path: Pa
     assert "dropped 2 frames" in reader.warnings[0]
 
 
-def test_a_second_frame_with_the_same_stamp_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_drops_and_counts_frames_with_the_same_stamp(tmp_path: Path) -> None:
     entries = pairs(5)
     copy = image(LOWER, entries[4].log_time_ns, 200)
     frames, reader = read(write_log(tmp_path / "log.mcap", [*entries[:5], copy, *entries[5:], entries[9]]))
@@ -193,7 +193,7 @@ def test_both_cameras_may_have_the_same_stamp(tmp_path: Path) -> None:
     assert [(f.camera, f.seq) for f in frames] == [(c, n) for n in range(3) for c in ("lower", "upper")]
 
 
-def test_an_unset_stamp_is_replaced_by_the_time_of_logging(tmp_path: Path) -> None:
+def test_replaces_an_unset_stamp_by_the_log_time(tmp_path: Path) -> None:
     entries = [Entry(e.topic, e.type, compressed(0, jpeg(1)), e.log_time_ns) for e in pairs(3)]
     frames, reader = read(write_log(tmp_path / "log.mcap", entries))
     assert places(frames) == in_order(3)
@@ -201,7 +201,7 @@ def test_an_unset_stamp_is_replaced_by_the_time_of_logging(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("damage", [b"", b"\0\1", b"\0\7\0\0" + bytes(40), b"\0\1\0\0" + b"\xff" * 40])
-def test_a_message_that_is_no_image_is_skipped_and_counted(tmp_path: Path, damage: bytes) -> None:
+def test_skips_and_counts_messages_without_an_image(tmp_path: Path, damage: bytes) -> None:
     entries = pairs(4)
     entries.insert(3, Entry(LOWER, COMPRESSED, damage, START_NS))
     frames, reader = read(write_log(tmp_path / "log.mcap", entries))
@@ -209,13 +209,13 @@ def test_a_message_that_is_no_image_is_skipped_and_counted(tmp_path: Path, damag
     assert reader.counts["broken"] == 1 and len(reader.warnings) == 1
 
 
-def test_other_topics_are_left_alone(tmp_path: Path) -> None:
+def test_ignores_other_topics(tmp_path: Path) -> None:
     noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS + n) for n in range(50)]
     frames, reader = read(write_log(tmp_path / "log.mcap", [*noise, *pairs(5), *noise]))
     assert places(frames) == in_order(5) and reader.counts["broken"] == 0
 
 
-def test_frames_can_be_read_again_and_stop_after_close(tmp_path: Path) -> None:
+def test_reads_frames_repeatedly_and_stops_after_close(tmp_path: Path) -> None:
     reader = LogReader(write_log(tmp_path / "log.mcap", pairs(50)), window=2)
     assert places(list(reader.frames())) == places(list(reader.frames())) == in_order(50)
     stream = reader.frames()
@@ -233,7 +233,7 @@ def test_attachments_with_and_without_a_summary(tmp_path: Path) -> None:
     assert LogReader(path).attachments() == {"rig.toml": b"version = 1", "empty": b""}
 
 
-def test_a_corrupt_attachment_is_not_given(tmp_path: Path) -> None:
+def test_ignores_a_corrupt_attachment(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2), [("rig.toml", b"version = 1"), ("other", b"2")])
     path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
     assert LogReader(path).attachments() == {"other": b"2"}

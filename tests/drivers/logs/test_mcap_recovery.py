@@ -1,4 +1,4 @@
-"""Whole logs out of cut, corrupt and hostile ones."""
+"""Recovery of truncated, corrupt and malicious logs."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ RIG = [("rig.toml", b"version = 1"), ("big", bytes(3 * 2**20))]
 
 
 def messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
-    """What the mcap package itself reads of a whole log, its CRCs checked, in the order of the file."""
+    """Return the messages that the mcap package reads, with CRCs checked, in the order of the file."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         found = reader.iter_messages(log_time_order=False)
         return [(c.topic, m.log_time, m.publish_time, m.sequence, m.data) for _, c, m in found]
 
 
-def mended(path: Path, out: Path) -> Recovery | None:
-    """None where nothing can be saved: then there is no file, and one line that says why."""
+def recovered(path: Path, out: Path) -> Recovery | None:
+    """Recover a log; None where nothing can be recovered: no file is left, and the message has one line."""
     out.unlink(missing_ok=True)
     try:
         found = recover(path, out)
@@ -51,13 +51,13 @@ def mended(path: Path, out: Path) -> Recovery | None:
 
 
 @pytest.mark.parametrize("layout", [*LAYOUTS, BARE | {"use_chunking": False}])
-def test_a_log_cut_anywhere_becomes_whole(tmp_path: Path, layout: dict[str, Any]) -> None:
+def test_recovers_truncated_logs(tmp_path: Path, layout: dict[str, Any]) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(3), RIG[:1], **layout), tmp_path / "out.mcap"
     whole, size = messages(path), path.stat().st_size
     saved = []
     for cut in range(size, 0, -71):
         os.truncate(path, cut)
-        found = mended(path, out)
+        found = recovered(path, out)
         if found is None:
             saved.append(0)
             continue
@@ -69,7 +69,7 @@ def test_a_log_cut_anywhere_becomes_whole(tmp_path: Path, layout: dict[str, Any]
     assert saved == sorted(saved, reverse=True) and saved[0] == 6 and 0 in saved
 
 
-def test_other_readers_take_what_comes_out(tmp_path: Path) -> None:
+def test_other_readers_accept_the_result(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(30), RIG, compression=CompressionType.ZSTD)
     entries = sorted(pairs(30))
     os.truncate(path, path.stat().st_size - 3000)
@@ -87,7 +87,7 @@ def test_other_readers_take_what_comes_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_flipped_bits_never_escape(tmp_path: Path, layout: dict[str, Any]) -> None:
+def test_detects_flipped_bits(tmp_path: Path, layout: dict[str, Any]) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(3), RIG[:1], **layout), tmp_path / "out.mcap"
     whole, expected, chance = path.read_bytes(), set(messages(path)), random.Random(11)
     saved = 0
@@ -96,7 +96,7 @@ def test_flipped_bits_never_escape(tmp_path: Path, layout: dict[str, Any]) -> No
         for _ in range(chance.choice((1, 1, 5))):
             data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
         path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
-        found = mended(path, out)
+        found = recovered(path, out)
         if found is not None and layout.get("use_chunking", True):
             assert {entry[1:] for entry in messages(out)} <= {entry[1:] for entry in expected}  # names have no CRC
         saved += found.messages if found is not None else 0
@@ -104,21 +104,21 @@ def test_flipped_bits_never_escape(tmp_path: Path, layout: dict[str, Any]) -> No
 
 
 @pytest.mark.parametrize("damage", range(20))
-def test_noise_gives_one_line(tmp_path: Path, damage: int) -> None:
+def test_refuses_noise_in_one_line(tmp_path: Path, damage: int) -> None:
     chance = random.Random(damage)
     (tmp_path / "log.mcap").write_bytes(MAGIC * (damage % 2) + chance.randbytes(chance.randrange(2000)))
-    assert mended(tmp_path / "log.mcap", tmp_path / "out.mcap") is None
+    assert recovered(tmp_path / "log.mcap", tmp_path / "out.mcap") is None
 
 
 @pytest.mark.parametrize("inner", HOSTILE.values(), ids=HOSTILE.keys())
-def test_hostile_records_take_no_memory(tmp_path: Path, inner: bytes) -> None:
+def test_wrong_lengths_need_no_memory(tmp_path: Path, inner: bytes) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(2)), tmp_path / "out.mcap"
     whole = path.read_bytes()
     at = whole.index(b"\x06", len(MAGIC) + 20)
     path.write_bytes(whole[:at] + inner + whole[at:])
     tracemalloc.start()
     try:
-        mended(path, out)
+        recovered(path, out)
         assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
     finally:
         tracemalloc.stop()
@@ -133,7 +133,7 @@ def chunk_places(path: Path) -> list[int]:
 
 @pytest.mark.parametrize("where", [0, 7], ids=["the first chunk, which defines the channels", "another"])
 @pytest.mark.parametrize("offset", [2, 6, 60], ids=["its length", "its length, beyond the file", "its content"])
-def test_a_corrupt_chunk_costs_only_itself_where_there_is_an_index(tmp_path: Path, where: int, offset: int) -> None:
+def test_a_corrupt_chunk_loses_only_itself_where_there_is_an_index(tmp_path: Path, where: int, offset: int) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(30), RIG[:1], chunk_size=700), tmp_path / "out.mcap"
     expected, places = messages(path), chunk_places(path)
     data = bytearray(path.read_bytes())
@@ -144,7 +144,7 @@ def test_a_corrupt_chunk_costs_only_itself_where_there_is_an_index(tmp_path: Pat
     assert 1 <= found.broken <= 2 and set(messages(out)) < set(expected)
 
 
-def test_what_other_writers_write_is_kept(tmp_path: Path) -> None:
+def test_keeps_records_of_other_writers(tmp_path: Path) -> None:
     path, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
     with path.open("wb") as file:
         writer = Writer(file, 200, CompressionType.LZ4)
@@ -169,7 +169,7 @@ def test_what_other_writers_write_is_kept(tmp_path: Path) -> None:
             {"n": str(n)} for n in range(5)]
 
 
-def test_nothing_is_overwritten_and_nothing_half_done_is_left(tmp_path: Path) -> None:
+def test_overwrites_nothing_and_leaves_no_partial_file(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(3))
     os.truncate(path, path.stat().st_size - 1)
     kept = tmp_path / "kept.mcap"
@@ -180,7 +180,7 @@ def test_nothing_is_overwritten_and_nothing_half_done_is_left(tmp_path: Path) ->
     assert kept.read_bytes() == b"mine" and sorted(os.listdir(tmp_path)) == ["kept.mcap", "log.mcap"]
 
 
-def test_a_corrupt_attachment_is_left_out(tmp_path: Path) -> None:
+def test_skips_a_corrupt_attachment(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2), RIG[:1])
     path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
     found = recover(path, tmp_path / "out.mcap")
@@ -205,7 +205,7 @@ def test_a_full_disk_leaves_no_file(tmp_path: Path, request: pytest.FixtureReque
     assert not out.exists()
 
 
-def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+def test_refuses_a_log_that_is_being_written(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log.mcap") as log:
         log.write("/a", "std_msgs/msg/String", text("a"), START_NS)
         with pytest.raises(DriverError, match="being written"):
@@ -214,7 +214,7 @@ def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     assert recover(tmp_path / "log.mcap", tmp_path / "out.mcap").whole
 
 
-def test_the_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     entries = (e._replace(data=e.data + os.urandom(200_000)) for e in pairs(100))
     path, out = write_log(tmp_path / "log.mcap", entries, chunk_size=2**20), tmp_path / "out.mcap"
     os.truncate(path, path.stat().st_size - 1)

@@ -30,7 +30,7 @@ def written(path: Path, entries: list[Entry], **options: object) -> Path:
 
 @pytest.mark.parametrize("compression", ["lz4", "none"])
 @pytest.mark.parametrize("chunk_bytes", [1, 256 * 1024])
-def test_what_is_written_is_read_by_rosbags_and_by_us(
+def test_rosbags_and_the_log_reader_read_it(
     tmp_path: Path, compression: Literal["lz4", "none"], chunk_bytes: int
 ) -> None:
     entries = [*pairs(30), Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
@@ -46,7 +46,7 @@ def test_what_is_written_is_read_by_rosbags_and_by_us(
     assert reader.attachments() == RIG and reader.pair_estimate() == 30
 
 
-def test_the_file_is_what_ros_writes(tmp_path: Path) -> None:
+def test_has_the_layout_of_ros(tmp_path: Path) -> None:
     with written(tmp_path / "log.mcap", pairs(2)).open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -70,7 +70,7 @@ os._exit(9)
 
 
 @pytest.mark.parametrize("chunk_bytes", [2000, 2**30])
-def test_a_crash_loses_no_more_than_the_last_chunk_or_second(tmp_path: Path, chunk_bytes: int) -> None:
+def test_a_crash_loses_at_most_the_last_chunk_or_second(tmp_path: Path, chunk_bytes: int) -> None:
     path = tmp_path / "log.mcap"
     command = [sys.executable, "-c", DIES, str(path), str(chunk_bytes)]
     assert subprocess.run(command, cwd=Path(__file__).parents[3], check=False).returncode == 9
@@ -80,14 +80,14 @@ def test_a_crash_loses_no_more_than_the_last_chunk_or_second(tmp_path: Path, chu
     assert reader.truncated and reader.attachments() == {"rig.toml": b"version = 1"}
 
 
-def test_a_path_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
+def test_refuses_a_path_that_cannot_be_written(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere" / "log.mcap"):
         with pytest.raises(DriverError, match="cannot create the log") as caught:
             LogWriter(path)
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_full_disk_is_told_at_once() -> None:
+def test_a_full_disk_is_an_error_at_once() -> None:
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("there is no /dev/full here")
@@ -106,7 +106,7 @@ def small_files() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("chunk_bytes", [2000, 2**30])
-def test_a_disk_that_fills_up_ends_the_log_which_stays_readable(
+def test_a_log_on_a_full_disk_stays_readable(
     tmp_path: Path, small_files: None, chunk_bytes: int
 ) -> None:
     log = LogWriter(tmp_path / "log.mcap", RIG, chunk_bytes, compression="none")
@@ -122,7 +122,7 @@ def test_a_disk_that_fills_up_ends_the_log_which_stays_readable(
     assert reader.attachments() == RIG and len(list(reader.frames())) > 100
 
 
-def test_wrong_use_is_told_and_leaves_the_log_whole(tmp_path: Path) -> None:
+def test_invalid_messages_are_errors_and_do_not_damage_the_log(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path) as log:
         with pytest.raises(DriverError, match="unknown message type 'no/msg/Such'"):

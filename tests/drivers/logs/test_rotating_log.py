@@ -1,4 +1,4 @@
-"""Recordings of limited size and age, on disks that fill up, fail and vanish."""
+"""Recordings of limited size and age, on disks that are full, fail or are removed."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ ROOMY = RotationSettings(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_b
 TICK_NS = 33_333_333
 
 
-class Heard(list[tuple[int, str]]):
-    """Reports, in order."""
+class Events(list[tuple[int, str]]):
+    """Reported events, in order."""
 
     def __call__(self, level: int, text: str) -> None:
         self.append((level, text))
@@ -44,8 +44,8 @@ class Bench:
     """A recording of noise that no compression makes smaller, at 30 messages a second of stamps."""
 
     def __init__(self, folder: Path, rotation: RotationSettings, name: str = "robot") -> None:
-        self.folder, self.heard = folder, Heard()
-        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, on_event=self.heard)
+        self.folder, self.events = folder, Events()
+        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, on_event=self.events)
         self.state, self._count = self.log.state, 0
 
     def write(self, count: int, size: int = 1000) -> None:
@@ -66,7 +66,7 @@ def counted(path: Path) -> int:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
-    """Makes benches in the test's own folder."""
+    """Create benches in the folder of the test."""
     benches: list[Bench] = []
 
     def make(rotation: RotationSettings = ROOMY, name: str = "robot", folder: Path = tmp_path / "log") -> Bench:
@@ -78,7 +78,7 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
         each.log.close()
 
 
-def test_a_file_is_part_until_it_is_whole(bench: Callable[..., Bench]) -> None:
+def test_a_file_has_the_suffix_part_until_it_is_complete(bench: Callable[..., Bench]) -> None:
     recording = bench()
     recording.write(30)
     assert recording.names() == ["robot_20231114T221320Z_001.mcap.part"]
@@ -93,7 +93,7 @@ def test_a_file_is_part_until_it_is_whole(bench: Callable[..., Bench]) -> None:
 
 @pytest.mark.parametrize("rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)],
                          ids=["size", "age"])
-def test_a_new_file_is_begun_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
+def test_starts_a_new_file_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
     recording = bench(rotation)
     recording.write(200, size=10_000)
     recording.log.close()
@@ -106,7 +106,7 @@ def test_a_new_file_is_begun_by_size_and_by_age(bench: Callable[..., Bench], rot
             assert [a.name for a in make_reader(opened).iter_attachments()] == ["rig.toml"]
 
 
-def test_the_oldest_files_are_deleted_and_counted(bench: Callable[..., Bench]) -> None:
+def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_s=1.0, keep_files=3))
     strangers = ["notes.txt", "robot_20200101T000000Z_001.mcap.bak", "other_20200101T000000Z_001.mcap"]
     recording.folder.mkdir()
@@ -122,7 +122,7 @@ def test_the_oldest_files_are_deleted_and_counted(bench: Callable[..., Bench]) -
     assert recording.state.deleted == 8 and recording.state.lost == 0
 
 
-def test_all_files_together_stay_within_their_size(bench: Callable[..., Bench]) -> None:
+def test_limits_the_size_of_all_files(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_bytes=300_000, keep_bytes=1_000_000))
     sizes = []
     for _ in range(60):
@@ -131,7 +131,7 @@ def test_all_files_together_stay_within_their_size(bench: Callable[..., Bench]) 
     assert max(sizes) <= 1_000_000 + 256 * 1024 and recording.state.deleted > 3  # one chunk beyond the file's size
 
 
-def test_two_daemons_in_one_folder_leave_each_other_alone(bench: Callable[..., Bench]) -> None:
+def test_two_recordings_share_a_folder(bench: Callable[..., Bench]) -> None:
     few = replace(ROOMY, file_s=1.0, keep_files=1)
     one, other = bench(few), bench(few)
     for _ in range(20):
@@ -139,13 +139,13 @@ def test_two_daemons_in_one_folder_leave_each_other_alone(bench: Callable[..., B
         other.write(20)
     one.log.close()
     other.log.close()
-    assert one.state.lost == other.state.lost == 0 and not one.heard and not other.heard
+    assert one.state.lost == other.state.lost == 0 and not one.events and not other.events
     files = list(one.folder.iterdir())
     assert len(files) + one.state.deleted + other.state.deleted == one.state.files + other.state.files >= 26
     assert all(file.suffix == ".mcap" and counted(file) for file in files)
 
 
-def test_a_message_that_is_none_is_refused_and_leaves_the_file_alone(bench: Callable[..., Bench]) -> None:
+def test_refuses_invalid_messages_without_damage_to_the_file(bench: Callable[..., Bench]) -> None:
     recording = bench()
     recording.write(1)
     for schema, stamp_ns in (("no/msg/Such", START_NS), (COMPRESSED, -1), (COMPRESSED, 2**64)):
@@ -153,7 +153,7 @@ def test_a_message_that_is_none_is_refused_and_leaves_the_file_alone(bench: Call
     recording.write(1)
     recording.log.close()
     assert (recording.state.refused, recording.state.lost, recording.state.files) == (3, 0, 1)
-    assert len(recording.heard) == 1 and "no/msg/Such" in recording.heard[0][1]
+    assert len(recording.events) == 1 and "no/msg/Such" in recording.events[0][1]
     assert counted(next(recording.folder.iterdir())) == 2
 
 
@@ -171,7 +171,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(disk: Path) -> Path:
-    """A file of somebody else's that takes all there is."""
+    """Create a file that uses all free space."""
     ballast = disk / "ballast"
     with ballast.open("wb", buffering=0) as file, suppress(OSError):
         while file.write(bytes(4096)):
@@ -180,7 +180,7 @@ def fill(disk: Path) -> Path:
 
 
 def try_again(recording: Bench) -> None:
-    """Writes until it works, a message each time."""
+    """Write single messages until the recording continues."""
     deadline_s = time.monotonic() + 20
     while recording.state.status == "stopped":
         assert time.monotonic() < deadline_s, recording.state
@@ -193,26 +193,26 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     recording.write(40, size=10_000)
     ballast = fill(small_disk)
     recording.write(300, size=10_000)
-    assert recording.state.status == "stopped" and "No space left" in recording.heard[0][1]
-    assert [level for level, _ in recording.heard] == [logging.WARNING] and recording.names() == [
+    assert recording.state.status == "stopped" and "No space left" in recording.events[0][1]
+    assert [level for level, _ in recording.events] == [logging.WARNING] and recording.names() == [
         "robot_20231114T221320Z_001.mcap.part"]  # what was saved until then, and no more than that
     lost = recording.state.lost
     time.sleep(1.1)
-    recording.write(10)  # tried again in vain, and not said again
-    assert recording.state.lost == lost + 10 and len(recording.heard) == 1
+    recording.write(10)  # the next try fails too, and is not reported again
+    assert recording.state.lost == lost + 10 and len(recording.events) == 1
     ballast.unlink()
     try_again(recording)
     recording.write(50, size=10_000)
     recording.log.close()
-    assert [level for level, _ in recording.heard] == [logging.WARNING, logging.INFO]
-    assert recording.heard[1][1].endswith(f"; {recording.state.lost} messages were lost")
+    assert [level for level, _ in recording.events] == [logging.WARNING, logging.INFO]
+    assert recording.events[1][1].endswith(f"; {recording.state.lost} messages were lost")
     whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
     saved = len(list(DataSection(LogFile(recording.folder / recording.names()[0]), Catalog()).messages()))
     assert saved >= 25 and whole >= 50 and recording.state.stops == 1
     assert recording.state.messages == saved + whole + recording.state.lost
 
 
-def test_what_is_to_be_left_free_stays_free_and_the_file_is_whole(
+def test_keeps_the_reserved_space_free_and_completes_the_file(
     small_disk: Path, bench: Callable[..., Bench]
 ) -> None:
     rotation = replace(ROOMY, file_bytes=2 * 10**6, free_bytes=10**6, sync_s=0.0)
@@ -223,12 +223,12 @@ def test_what_is_to_be_left_free_stays_free_and_the_file_is_whole(
     disk = os.statvfs(small_disk)
     assert 700_000 < disk.f_bavail * disk.f_frsize <= 10**6
     assert recording.state.status == "stopped" and "make room" in recording.state.problem
-    assert len(recording.heard) == 1 and "MB are free" in recording.heard[0][1]
+    assert len(recording.events) == 1 and "MB are free" in recording.events[0][1]
     assert sum(map(counted, recording.folder.iterdir())) + recording.state.lost == 320
 
 
 @pytest.mark.parametrize(("limit", "kept"), [(300_000, 1), (20_000, 0)])
-def test_a_file_that_may_not_grow_costs_no_more_than_what_is_beyond(tmp_path: Path, limit: int, kept: int) -> None:
+def test_a_limited_file_size_loses_only_the_messages_beyond(tmp_path: Path, limit: int, kept: int) -> None:
     """Without any right to mount: the kernel refuses larger files. One in which nothing could be saved is deleted."""
     program = """
 import resource, signal, sys
@@ -240,7 +240,7 @@ from tests.drivers.logs.test_rotating_log import Bench, ROOMY
 recording = Bench(Path(sys.argv[1]), ROOMY)
 recording.write(200, size=10_000)
 state = recording.state
-print(state.status, state.messages, state.lost, state.stops, len(recording.heard), len(recording.names()))
+print(state.status, state.messages, state.lost, state.stops, len(recording.events), len(recording.names()))
 """
     command = [sys.executable, "-c", program, str(tmp_path / "log"), str(limit)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
@@ -251,7 +251,7 @@ print(state.status, state.messages, state.lost, state.stops, len(recording.heard
     assert sum(len(list(DataSection(part, Catalog()).messages())) for part in parts) == messages - lost
 
 
-def test_a_folder_that_vanishes_is_noticed_and_its_return_too(bench: Callable[..., Bench], tmp_path: Path) -> None:
+def test_detects_a_removed_folder_and_its_return(bench: Callable[..., Bench], tmp_path: Path) -> None:
     stick = tmp_path / "stick"
     stick.mkdir()
     recording = bench(replace(ROOMY, sync_s=0.0), folder=stick / "log")
@@ -259,26 +259,26 @@ def test_a_folder_that_vanishes_is_noticed_and_its_return_too(bench: Callable[..
     shutil.rmtree(stick)
     recording.write(30)
     assert recording.state.status == "stopped" and recording.state.lost == 60
-    assert len(recording.heard) == 1 and "deleted" in recording.heard[0][1]
+    assert len(recording.events) == 1 and "deleted" in recording.events[0][1]
     stick.mkdir()
     try_again(recording)
     recording.log.close()
-    assert [level for level, _ in recording.heard] == [logging.WARNING, logging.INFO]
+    assert [level for level, _ in recording.events] == [logging.WARNING, logging.INFO]
     assert counted(next(recording.folder.iterdir())) == recording.state.messages - recording.state.lost > 0
 
 
 @pytest.mark.parametrize("path", ["missing/log", "file", "file/log", "x" * 300])
-def test_a_folder_that_cannot_be_had_is_told_once(bench: Callable[..., Bench], tmp_path: Path, path: str) -> None:
+def test_reports_an_unusable_folder_once(bench: Callable[..., Bench], tmp_path: Path, path: str) -> None:
     (tmp_path / "file").write_bytes(b"")
     recording = bench(folder=tmp_path / path)
     recording.write(100)
     recording.log.close()
-    assert (recording.state.lost, recording.state.stops, len(recording.heard)) == (100, 1, 1)
-    assert str(tmp_path / path) in recording.heard[0][1] and "\n" not in recording.heard[0][1]
+    assert (recording.state.lost, recording.state.stops, len(recording.events)) == (100, 1, 1)
+    assert str(tmp_path / path) in recording.events[0][1] and "\n" not in recording.events[0][1]
 
 
 @pytest.mark.parametrize("name", ["a/b", "ü n/../..", "-", "%s\0\n"])
-def test_no_name_leaves_the_folder(bench: Callable[..., Bench], name: str) -> None:
+def test_no_name_escapes_the_folder(bench: Callable[..., Bench], name: str) -> None:
     recording = bench(name=name)
     recording.write(3)
     recording.log.close()
@@ -286,7 +286,7 @@ def test_no_name_leaves_the_folder(bench: Callable[..., Bench], name: str) -> No
     assert counted(file) == 3 and file.name.isprintable()
 
 
-def test_the_memory_does_not_grow_with_the_recording(bench: Callable[..., Bench]) -> None:
+def test_memory_does_not_grow_with_the_recording(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_bytes=10**7, keep_files=1))
     recording.write(10, size=100_000)
     tracemalloc.start()
@@ -297,7 +297,7 @@ def test_the_memory_does_not_grow_with_the_recording(bench: Callable[..., Bench]
         tracemalloc.stop()
 
 
-def test_what_survives_is_counted_at_every_moment(tmp_path: Path) -> None:
+def test_counts_the_persisted_messages_at_any_time(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path, chunk_bytes=3000) as log:
         for n in range(100):

@@ -24,14 +24,14 @@ CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
         ("/LOWER", "/Upper"),
     ],
 )
-def test_names_that_tell_the_camera(tmp_path: Path, lower: str, upper: str) -> None:
+def test_identifies_cameras_by_name(tmp_path: Path, lower: str, upper: str) -> None:
     reader = LogReader(write_log(tmp_path / "log.mcap", [CHATTER, *pairs(2, lower, upper)]))
     assert reader.topics == {"lower": lower, "upper": upper}
     assert [frame.camera for frame in reader.frames()] == ["lower", "upper"] * 2
 
 
 @pytest.mark.parametrize("layout", [{}, BARE, BARE | {"use_chunking": False}])
-def test_given_names_with_and_without_a_summary(tmp_path: Path, layout: dict[str, Any]) -> None:
+def test_requested_topics_with_and_without_a_summary(tmp_path: Path, layout: dict[str, Any]) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/b"), **layout)
     with pytest.raises(DriverError, match=r"found /a, /b; give --lower and --upper"):
         LogReader(path)
@@ -39,7 +39,7 @@ def test_given_names_with_and_without_a_summary(tmp_path: Path, layout: dict[str
     assert reader.topics == {"lower": "/b", "upper": "/a"} and len(list(reader.frames())) == 4
 
 
-def test_one_given_name_leaves_the_other_to_its_own(tmp_path: Path) -> None:
+def test_identifies_the_other_camera_where_one_is_requested(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/upper/b"))
     assert LogReader(path, lower="/a").topics == {"lower": "/a", "upper": "/upper/b"}
 
@@ -47,7 +47,7 @@ def test_one_given_name_leaves_the_other_to_its_own(tmp_path: Path) -> None:
 IMAGES = {"/a/lower/image_raw": IMAGE, "/a/upper/image_raw": IMAGE}
 
 
-def test_compressed_images_are_preferred_and_depth_is_no_image() -> None:
+def test_prefers_compressed_images_and_ignores_depth() -> None:
     both = IMAGES | {name + "/compressed": COMPRESSED for name in IMAGES}
     both |= {name + "/compressedDepth": COMPRESSED for name in IMAGES}
     assert choose_topics("log", both, {"lower": None, "upper": None}) == {
@@ -83,7 +83,7 @@ def test_compressed_images_are_preferred_and_depth_is_no_image() -> None:
         ({f"/t{n:02}": "" for n in range(40)}, {}, "/t15 and 24 more"),
     ],
 )
-def test_doubts_are_errors_that_list_what_there_is(
+def test_ambiguity_is_an_error_that_lists_the_candidates(
     topics: dict[str, str], wanted: dict[Camera, str], message: str
 ) -> None:
     with pytest.raises(DriverError, match=message) as caught:

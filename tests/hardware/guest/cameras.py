@@ -1,7 +1,7 @@
 """Run by pytest in the guest, as root: the camera driver on vivid and v4l2loopback, the kernel's own virtual cameras.
 
-vivid is loaded afresh for each test; its two cameras are called /dev/omnid/lower and upper by the rules that `omnid
-cameras` prints. v4l2loopback shows what a test writes.
+vivid is loaded again for each test; its two cameras are called /dev/omnid/lower and upper by the rules that `omnid
+cameras` prints. v4l2loopback delivers the images that a test writes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def run(*command: str) -> str:
 
 
 def control(device: str, control_id: int, value: int | None = None) -> int:
-    """Sets or presses a control behind the driver's back, or reads it."""
+    """Set or press a control without the driver, or read it."""
     fd = os.open(device, os.O_RDWR)
     try:
         entry = v4l2.V4l2Control(control_id, value or 0)
@@ -57,20 +57,21 @@ def control(device: str, control_id: int, value: int | None = None) -> int:
 def until(what: Callable[[], object], limit_s: float = LIMIT_S) -> None:
     end_s = time.monotonic() + limit_s
     while not what():
-        assert time.monotonic() < end_s, "it did not come about in time"
+        assert time.monotonic() < end_s, "condition not met in time"
         time.sleep(0.02)
 
 
-class Watched:
-    """A camera that is read by a thread of its own; `taken`: seq, stamp and arrival of each frame."""
+class CameraReader:
+    """A camera that is read by a thread; `taken`: seq, stamp and arrival of each frame."""
 
     def __init__(self, device: str = LOWER, **fields: Any) -> None:
         fields = {"width_px": SIZE[0], "height_px": SIZE[1], "rate_hz": RATE_HZ, "pixel_format": "GREY",
                   "timeout_s": 5.0, "controls": STILL} | fields
-        self.said: list[tuple[int, str]] = []
+        self.events: list[tuple[int, str]] = []
         self.taken: list[tuple[int, int, int]] = []
         self.last: Frame | None = None
-        self.camera = V4l2Camera(V4l2Settings(device, **fields), "lower", on_event=lambda *said: self.said.append(said))
+        settings = V4l2Settings(device, **fields)
+        self.camera = V4l2Camera(settings, "lower", on_event=lambda *event: self.events.append(event))
         self.state = self.camera.state
         self.thread = threading.Thread(target=self._read, daemon=True)
 
@@ -79,7 +80,7 @@ class Watched:
             self.taken.append((frame.seq, frame.stamp_ns, time.monotonic_ns()))
             self.last = frame
 
-    def __enter__(self) -> Watched:
+    def __enter__(self) -> CameraReader:
         self.thread.start()
         return self
 
@@ -89,30 +90,30 @@ class Watched:
         assert not self.thread.is_alive(), "close() did not end frames()"
 
     def more(self, count: int) -> None:
-        """Waits for so many more frames."""
+        """Wait for more frames."""
         goal = len(self.taken) + count
         until(lambda: len(self.taken) >= goal)
 
     def missing(self, period_ns: int = round(1e9 / RATE_HZ)) -> int:
-        """How many frames the stamps say are missing: vivid's are multiples of its period."""
+        """Return the number of missing frames by their stamps, which vivid sets to multiples of its period."""
         stamps = [stamp_ns for _, stamp_ns, _ in self.taken]
         return sum(round((after - before) / period_ns) - 1 for before, after in pairwise(stamps))
 
     def require_order(self) -> None:
-        """Numbers without a gap, stamps that rise and lie in the past."""
+        """Require numbers without a gap, and increasing stamps in the past."""
         assert [seq for seq, _, _ in self.taken] == list(range(len(self.taken)))
         stamps = [stamp_ns for _, stamp_ns, _ in self.taken]
         assert all(before < after for before, after in pairwise(stamps))
         assert all(stamp_ns <= arrival_ns for _, stamp_ns, arrival_ns in self.taken)
 
-    def require_said(self, *words: str) -> None:
-        """That it was told of the words in this order, and of nothing else."""
-        assert len(self.said) == len(words), self.said
-        assert all(word in text for word, (_, text) in zip(words, self.said, strict=True)), self.said
+    def require_events(self, *words: str) -> None:
+        """Require events with these words in this order, and no others."""
+        assert len(self.events) == len(words), self.events
+        assert all(word in text for word, (_, text) in zip(words, self.events, strict=True)), self.events
 
 
 class Writer:
-    """Shows a image on a loopback camera over and over, as a webcam would."""
+    """Writes an image to a loopback camera again and again, as a webcam does."""
 
     def __init__(self, device: str, image: bytes, pixel_format: str = "GREY") -> None:
         self._loopback = Loopback(device, pixel_format, SIZE)
@@ -155,7 +156,7 @@ def rules() -> Path:
 
 @pytest.fixture
 def vivid(rules: Path) -> Iterator[None]:
-    """Two fresh cameras by their stable names."""
+    """Two newly loaded cameras with their persistent names."""
     run("modprobe", "vivid", "n_devs=2", "node_types=0x1,0x1")
     run("udevadm", "settle")
     assert {os.readlink(LOWER), os.readlink(UPPER)} == {"../video0", "../video1"}
@@ -180,8 +181,8 @@ def no_file_stays_open() -> Iterator[None]:
 def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
     image = bytes(SIZE[0] * SIZE[1])
     with Writer(DEVICES[0], image), Writer(DEVICES[1], image):
-        real = [Watched(LOWER), Watched(UPPER)]
-        looped = [Watched(device, controls=()) for device in DEVICES]
+        real = [CameraReader(LOWER), CameraReader(UPPER)]
+        looped = [CameraReader(device, controls=()) for device in DEVICES]
         with real[0], real[1], looped[0], looped[1]:
             until(lambda: all(len(watched.taken) >= 20 for watched in real + looped))
     for watched in real + looped:
@@ -190,22 +191,22 @@ def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
         print(watched.state, f"{1e9 / period_ns:.2f} Hz")
         assert 0.5 < 1e9 / period_ns / RATE_HZ < 1.5
     for watched in real:
-        watched.require_said()
+        watched.require_events()
         assert watched.state.mode == "GREY 320x180 at 10 Hz" and watched.missing() == watched.state.drops
     for watched in looped:
-        watched.require_said("clock")
+        watched.require_events("clock")
 
 
-def test_dropped_buffers_are_counted_exactly(vivid: None) -> None:
-    with Watched(controls=(*STILL, "percentage_of_dropped_buffers=40"), rate_hz=25.0) as watched:
+def test_counts_dropped_buffers_exactly(vivid: None) -> None:
+    with CameraReader(controls=(*STILL, "percentage_of_dropped_buffers=40"), rate_hz=25.0) as watched:
         watched.more(60)
     watched.require_order()
     assert watched.state.drops == watched.missing(40_000_000) > 5
     assert watched.state.frames == len(watched.taken) and watched.state.errors == watched.state.losses == 0
 
 
-def test_flagged_buffers_are_left_out_and_counted(vivid: None) -> None:
-    with Watched() as watched:
+def test_skips_and_counts_flagged_buffers(vivid: None) -> None:
+    with CameraReader() as watched:
         for count in (1, 2, 3):
             watched.more(3)
             control(LOWER, FLAG_ERROR, 1)
@@ -215,16 +216,16 @@ def test_flagged_buffers_are_left_out_and_counted(vivid: None) -> None:
     assert watched.missing() == watched.state.drops + 3 and watched.state.losses == 0
 
 
-def test_stamps_of_the_future_become_the_arrival(vivid: None) -> None:
-    with Watched(controls=("timestamp_source=0",)) as watched:
+def test_replaces_stamps_in_the_future_by_the_arrival(vivid: None) -> None:
+    with CameraReader(controls=("timestamp_source=0",)) as watched:
         watched.more(10)
     watched.require_order()
-    watched.require_said("stamp")
+    watched.require_events("stamp")
     assert watched.state.restamped == watched.state.frames
 
 
-def test_an_input_error_is_survived_and_all_is_set_anew(vivid: None) -> None:
-    with Watched(gain=77) as watched:
+def test_recovers_from_an_input_error_with_all_settings(vivid: None) -> None:
+    with CameraReader(gain=77) as watched:
         watched.more(5)
         control(LOWER, GAIN, 5)
         control(LOWER, FATAL_ERROR, 1)
@@ -232,16 +233,17 @@ def test_an_input_error_is_survived_and_all_is_set_anew(vivid: None) -> None:
         watched.more(5)
         assert control(LOWER, GAIN) == 77
     watched.require_order()
-    watched.require_said("lost", "back, GREY 320x180 at 10 Hz")
+    watched.require_events("lost", "back, GREY 320x180 at 10 Hz")
     assert (watched.state.losses, watched.state.reopens, watched.state.drops) == (1, 1, 0)
 
 
-def test_both_cameras_are_unplugged_and_come_back(vivid: None) -> None:
-    with Watched(LOWER) as lower, Watched(UPPER) as upper:
+def test_both_cameras_are_unplugged_and_reconnected(vivid: None) -> None:
+    with CameraReader(LOWER) as lower, CameraReader(UPPER) as upper:
         lower.more(5)
         upper.more(5)
         control(LOWER, DISCONNECT, 1)
-        until(lambda: lower.state.losses == 1 and lower.state.status == "streaming")  # vivid connects when it is let go
+        # vivid reconnects when it is closed
+        until(lambda: lower.state.losses == 1 and lower.state.status == "streaming")
         upper.more(5)
         assert upper.state.losses == 0
         (BIND / "unbind").write_text("vivid.0")
@@ -253,13 +255,13 @@ def test_both_cameras_are_unplugged_and_come_back(vivid: None) -> None:
             watched.more(5)
     lower.require_order()
     upper.require_order()
-    lower.require_said("lost", "back", "lost", "back")
-    upper.require_said("lost", "back")
+    lower.require_events("lost", "back", "lost", "back")
+    upper.require_events("lost", "back")
 
 
-def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
+def test_refuses_another_camera_with_the_old_number(vivid: None) -> None:
     node = os.path.realpath(LOWER)
-    with Watched(node) as watched:
+    with CameraReader(node) as watched:
         watched.more(3)
         os.rename(node, "/dev/hidden")
         os.symlink(os.path.realpath(UPPER), node)
@@ -268,13 +270,13 @@ def test_another_camera_under_the_old_number_is_not_taken(vivid: None) -> None:
         assert watched.state.status == "lost"
         os.rename("/dev/hidden", node)
         watched.more(3)
-    watched.require_said("lost", "back")
+    watched.require_events("lost", "back")
 
 
-def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
+def test_reopens_a_camera_that_sends_no_images(loopback: None) -> None:
     device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
     with Writer(device, image) as writer:
-        watched = Watched(device, controls=(), timeout_s=1.0)
+        watched = CameraReader(device, controls=(), timeout_s=1.0)
         with watched:
             watched.more(5)
             writer.pausing = True
@@ -284,13 +286,13 @@ def test_a_camera_that_falls_silent_is_opened_anew(loopback: None) -> None:
             writer.pausing = False
             watched.more(5)
     watched.require_order()
-    watched.require_said("clock", "lost", "back")
+    watched.require_events("clock", "lost", "back")
 
 
-def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
+def test_waits_for_a_writer_that_has_closed(loopback: None) -> None:
     device, image = DEVICES[1], bytes(SIZE[0] * SIZE[1])
     with Writer(device, image):
-        watched = Watched(device, controls=(), timeout_s=1.0)
+        watched = CameraReader(device, controls=(), timeout_s=1.0)
         watched.thread.start()
         watched.more(5)
     until(lambda: "no capture device" in watched.state.problem)
@@ -298,13 +300,13 @@ def test_a_writer_that_goes_is_awaited(loopback: None) -> None:
         watched.more(5)
         watched.__exit__()
     watched.require_order()
-    watched.require_said("clock", "lost", "back")
+    watched.require_events("clock", "lost", "back")
 
 
 def test_motion_jpeg_arrives_whole(loopback: None) -> None:
     image = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
     jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-    with Writer(DEVICES[0], jpeg, "MJPG"), Watched(DEVICES[0], controls=(), pixel_format="auto") as watched:
+    with Writer(DEVICES[0], jpeg, "MJPG"), CameraReader(DEVICES[0], controls=(), pixel_format="auto") as watched:
         watched.more(5)
     assert watched.last and watched.last.encoding == "jpeg"
     assert np.abs(gray(watched.last).astype(int) - image).max() < 12
@@ -313,7 +315,7 @@ def test_motion_jpeg_arrives_whole(loopback: None) -> None:
 def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
     images = {}
     for name in ("GREY", "YUYV", "UYVY", "NV12"):
-        with Watched(pixel_format=name) as watched:
+        with CameraReader(pixel_format=name) as watched:
             watched.more(2)
         assert watched.last and watched.state.mode.startswith(name)
         images[name] = gray(watched.last)
@@ -325,13 +327,13 @@ def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
 
 def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
     assert control(LOWER, GAIN) != 33
-    with Watched(gain=33, controls=(*STILL, "brightness=40", "hue=-7")):
+    with CameraReader(gain=33, controls=(*STILL, "brightness=40", "hue=-7")):
         listed = run("v4l2-ctl", "-d", LOWER, "-C", "gain,gain_automatic,brightness,hue")
     assert listed.splitlines() == ["gain: 33", "gain_automatic: 0", "brightness: 40", "hue: -7"]
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"gain": 300}, "300 was requested, it accepts 0 to 255"),
         ({"exposure_us": 500}, "no control of its automatic exposure"),
@@ -342,31 +344,31 @@ def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
         ({"width_px": 322}, "not offered; choose from: "),
     ],
 )
-def test_what_the_device_does_not_take_is_refused(vivid: None, fields: dict[str, Any], said: str) -> None:
-    with pytest.raises(DriverError, match=said) as caught:
-        Watched(**fields)
+def test_refuses_settings_that_the_device_does_not_accept(vivid: None, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(DriverError, match=message) as caught:
+        CameraReader(**fields)
     assert str(caught.value).startswith(f"camera {LOWER}: ") and "\n" not in str(caught.value)
 
 
-def test_a_device_is_had_by_one_alone(vivid: None) -> None:
-    with Watched() as watched:
+def test_a_device_has_one_user(vivid: None) -> None:
+    with CameraReader() as watched:
         watched.more(3)
         with pytest.raises(DriverError, match="is used by another program"):
-            Watched()
+            CameraReader()
         watched.more(3)
-    with Watched(width_px=640, height_px=360) as later:
+    with CameraReader(width_px=640, height_px=360) as later:
         later.more(3)
-    watched.require_said()
+    watched.require_events()
 
 
-def test_an_output_is_no_camera(loopback: None) -> None:
+def test_refuses_an_output_device(loopback: None) -> None:
     with pytest.raises(DriverError, match="is no capture device now"):
-        Watched(DEVICES[0], controls=())
+        CameraReader(DEVICES[0], controls=())
 
 
-def test_close_ends_a_wait_and_may_come_at_any_time(vivid: None, loopback: None) -> None:
+def test_close_ends_a_wait_at_any_time(vivid: None, loopback: None) -> None:
     device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, image) as writer, Watched(device, controls=(), timeout_s=60.0) as watched:
+    with Writer(device, image) as writer, CameraReader(device, controls=(), timeout_s=60.0) as watched:
         watched.more(1)
         writer.pausing = True
         time.sleep(0.5)
@@ -374,9 +376,9 @@ def test_close_ends_a_wait_and_may_come_at_any_time(vivid: None, loopback: None)
         watched.camera.close()
         watched.thread.join(LIMIT_S)
         assert time.monotonic() - started_s < 30 and watched.state.status == "closed"
-    unread = Watched()
+    unread = CameraReader()
     unread.camera.close()
     unread.camera.close()
     assert list(unread.camera.frames()) == [] and unread.state.status == "closed"
-    with Watched() as again:  # it was let go
+    with CameraReader() as again:  # it was released
         again.more(1)

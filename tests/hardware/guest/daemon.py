@@ -1,7 +1,7 @@
 """Run by pytest in the guest, as root: `omnid run` under its unit, two loopback cameras, a motor at ttyS1.
 
-The tests build on each other. The cameras show the sample log: each image again and again until the daemon has told
-a pose of it, then the next, so that an emulated machine may take its time. All deadlines are long for the same reason.
+The tests build on each other. The cameras show the sample log: each image is repeated until the daemon has published a
+pose of it, since the emulated machine is slow. All deadlines are long for the same reason.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.cameras.log_camera import LogImages
 from tests.hardware.guest.loopback import load_loopback
-from tests.hardware.guest.unit import DROP_INS, SYSTEMD, restarted, run, said, show, until
-from tests.hardware.guest.world import SAMPLE, Operator, World
+from tests.hardware.guest.sample_log import SAMPLE, GuestOperator, SampleLog
+from tests.hardware.guest.unit import DROP_INS, SYSTEMD, journal, restarted, run, show, until
 
 RESULTS = Path("/mnt/job/results")
 RECORDINGS = Path("/var/lib/omnid/recordings")
@@ -79,32 +79,32 @@ stall_timeout_s = 30.0
 
 
 class Wheels:
-    """The controller outside, by the line on which it answers questions."""
+    """The simulated board on the host, by the serial line on which it reports its state."""
 
     def __init__(self) -> None:
         self._port = serial.Serial("/dev/ttyS2", 115200, timeout=30)
         self.log: list[dict[str, Any]] = []
 
-    def ask(self) -> dict[str, Any]:
-        """Its state now, and the fastest that a wheel was told since the last question."""
+    def state(self) -> dict[str, Any]:
+        """Return its state, with the highest commanded speed of a wheel since the last call."""
         self._port.write(b"?\n")
         self.log.append(json.loads(self._port.readline()))
         return self.log[-1]
 
     @property
     def commanded_mps(self) -> float:
-        """What they are told now, or were told last."""
-        return float(self.ask()["commanded_mps"])
+        """The last commanded speed."""
+        return float(self.state()["commanded_mps"])
 
 
 def transform_of(row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_world_rig out of x y z and a quaternion x y z w."""
+    """Return T_world_rig from x y z and a quaternion x y z w."""
     return se3.transform(se3.rotation(row[3:]), row[:3])
 
 
-def words() -> list[str]:
-    """What the journal has of the unit."""
-    return [text for _, text in said()]
+def journal_lines() -> list[str]:
+    """Return the lines of the unit in the journal."""
+    return [text for _, text in journal()]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -126,18 +126,18 @@ def unit() -> Iterator[None]:
     run("udevadm", "trigger", "--settle", "--subsystem-match=video4linux", "--subsystem-match=tty")
     run("systemctl", "daemon-reload")
     yield
-    (RESULTS / "journal").write_text("\n".join(words()))
+    (RESULTS / "journal").write_text("\n".join(journal_lines()))
 
 
 @pytest.fixture(scope="module")
-def world(unit: None) -> World:
-    return World()
+def sample_log(unit: None) -> SampleLog:
+    return SampleLog()
 
 
 @pytest.fixture(scope="module")
-def operator(world: World) -> Iterator[Operator]:
+def operator(sample_log: SampleLog) -> Iterator[GuestOperator]:
     run("systemctl", "start", "omnid")  # waits for READY=1
-    made = Operator(world)
+    made = GuestOperator(sample_log)
     yield made
     made.close()
 
@@ -147,12 +147,12 @@ def wheels() -> Wheels:
     return Wheels()
 
 
-def test_poses_flow_once_it_is_ready(operator: Operator) -> None:
+def test_poses_flow_once_it_is_ready(operator: GuestOperator) -> None:
     assert show("ActiveState") == "active"
     assert {pose.state for pose in operator.more(8)} == {"tracking"}
 
 
-def test_they_are_those_of_the_log(operator: Operator) -> None:
+def test_poses_match_the_log(operator: GuestOperator) -> None:
     truth = np.loadtxt(SAMPLE / "truth.txt")  # TUM: time, x y z, quaternion; T_base_rig of this rig is 1
     first = operator.poses[0]
     until(lambda: operator.index(operator.poses[-1]) >= operator.index(first) + 10)
@@ -164,90 +164,92 @@ def test_they_are_those_of_the_log(operator: Operator) -> None:
     assert np.linalg.norm(moved[:3, 3] - expected[:3, 3]) < 0.05
 
 
-def test_commands_turn_the_wheels_and_silence_stops_them(operator: Operator, wheels: Wheels) -> None:
-    until(lambda: wheels.ask()["commands"] > 3)
-    before = wheels.ask()
+def test_commands_turn_the_wheels_and_their_absence_stops_them(operator: GuestOperator, wheels: Wheels) -> None:
+    until(lambda: wheels.state()["commands"] > 3)
+    before = wheels.state()
     assert before["fastest_mps"] == 0.0
     operator.driving = True
     until(lambda: wheels.commanded_mps > 0.25)
     operator.driving = False
     until(lambda: wheels.commanded_mps == 0.0)
-    after = wheels.ask()
+    after = wheels.state()
     assert after["errors"] == before["errors"] and after["way_m"] > 0.05
-    assert "the wheels stop: the command is stale" in words()
+    assert "the wheels stop: the command is stale" in journal_lines()
 
 
-def test_one_camera_gone_stops_the_wheels_until_it_is_back(world: World, operator: Operator, wheels: Wheels) -> None:
+def test_a_lost_camera_stops_the_wheels_until_it_is_back(
+    sample_log: SampleLog, operator: GuestOperator, wheels: Wheels
+) -> None:
     operator.driving = True
     until(lambda: wheels.commanded_mps > 0.25)
-    world.close("lower")
+    sample_log.close("lower")
     until(lambda: wheels.commanded_mps == 0.0)
     until(lambda: operator.message("lower camera").startswith("camera /dev/omnid/lower"))
     until(lambda: operator.message("pairing") == "no images of the lower camera")
-    assert wheels.ask()["fastest_mps"] == 0.0
-    world.open("lower")
+    assert wheels.state()["fastest_mps"] == 0.0
+    sample_log.open("lower")
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
-    lost = [text for text in words() if "lower camera: " in text]
+    lost = [text for text in journal_lines() if "lower camera: " in text]
     assert sum("lost, and tried again" in text for text in lost) == 1 and sum(": back, " in text for text in lost) == 1
     assert show("NRestarts") == "0"
 
 
-def test_a_kill_stops_the_wheels_until_it_is_back(world: World, operator: Operator, wheels: Wheels) -> None:
-    pid, before = int(show("MainPID")), wheels.ask()
+def test_a_killed_daemon_stops_the_wheels_until_it_is_back(operator: GuestOperator, wheels: Wheels) -> None:
+    pid, before = int(show("MainPID")), wheels.state()
     os.kill(pid, signal.SIGKILL)
     killed_ns = time.time_ns()
     until(lambda: wheels.commanded_mps == 0.0)
-    after = wheels.ask()
-    assert after["expiries"] == before["expiries"], "what steers slowed them down, long before the watchdog"
-    keep_what_was_recorded(killed_ns, killed_ns - operator.poses[-1].stamp_ns)
+    after = wheels.state()
+    assert after["expiries"] == before["expiries"], "the base controller stopped them, long before the watchdog"
+    save_the_recording(killed_ns, killed_ns - operator.poses[-1].stamp_ns)
     until(lambda: int(show("MainPID")) not in (0, pid))
-    assert wheels.ask()["fastest_mps"] == 0.0
+    assert wheels.state()["fastest_mps"] == 0.0
     restarted(pid)
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
-    assert wheels.ask()["unsafe_resumes"] == 0
+    assert wheels.state()["unsafe_resumes"] == 0
 
 
-def keep_what_was_recorded(killed_ns: int, newest_age_ns: int) -> None:
-    """For those outside, who are faster."""
+def save_the_recording(killed_ns: int, newest_age_ns: int) -> None:
+    """Save the recording for the host, which is faster."""
     left, = RECORDINGS.glob("*.part")
     shutil.copy(left, RESULTS / "killed.mcap.part")
     (RESULTS / "killed.json").write_text(json.dumps({"killed_ns": killed_ns, "newest_age_ns": newest_age_ns}))
 
 
-def test_a_daemon_that_stands_still_is_started_anew(operator: Operator, wheels: Wheels) -> None:
+def test_restarts_a_daemon_that_stalls(operator: GuestOperator, wheels: Wheels) -> None:
     pid = int(show("MainPID"))
     os.kill(pid, signal.SIGSTOP)
     until(lambda: wheels.commanded_mps == 0.0)
     restarted(pid)
-    lines = words()
+    lines = journal_lines()
     assert any("Watchdog timeout" in text for text in lines)
     assert any("Fatal Python error: Aborted" in text for text in lines)
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
 
 
-def test_the_end_stops_the_wheels(operator: Operator, wheels: Wheels) -> None:
-    before = wheels.ask()
+def test_stopping_the_unit_stops_the_wheels(operator: GuestOperator, wheels: Wheels) -> None:
+    before = wheels.state()
     run("systemctl", "stop", "--no-block", "omnid")
     until(lambda: wheels.commanded_mps == 0.0)
-    assert wheels.ask()["expiries"] == before["expiries"], "told so, long before its watchdog"
+    assert wheels.state()["expiries"] == before["expiries"], "stopped by a command, long before the watchdog"
     run("systemctl", "stop", "omnid")
-    after = wheels.ask()
+    after = wheels.state()
     assert after["commanded_mps"] == after["fastest_mps"] == 0.0
     assert (show("ActiveState"), show("Result"), show("ExecMainStatus")) == ("inactive", "success", "0")
-    assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in words())
+    assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in journal_lines())
 
 
-def test_what_is_recorded_from_the_cameras_alone_is_a_log(operator: Operator, tmp_path: Path) -> None:
+def test_records_a_log_from_the_cameras_alone(operator: GuestOperator, tmp_path: Path) -> None:
     """`omnid record` beside no daemon, ended as Ctrl-C does."""
     run("timeout", "--preserve-status", "-s", "INT", "60", "/opt/omnid/bin/omnid", "record", str(tmp_path / "boards"),
         "--config", "/etc/omnid/omnid.toml")
     log, = (tmp_path / "boards").glob("*.mcap")
     assert "rig.toml" in run("/opt/omnid/bin/omnid", "log", "info", str(log))
     images = LogImages.load(log)
-    for eye in (images.lower, images.upper):
-        stamps_ns = [frame.stamp_ns for _, frame in eye]
+    for frames in (images.lower, images.upper):
+        stamps_ns = [frame.stamp_ns for _, frame in frames]
         assert len(stamps_ns) > 10 and stamps_ns == sorted(set(stamps_ns))
-        assert {frame.encoding for _, frame in eye} == {"jpeg"}
+        assert {frame.encoding for _, frame in frames} == {"jpeg"}

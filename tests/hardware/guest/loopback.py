@@ -1,4 +1,4 @@
-"""Images of our own as the images of a camera, by v4l2loopback; for scripts in a guest."""
+"""Cameras with given images, by v4l2loopback; for scripts in a guest."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT
 
 
 def load_loopback() -> None:
-    """Two loopback cameras; more than 4 buffers have been seen to crash the kernel when the reader asks for 4."""
+    """Load two loopback cameras with 4 buffers: with more, a reader that requests 4 has crashed the kernel."""
     subprocess.run(["modprobe", "v4l2loopback", "devices=2", "video_nr=10,11", "card_label=omni-lower,omni-upper",
                     "exclusive_caps=1,1", "max_buffers=4"], check=True)
     subprocess.run(["udevadm", "settle"], check=True)
 
 
 class Loopback:
-    """The inner end of a loopback camera, which is a camera from the first image until it is closed."""
+    """The writing end of a loopback camera, which is a capture device from the first image until it is closed."""
 
     def __init__(self, device: str, pixel_format: str, size_px: tuple[int, int]) -> None:
         self._fd = os.open(device, os.O_RDWR)
@@ -27,12 +27,12 @@ class Loopback:
         pix = asked.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = *size_px, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
         v4l2.call(self._fd, v4l2.S_FMT, asked)
-        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Int32(OUTPUT))  # else its writer is never seen to go
+        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Int32(OUTPUT))  # else the end of the writer is not visible to readers
 
     def write(self, image: bytes) -> None:
-        """Shows the image; the kernel stamps it now."""
+        """Write an image; the kernel stamps it now."""
         os.write(self._fd, image)
 
     def close(self) -> None:
-        """Pulls the plug, as far as a reader can tell: images stop."""
+        """Stop the images, which a reader sees as a lost camera."""
         os.close(self._fd)

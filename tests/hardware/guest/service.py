@@ -1,6 +1,6 @@
-"""Run by pytest in the guest, as root: the unit under systemd, with a small daemon in the place of omnid.
+"""Run by pytest in the guest, as root: the unit under systemd, with a small daemon that replaces omnid.
 
-The tests build on each other: the service starts, is looked at, gets a network, hangs, is killed, is stopped.
+The tests build on each other: the service starts, is inspected, gets a network, stalls, is killed, is stopped.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.hardware.guest.unit import DROP_INS, SYSTEMD, restarted, run, said, show, until
+from tests.hardware.guest.unit import DROP_INS, SYSTEMD, journal, restarted, run, show, until
 
 REPORT = Path("/var/lib/omnid/report.json")
 OPEN = "/etc/omnid", "/opt/omnid", "/dev/vda", "/dev/kmsg"  # to everybody: it is the unit that closes them
@@ -31,7 +31,7 @@ TimeoutStartSec=400
 
 
 def reported() -> dict[str, Any]:
-    """What the daemon that runs now has found."""
+    """Return the report of the running daemon."""
     def is_there() -> bool:
         return REPORT.exists() and json.loads(REPORT.read_text())["pid"] == int(show("MainPID"))
 
@@ -57,33 +57,33 @@ def unit() -> Iterator[None]:
         yield
 
 
-def test_it_is_ready_when_it_says_so() -> None:
+def test_start_waits_until_it_is_ready() -> None:
     run("systemctl", "start", "omnid")  # waits for READY=1
     assert show("ActiveState") == "active" and show("StatusText").startswith("waiting for images")
 
 
-def test_its_threads_have_names_and_only_two_have_priority() -> None:
+def test_threads_have_names_and_only_two_have_priority() -> None:
     threads = {name: tuple(found) for name, found in reported()["threads"].items()}
     assert threads["motor"] == (FIFO, 20) and threads["lower"] == (FIFO, 10)
     assert {"image", "bus", "watchdog"} <= threads.keys()
     assert {found for name, found in threads.items() if name not in ("motor", "lower")} == {(OTHER, 0)}
 
 
-def test_its_memory_is_locked() -> None:
+def test_memory_is_locked() -> None:
     assert reported()["locked_kb"] > 100_000
 
 
-def test_only_its_own_folders_can_be_written() -> None:
+def test_writes_only_to_its_own_folders() -> None:
     assert {path: found == "done" for path, found in reported()["written"].items()} == {
         "/etc/omnid": False, "/opt/omnid": False, "/var/lib": False, "/var/lib/omnid": True, "/run/omnid": True}
 
 
-def test_cameras_and_serial_ports_are_open_to_it_and_nothing_else() -> None:
+def test_opens_only_cameras_and_serial_ports() -> None:
     assert {path: found == "done" for path, found in reported()["opened"].items()} == {
         "/dev/ttyS1": True, "/dev/video0": True, "/dev/vda": False, "/dev/kmsg": False}
 
 
-def test_this_machine_is_all_its_network_unless_more_is_allowed() -> None:
+def test_reaches_only_this_machine_unless_more_is_allowed() -> None:
     found = reported()
     assert found["reached"]["127.0.0.1"] == "done" and found["reached"]["192.168.1.5"] != "done"
     shutil.copy(SYSTEMD / "lan.conf", DROP_INS)
@@ -96,20 +96,20 @@ def test_a_stalled_stage_is_logged_and_the_daemon_restarted() -> None:
     pid = reported()["pid"]
     Path("/run/omnid/hang").touch()
     restarted(pid)
-    lines = said()
+    lines = journal()
     assert any(priority == 3 and text.startswith("stage 'image' is stalled") for priority, text in lines)
     assert any("in where_it_hangs" in text for _, text in lines)
     assert any(text == "omnid.service: Failed with result 'watchdog'." for _, text in lines)
 
 
-def test_a_daemon_that_is_killed_comes_back() -> None:
+def test_restarts_a_killed_daemon() -> None:
     pid = reported()["pid"]
     os.kill(pid, signal.SIGKILL)
     restarted(pid)
     assert int(show("NRestarts")) == 2
 
 
-def test_it_ends_when_it_is_told_to() -> None:
+def test_stops_on_request() -> None:
     reported()
     run("systemctl", "stop", "omnid")
     assert (show("ActiveState"), show("Result")) == ("inactive", "success")

@@ -1,6 +1,6 @@
-"""A daemon of the real parts that surround the stages, in which a stage hangs when it is told to.
+"""A daemon with the real graph, bus and service, in which a stage stalls on request.
 
-It leaves in /var/lib/omnid/report.json what it may do and what its threads are.
+It writes its rights and its threads to /var/lib/omnid/report.json.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class Image:
     """A stage that uses OpenCV, until it hangs."""
 
     def process(self, number: int) -> int:
-        """Takes its time."""
+        """Blur an image, and stall if requested."""
         cv2.blur(np.zeros((50, 50), np.uint8), (3, 3))
         if HANG.exists():
             self.where_it_hangs()
         return number
 
     def where_it_hangs(self) -> None:
-        """Does not come back."""
+        """Sleep for 1000 s."""
         HANG.unlink()
         time.sleep(1000)
 
@@ -69,7 +69,7 @@ class Speaker:
 
 
 def outcome(action: Callable[[], object]) -> str:
-    """How the action ends."""
+    """Return "done" or the error of an action."""
     try:
         action()
     except OSError as error:
@@ -78,17 +78,17 @@ def outcome(action: Callable[[], object]) -> str:
 
 
 def opened(path: str) -> str:
-    """Whether a device can be opened."""
+    """Return the result of opening a device."""
     return outcome(lambda: os.close(os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)))
 
 
 def reached(host: str) -> str:
-    """Whether a host answers."""
+    """Return the result of connecting to a host."""
     return outcome(lambda: socket.create_connection((host, PORT), 3).close())
 
 
 def threads() -> dict[str, tuple[int, int]]:
-    """Policy and priority by name (proc(5))."""
+    """Return policy and priority of the threads by name (proc(5))."""
     found = {}
     for task in TASKS.iterdir():
         words = (task / "stat").read_text().rpartition(")")[2].split()
@@ -97,7 +97,7 @@ def threads() -> dict[str, tuple[int, int]]:
 
 
 def report() -> dict[str, Any]:
-    """All that a test may want to know."""
+    """Return all facts that the tests check."""
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return {
         "pid": os.getpid(),
@@ -116,7 +116,7 @@ class Reporter:
         self._left = 20
 
     def __call__(self) -> None:
-        """Waits for all threads to be there."""
+        """Write the report at the 20th call, when all threads are running."""
         self._left -= 1
         if self._left == 0:
             text = json.dumps(report())

@@ -1,4 +1,4 @@
-"""The unit in the guest: what systemd and the journal say of it."""
+"""The unit in the guest: its state in systemd and its lines in the journal."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def until(what: Callable[[], object]) -> None:
 
 
 def restarted(pid: int) -> None:
-    """Waits for another daemon in the place of this one."""
+    """Wait until another process is the daemon."""
     until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
 
 
-def said() -> list[tuple[int, str]]:
-    """Priority and text of all that is in the journal of the unit."""
+def journal() -> list[tuple[int, str]]:
+    """Return priority and text of all lines in the journal of the unit."""
     lines = run("journalctl", "-u", "omnid", "--no-pager", "-o", "json").splitlines()
     return [(int(entry["PRIORITY"]), entry["MESSAGE"]) for entry in map(json.loads, lines)]

@@ -1,4 +1,4 @@
-"""What the daemon in the guest lives among: a world before its cameras, and an operator who drives."""
+"""The surroundings of the daemon in the guest: images for its cameras, and an operator who drives."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from tests.hardware.guest.unit import until
 
 SAMPLE = Path("/opt/omnid/omnid/sample")
 SIZE = 512, 512
-AGAIN_S = 0.5  # a camera shows a image that often
+REPEAT_S = 0.5  # period of an image that is repeated
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
 
 
 class Shown(NamedTuple):
-    """A image of the lower camera and when it was written."""
+    """An image of the lower camera and the time at which it was written."""
 
     at_ns: int  # CLOCK_MONOTONIC
     number: int  # in the log
 
 
-class World:
-    """What is before the cameras: the log, forwards and backwards, one step after each pose that was told of it."""
+class SampleLog:
+    """The sample log on both cameras, forwards and backwards, one step after each published pose."""
 
     def __init__(self) -> None:
         images = LogImages.load(SAMPLE / "log.mcap")
-        self._data = [[bytes(timed[1].data) for timed in eye] for eye in (images.lower, images.upper)]
+        self._data = [[bytes(timed[1].data) for timed in frames] for frames in (images.lower, images.upper)]
         self._last = min(map(len, self._data)) - 1
         self._step, self._moved = 0, threading.Event()
-        self._eyes: dict[Camera, Loopback] = {}
+        self._cameras: dict[Camera, Loopback] = {}
         self._lock = threading.Lock()
         self.shown: list[Shown] = []
         for camera in CAMERAS:
             self.open(camera)
-        threading.Thread(target=self._show_on, daemon=True).start()
+        threading.Thread(target=self._run, daemon=True).start()
 
     def open(self, camera: Camera) -> None:
-        """The camera shows images."""
+        """Connect a camera."""
         with self._lock:
-            self._eyes[camera] = Loopback(DEVICES[CAMERAS.index(camera)], "MJPG", SIZE)
+            self._cameras[camera] = Loopback(DEVICES[CAMERAS.index(camera)], "MJPG", SIZE)
 
     def close(self, camera: Camera) -> None:
-        """The camera shows nothing more."""
+        """Disconnect a camera."""
         with self._lock:
-            self._eyes.pop(camera).close()
+            self._cameras.pop(camera).close()
 
     def index(self, at_ns: int) -> int:
-        """Which image was shown at that time."""
+        """Return the number of the image that was shown at a time."""
         return self.shown[max(0, bisect.bisect([entry.at_ns for entry in self.shown], at_ns) - 1)].number
 
-    def heed(self, at_ns: int) -> None:
-        """There is a pose of the images of that time: if they are those that are shown, on to the next."""
+    def on_pose(self, at_ns: int) -> None:
+        """Show the next images after a pose of those that are shown now."""
         if self.shown and self.index(at_ns) == self._index:
             self._step += 1
             self._moved.set()
@@ -67,25 +67,25 @@ class World:
     def _index(self) -> int:
         return self._last - abs(self._step % (2 * self._last) - self._last)
 
-    def _show_on(self) -> None:
+    def _run(self) -> None:
         while True:
             self._moved.clear()
             self._show(self._index)
-            self._moved.wait(AGAIN_S)
+            self._moved.wait(REPEAT_S)
 
     def _show(self, index: int) -> None:
         with self._lock:
             self.shown.append(Shown(time.monotonic_ns(), index))
             for data, camera in zip(self._data, CAMERAS, strict=True):
-                if camera in self._eyes:
-                    self._eyes[camera].write(data[index])
+                if camera in self._cameras:
+                    self._cameras[camera].write(data[index])
 
 
-class Operator:
-    """Hears the daemon and sends it commands, several in a second, while it wants the robot to drive."""
+class GuestOperator:
+    """Receives the messages of the daemon, and sends it commands at 3 Hz while `driving` is set."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, sample_log: SampleLog) -> None:
+        self._sample_log = sample_log
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self.poses: list[Pose] = []
         self.report: Diagnostics | None = None
@@ -97,22 +97,22 @@ class Operator:
         self._thread.start()
 
     def close(self) -> None:
-        """Leaves; a session that is open keeps Python from ending."""
+        """Close the session, which would keep Python from ending."""
         self._leaving.set()
         self._thread.join()
         self._robot.close()
 
     def index(self, pose: Pose) -> int:
-        """The image it is a pose of."""
-        return self._world.index(pose.stamp_ns - self._offset_ns)
+        """Return the number of the image of a pose."""
+        return self._sample_log.index(pose.stamp_ns - self._offset_ns)
 
     def message(self, part: str) -> str:
-        """What the daemon last said of a part."""
+        """Return the last status message of a part of the daemon."""
         statuses = () if self.report is None else self.report.statuses
         return next((status.message for status in statuses if status.name == f"omnid: {part}"), "")
 
     def more(self, count: int) -> list[Pose]:
-        """Waits for so many more poses."""
+        """Wait for more poses and return them."""
         before = len(self.poses)
         until(lambda: len(self.poses) >= before + count)
         return self.poses[before:]
@@ -120,7 +120,7 @@ class Operator:
     def _take(self, topic: str, payload: bytes, note: bytes) -> None:
         if topic == "odom":
             self.poses.append(decode_pose(payload, note))
-            self._world.heed(self.poses[-1].stamp_ns - self._offset_ns)
+            self._sample_log.on_pose(self.poses[-1].stamp_ns - self._offset_ns)
         elif topic == "status" and len((report := decode_diagnostics(payload)).statuses) > 1:  # else of a change alone
             self.report = report
 
