@@ -1,4 +1,4 @@
-"""Runs the command line in this process, and reads what it wrote."""
+"""Calls of the command line in this process, with its output."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Result(NamedTuple):
     err: str
 
     def count(self, name: str) -> int:
-        """A counter of the summary, such as `pairs`, `late`, `unpaired_lower`."""
+        """Return a counter of the summary, such as `pairs`, `late`, `unpaired_lower`."""
         found = re.search(rf"\b{name} +(\d+)", self.out)
         assert found, f"{name} is not in:\n{self.out}"
         return int(found[1])
 
 
 class Command:
-    """omnid, called as a function."""
+    """The command line as a function."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
@@ -39,18 +39,18 @@ class Command:
         return Result(code, *self._capsys.readouterr())
 
     def replay(self, log: Path, *words: object, rig: Path | None = None) -> Result:
-        """`omnid replay` without progress."""
+        """Run `omnid replay` without progress."""
         return self("replay", log, *(["--rig", rig] if rig else []), "--quiet", *words)
 
     def refused(self, *words: object) -> str:
-        """The one line with which the command refuses its input."""
+        """Return the line with which the command refuses its input; fail if there is any other output."""
         code, out, err = self(*words)
         assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("omnid: "), (code, out, err)
         return err
 
 
 def rows(tum: Path) -> Sequence[str]:
-    """The lines of a trajectory, each of which must be whole."""
+    """Return the lines of a trajectory; fail if one is not whole."""
     text = tum.read_text("ascii")
     assert text == "" or text.endswith("\n")
     assert all(len(line.split()) == 8 for line in text.splitlines())

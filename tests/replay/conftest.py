@@ -12,13 +12,13 @@ from tests.replay.command import Command
 
 @pytest.fixture
 def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
-    """The command line, called as a function."""
+    """Return the command line as a function."""
     return Command(capsys)
 
 
 @pytest.fixture
 def unused_tcp_port() -> int:
-    """A port on this machine that was free a moment ago."""
+    """Return a port that was free a moment ago."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -26,6 +26,6 @@ def unused_tcp_port() -> int:
 
 @pytest.fixture
 def taken_port() -> Iterator[int]:
-    """A port on this machine on which somebody listens."""
+    """Yield a port on which a server listens."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield int(server.getsockname()[1])

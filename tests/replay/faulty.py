@@ -1,8 +1,8 @@
-"""`omnid run` on a log whose cameras can be spoilt: lines on the standard input say which and how.
+"""`omnid run` on a log whose cameras are made faulty by lines on the standard input.
 
     upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
-    lower cut       halves of JPEGs           both ok         as they are
-    clock 3600      the time of day is that many seconds ahead
+    lower cut       halves of JPEGs           both ok         no fault
+    clock 3600      the system clock is that many seconds ahead
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from omnid.runs.live import LiveRun
 TIME, TIME_NS = time.time, time.time_ns
 
 
-class SpoiltCamera(LogCamera):
-    """A log's camera with something done to its images."""
+class FaultyCamera(LogCamera):
+    """A camera of a log with a fault in its images."""
 
     def __init__(self, images: LogImages, camera: Camera, epoch_ns: int, faults: dict[str, str]) -> None:
         super().__init__(images, camera, epoch_ns)
@@ -39,13 +39,13 @@ class SpoiltCamera(LogCamera):
         self._rng = random.Random(1)
 
     def frames(self) -> Iterator[Frame]:
-        """The images, spoilt."""
+        """Yield the images with the fault."""
         for frame in super().frames():
             fault = self._faults.get(self._camera, "ok")
             if fault != "mute":
-                yield replace(frame, data=self._spoilt(fault, bytes(frame.data)))
+                yield replace(frame, data=self._with_fault(fault, bytes(frame.data)))
 
-    def _spoilt(self, fault: str, data: bytes) -> bytes:
+    def _with_fault(self, fault: str, data: bytes) -> bytes:
         match fault:
             case "garbage":
                 return b"\xff\xd8\xff" + self._rng.randbytes(len(data)) + b"\xff\xd9"
@@ -56,24 +56,24 @@ class SpoiltCamera(LogCamera):
         return data
 
 
-def obey(faults: dict[str, str]) -> None:
-    """Takes the lines."""
+def read_faults(faults: dict[str, str]) -> None:
+    """Read faults from the standard input until it ends."""
     for line in sys.stdin:
-        whom, fault = line.split()
-        if whom == "clock":
+        camera, fault = line.split()
+        if camera == "clock":
             step_clock(int(fault))
             continue
-        faults.update(dict.fromkeys(("lower", "upper") if whom == "both" else (whom,), fault))
+        faults.update(dict.fromkeys(("lower", "upper") if camera == "both" else (camera,), fault))
 
 
 def step_clock(step_s: int) -> None:
-    """Stands for a step of the system's clock, which is not ours to set."""
+    """Set the clock of this process, in place of the system's."""
     time.time = lambda: TIME() + step_s
     time.time_ns = lambda: TIME_NS() + step_s * 10**9
 
 
 def main() -> int:
-    """The exit code of the daemon."""
+    """Run the daemon and return its exit code."""
     parser = argparse.ArgumentParser()
     for name in ("--log", "--rig"):
         parser.add_argument(name, type=Path, required=True)
@@ -81,10 +81,10 @@ def main() -> int:
     parser.add_argument("--set", action="append", dest="settings", default=[])
     args = parser.parse_args()
     faults: dict[str, str] = {}
-    threading.Thread(target=obey, args=(faults,), daemon=True).start()
+    threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
     images, epoch_ns = LogImages.load(args.log), time.monotonic_ns()
     config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
-    live = LiveRun(config, lambda camera: SpoiltCamera(images, camera, epoch_ns, faults),
+    live = LiveRun(config, lambda camera: FaultyCamera(images, camera, epoch_ns, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()
 

@@ -1,4 +1,4 @@
-"""Both ends of a live daemon, for real: an operator on the bus, and a controller that notes what it is told."""
+"""A live daemon as a process, with an operator on the bus and a simulated base that keeps its commands."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0  # bounds a wait on a loaded machine; nothing is measured against it
-COMMANDS_S = 0.05  # between two commands of the operator
+PATIENCE_S = 60.0  # timeout of a wait on a loaded machine; not a measured time
+COMMAND_PERIOD_S = 0.05  # of the operator's commands
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def wait_until(happens: Callable[[], object], what: str = "it", patience_s: float = PATIENCE_S) -> None:
-    """Returns once it happens; AssertionError after the patience."""
+    """Return once it happens; raise AssertionError after the timeout."""
     deadline_s = time.monotonic() + patience_s
     while not happens():
         assert time.monotonic() < deadline_s, f"{what} did not happen within {patience_s:g} s"
@@ -37,75 +37,75 @@ def wait_until(happens: Callable[[], object], what: str = "it", patience_s: floa
 
 
 def free_port() -> int:
-    """A port on this machine that was free a moment ago."""
+    """Return a port that was free a moment ago."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def answers(port: int) -> bool:
-    """Whether somebody listens on the port."""
+    """True if a server listens on the port."""
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-class Told(NamedTuple):
-    """What the controller had been told by then."""
+class CommandNote(NamedTuple):
+    """The wheel speeds that were set at a time."""
 
     at_s: float
     wheels_mps: tuple[float, float]
 
 
-class NotedLine(SimulatedLine):
-    """The twin's controller, with notes; bounded by the length of a test."""
+class RecordedLine(SimulatedLine):
+    """A simulated controller that keeps the wheel speeds of every command."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.notes: list[Told] = []
+        self.notes: list[CommandNote] = []
 
     def feed(self, data: bytes) -> bytes:
-        """The answers; what is told by now is noted."""
+        """Return the answers of the controller."""
         answer = super().feed(data)
-        self.notes.append(Told(time.monotonic(), (self.base.commanded_mps[0], self.base.commanded_mps[1])))
+        self.notes.append(CommandNote(time.monotonic(), (self.base.commanded_mps[0], self.base.commanded_mps[1])))
         return answer
 
     def moved_since(self, at_s: float) -> bool:
-        """Whether a wheel was told to turn after that time."""
+        """True if a wheel was commanded to turn after that time."""
         return any(note.at_s > at_s and any(note.wheels_mps) for note in list(self.notes))
 
 
 class Base:
-    """A robot's base behind a name that stays; it can be unplugged and plugged in again."""
+    """A simulated base behind a persistent name; it can be unplugged and plugged in again."""
 
     def __init__(self, folder: Path) -> None:
-        self.line = NotedLine()
+        self.line = RecordedLine()
         self.port = folder / "motor"
         self.twin = SimulatedMotor(self.line)
         self.port.symlink_to(self.twin.port)
 
     @property
     def drives(self) -> bool:
-        """Whether the wheels are told to turn now."""
+        """True if the wheels are commanded to turn now."""
         return any(self.line.base.commanded_mps)
 
     def unplug(self) -> None:
-        """The port is gone."""
+        """Remove the port."""
         self.port.unlink()
         self.twin.close()
 
     def plug_in(self) -> None:
-        """Another pty under the same name; the controller has started anew."""
-        self.line = NotedLine()
+        """Open another pty under the same name; the controller starts again."""
+        self.line = RecordedLine()
         self.twin = SimulatedMotor(self.line)
         self.port.symlink_to(self.twin.port)
 
     def close(self) -> None:
-        """Lets go of the pty."""
+        """Close the pty."""
         self.twin.close()
 
 
 class Operator:
-    """A zenoh peer beside the daemon: hears poses and states, sends commands at 20 Hz once it is told to."""
+    """A zenoh peer: receives poses and statuses, and sends commands at 20 Hz between `drive` and `stop_sending`."""
 
     def __init__(self, port: int) -> None:
         config = zenoh.Config()
@@ -114,8 +114,8 @@ class Operator:
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         self.poses: list[codec.OdometryRecord] = []
-        self.states: dict[str, Any] = {}  # newest diagnostic status by name
-        self.said: set[tuple[str, str]] = set()  # part and message, all there were
+        self.states: dict[str, Any] = {}  # newest status by name
+        self.messages: set[tuple[str, str]] = set()  # part and message, all there were
         self._session = zenoh.open(config)
         self._session.declare_subscriber("omnid/odom", self._pose)
         self._session.declare_subscriber("omnid/status", self._state)
@@ -125,35 +125,35 @@ class Operator:
         self._thread.start()
 
     def drive(self, velocity_mps: float = 0.3, heading_rad: float = 0.0) -> None:
-        """Sends this from now on."""
+        """Send this command from now on."""
         self._wish = velocity_mps, heading_rad
 
-    def cease(self) -> None:
-        """Sends no more."""
+    def stop_sending(self) -> None:
+        """Send no more commands."""
         self._wish = None
 
     def send(self, key: str, payload: bytes) -> None:
-        """Sends anything once."""
-        self._session.put(f"omnid/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)  # not one is lost
+        """Send a message once."""
+        self._session.put(f"omnid/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)  # none is dropped
 
     def message(self, part: str) -> str:
-        """What the daemon last said about a part."""
+        """Return the newest message of a status."""
         status = self.states.get(f"omnid: {part}")
         return "" if status is None else status.message
 
     def values(self, part: str) -> dict[str, str]:
-        """The values it last gave for a part."""
+        """Return the newest values of a status."""
         status = self.states.get(f"omnid: {part}")
         return {} if status is None else {pair.key: pair.value for pair in status.values}
 
     def close(self) -> None:
-        """Leaves the bus."""
+        """Close the session."""
         self._leaving.set()
         self._thread.join()
         self._session.close()  # type: ignore[no-untyped-call]
 
     def _send_on(self) -> None:
-        while not self._leaving.wait(COMMANDS_S):
+        while not self._leaving.wait(COMMAND_PERIOD_S):
             wish = self._wish
             if wish is not None:
                 self.send("cmd/heading", codec.heading_cdr(time.time_ns(), *wish))
@@ -164,44 +164,44 @@ class Operator:
     def _state(self, sample: zenoh.Sample) -> None:
         message: Any = STORE.deserialize_cdr(sample.payload.to_bytes(), codec.DIAGNOSTICS_SCHEMA)
         for status in message.status:
-            if len(message.status) > 1:  # else it only tells that the state of the odometry has changed
+            if len(message.status) > 1:  # a single status only reports a new state of the odometry
                 self.states[status.name] = status
-            self.said.add((status.name.removeprefix("omnid: "), status.message))
+            self.messages.add((status.name.removeprefix("omnid: "), status.message))
 
 
 class Daemon:
-    """A running daemon, heard by its operator; `tell` reaches the standard input of tests.replay.faulty."""
+    """A running daemon; `write_line` writes to the standard input of tests.replay.faulty."""
 
     def __init__(self, process: subprocess.Popen[str], port: int) -> None:
         self.process, self.port = process, port
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
+        """True if the process runs."""
         return self.process.poll() is None
 
     @property
-    def steering(self) -> int:
-        """The process that steers."""
+    def controller_pid(self) -> int:
+        """Process id of the controller."""
         tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
         children = [int(word) for task in tasks for word in (task / "children").read_text().split()]
         return next(pid for pid in children if "omnid.controller.process" in Path(f"/proc/{pid}/cmdline").read_text())
 
-    def tell(self, line: str) -> None:
-        """One line for its standard input."""
+    def write_line(self, line: str) -> None:
+        """Write a line to its standard input."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        """The exit code and what was said on stderr, after a signal."""
+        """Send a signal and return the exit code and stderr."""
         self.process.send_signal(number)
         _, err = self.process.communicate(timeout=PATIENCE_S)
         return self.process.returncode, err
 
 
 def command_line(scene: Path, port: int, motor: Path | None, *words: object, module: str = "omnid") -> list[str]:
-    """`omnid run` on the images of a scene."""
+    """Return the command of `omnid run` on the images of a scene."""
     run = [] if module != "omnid" else ["run"]
     log = ["--log", scene / "log.mcap", "--rig", scene / "rig.toml"]
     wheels = [] if motor is None else ["--motor", motor]
@@ -212,7 +212,7 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
 
 @contextmanager
 def started(command: list[str], port: int) -> Iterator[Daemon]:
-    """A daemon, ended at the latest with the block."""
+    """Yield a daemon that is killed at the end of the block."""
     pipe = subprocess.PIPE
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
@@ -224,14 +224,14 @@ def started(command: list[str], port: int) -> Iterator[Daemon]:
 
 @contextmanager
 def robot(scene: Path, folder: Path, *words: object, module: str = "omnid") -> Iterator[tuple[Daemon, Operator, Base]]:
-    """A daemon that has given its first pose, its operator, and the base, which stands."""
+    """Yield a daemon after its first pose, its operator, and its base, which stands."""
     port = free_port()
     with ExitStack() as ends:
         base = Base(folder)
         ends.callback(base.close)
         command = command_line(scene, port, base.port, *words, module=module)
         daemon = ends.enter_context(started(command, port))
-        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
+        wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         assert daemon.alive, daemon.process.communicate()[1]
         operator = Operator(port)
         ends.callback(operator.close)

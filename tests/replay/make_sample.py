@@ -1,4 +1,4 @@
-"""Makes the log that `omnid demo` replays: two_walls at 512x512, grey, with its rig attached.
+"""Make the log that `omnid demo` replays: two_walls at 512x512, grey, with its rig attached.
 
     python -m tests.replay.make_sample ../shared/data/two_walls omnid/sample
 """
@@ -28,13 +28,13 @@ SCHEMA = "sensor_msgs/msg/CompressedImage"
 
 
 def main() -> None:
-    """Writes log.mcap and truth.txt."""
+    """Write log.mcap and truth.txt."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("source", type=Path, help="folder with log.mcap, camchain.yaml and truth.txt")
     parser.add_argument("target", type=Path, help="folder of the package")
     parser.add_argument("--quality", type=int, default=QUALITY, help="of the JPEGs")
     args = parser.parse_args()
-    rig = smaller(import_kalibr(args.source / "camchain.yaml"))
+    rig = reduced(import_kalibr(args.source / "camchain.yaml"))
     reader = LogReader(args.source / "log.mcap")
     with LogWriter(args.target / "log.mcap", {"rig.toml": rig_toml(rig).encode()}, compression="none") as writer:
         for frame in reader.frames():
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def message(frame: Frame, quality: int) -> bytes:
-    """The frame's image, shrunk, as CDR."""
+    """Return the frame's image, reduced in size, as CDR."""
     small = cv2.resize(gray(frame), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1])[1]
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -54,12 +54,12 @@ def message(frame: Frame, quality: int) -> bytes:
     return bytes(store.serialize_cdr(image, SCHEMA))
 
 
-def smaller(rig: Rig) -> Rig:
-    """The rig of the smaller images."""
-    return replace(rig, lower=_smaller(rig.lower), upper=_smaller(rig.upper))
+def reduced(rig: Rig) -> Rig:
+    """Return the rig of the reduced images."""
+    return replace(rig, lower=_reduced_camera(rig.lower), upper=_reduced_camera(rig.upper))
 
 
-def _smaller(mounted: MountedCamera) -> MountedCamera:
+def _reduced_camera(mounted: MountedCamera) -> MountedCamera:
     camera = mounted.camera
     assert isinstance(camera, UnifiedCamera)
     s = SIDE_PX / camera.size[0]

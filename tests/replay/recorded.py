@@ -1,4 +1,4 @@
-"""A recording that `omnid run` made: somebody drives it, simulated wheels obey."""
+"""A recording of `omnid run` with a driven simulated base."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from tests.replay.live import Base, Operator, answers, command_line, free_port, 
 
 
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
-    """The recording of so many poses and more, with images slow enough that an idle machine drops none."""
+    """Return a recording of at least so many poses, at half speed so that an idle machine drops no image."""
     port, base, kept = free_port(), Base(folder), folder / "kept"
     more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={kept}", "--set",
             "record.free_mb=0")
     with started(command_line(scene, port, base.port, *more), port) as daemon:
-        wait_until(lambda: answers(port) or not daemon.alive, "the daemon's voice")
+        wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         operator = Operator(port)
         operator.drive(0.3)
         wait_until(lambda: len(operator.poses) > poses and base.drives, "poses and motion")

@@ -1,4 +1,4 @@
-"""Bad input on real bytes: what can be used is used and counted, what cannot is refused in one line."""
+"""Wrong input: usable parts are used and losses are counted, the rest is refused in one line."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from tests.replay.edited import images, save
 
 
 @pytest.mark.parametrize("content", [b"", b"omnid\n" * 1000, bytes(range(256)) * 64])
-def test_no_mcap(omnid: Command, tmp_path: Path, scene: Path, content: bytes) -> None:
+def test_refuses_a_file_that_is_no_mcap(omnid: Command, tmp_path: Path, scene: Path, content: bytes) -> None:
     (tmp_path / "log.mcap").write_bytes(content)
     error = omnid.refused("replay", tmp_path / "log.mcap", "--rig", scene / "rig.toml")
     assert "log.mcap" in error
 
 
-def test_no_such_log(omnid: Command, tmp_path: Path) -> None:
+def test_refuses_a_missing_log(omnid: Command, tmp_path: Path) -> None:
     assert "absent.mcap" in omnid.refused("replay", tmp_path / "absent.mcap")
 
 
-def test_truncated_log_is_used_as_far_as_it_is_whole(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log, tum = save(tmp_path / "log.mcap", images(scene / "log.mcap")), tmp_path / "est.txt"
     whole = log.read_bytes()
     log.write_bytes(whole[: len(whole) * 6 // 10])
@@ -37,20 +37,20 @@ def test_truncated_log_is_used_as_far_as_it_is_whole(omnid: Command, tmp_path: P
     assert len(rows(tum)) == result.count("pairs")
 
 
-def test_no_image_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_refuses_a_log_without_image_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = write_log(tmp_path / "log.mcap", [Entry("/chatter", "std_msgs/msg/String", text("hello"), 10**18)])
     assert "no image topics" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
 
 
 @pytest.mark.parametrize("camera", ["lower", "upper"])
-def test_one_camera_only(omnid: Command, tmp_path: Path, scene: Path, camera: str) -> None:
+def test_refuses_a_log_with_one_camera(omnid: Command, tmp_path: Path, scene: Path, camera: str) -> None:
     log = save(tmp_path / "log.mcap", [p for p in images(scene / "log.mcap") if p.camera == camera])
     missing = {"lower": "upper", "upper": "lower"}[camera]
     assert f"no {missing} camera" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_rig_of_another_image_size(omnid: Command, tmp_path: Path, scene: Path, masks: bool) -> None:
+def test_refuses_a_rig_of_another_image_size(omnid: Command, tmp_path: Path, scene: Path, masks: bool) -> None:
     rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
     (tmp_path / "rig.toml").write_text(rig if masks else without_masks(rig))
     error = omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet")
@@ -62,16 +62,16 @@ def without_masks(rig: str) -> str:
     return "\n\n".join(table for table in tables if ".mask]" not in table) + "\n"
 
 
-def test_no_rig(omnid: Command, scene: Path) -> None:
+def test_refuses_a_log_without_a_rig(omnid: Command, scene: Path) -> None:
     assert "omnid calibrate import" in omnid.refused("replay", scene / "log.mcap")
 
 
-def test_broken_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_refuses_a_broken_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
     (tmp_path / "rig.toml").write_text("schema = 1\n[lower]\nmodel = 7\n")
     assert "rig.toml" in omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml")
 
 
-def test_broken_jpegs_are_counted_and_skipped(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_skips_and_counts_broken_jpegs(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
     broken = {0: b"", 9: b"no image at all", 20: taken[20].jpeg[: len(taken[20].jpeg) // 2]}
     log = save(tmp_path / "log.mcap", [replace(p, jpeg=broken.get(i, p.jpeg)) for i, p in enumerate(taken)])
@@ -81,14 +81,14 @@ def test_broken_jpegs_are_counted_and_skipped(omnid: Command, tmp_path: Path, sc
     assert len(rows(tmp_path / "est.txt")) == result.count("pairs") == PAIRS - 3
 
 
-def test_all_jpegs_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_warns_if_all_jpegs_are_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in images(scene / "log.mcap")])
     result = omnid.replay(log, "--tum", tmp_path / "t", "--map", tmp_path / "m", rig=scene / "rig.toml")
     assert result.code == 1 and result.count("broken") == 2 * PAIRS and result.count("pairs") == 0
     assert "no pair of images" in result.err
 
 
-def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_the_order_in_the_log_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
     delays = random.Random(1)
     shuffled = sorted(taken, key=lambda p: p.pair + delays.uniform(0, 5))
@@ -99,7 +99,7 @@ def test_order_of_arrival_changes_nothing(omnid: Command, tmp_path: Path, scene:
     assert (tmp_path / "est.txt").read_bytes() == (tmp_path / "shuffled.txt").read_bytes()
 
 
-def test_late_and_double_images_are_counted(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_counts_late_and_duplicate_images(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
     late, rest = taken[10], taken[:10] + taken[11:]
     log = save(tmp_path / "log.mcap", [*rest[:8], rest[7], *rest[8:40], late, *rest[40:]])
@@ -109,17 +109,17 @@ def test_late_and_double_images_are_counted(omnid: Command, tmp_path: Path, scen
 
 
 @pytest.mark.parametrize("option", ["--tum", "--map", "--plan", "--record"])
-def test_unwritable_output_is_said_before_the_work(omnid: Command, tmp_path: Path, scene: Path, option: str) -> None:
+def test_refuses_an_unwritable_output_before_the_run(omnid: Command, tmp_path: Path, scene: Path, option: str) -> None:
     kept = tmp_path / "kept.txt"
-    kept.write_text("yesterday's work")
+    kept.write_text("previous result")
     other = "--tum" if option != "--tum" else "--map"
     for path, reason in ((tmp_path / "absent" / "x", "no folder"), (tmp_path, "folder"), (Path("/proc/x"), "/proc/x")):
         error = omnid.refused("replay", tmp_path / "absent.mcap", other, kept, option, path)
         assert reason in error and option in error
-    assert kept.read_text() == "yesterday's work" and list(tmp_path.iterdir()) == [kept]
+    assert kept.read_text() == "previous result" and list(tmp_path.iterdir()) == [kept]
 
 
-def test_a_refused_run_leaves_nothing_behind(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_refused_run_leaves_no_files(omnid: Command, tmp_path: Path, scene: Path) -> None:
     omnid.refused("replay", scene / "log.mcap", "--tum", tmp_path / "fresh", "--record", tmp_path / "absent" / "x")
     assert list(tmp_path.iterdir()) == []
 
@@ -132,7 +132,7 @@ def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tm
     assert log.read_bytes() == before
 
 
-def test_nothing_that_is_read_is_written_over(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
     bag, rig, settings = tmp_path / "bag", tmp_path / "rig.toml", tmp_path / "omnid.toml"
     bag.mkdir()
     shutil.copy(scene / "log.mcap", bag / "bag_0.mcap")
@@ -147,21 +147,21 @@ def test_nothing_that_is_read_is_written_over(omnid: Command, tmp_path: Path, sc
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_a_run_without_a_pair_leaves_what_was_there(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Refused when the first image comes, or ended without one: yesterday's results stay."""
+def test_a_run_without_a_pair_keeps_existing_files(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """It is refused at the first image, or it ends without one."""
     rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
     (tmp_path / "other.toml").write_text(rig)
     kept = {option: tmp_path / option for option in ("--tum", "--map", "--plan", "--record")}
     for path in kept.values():
-        path.write_text("yesterday's work")
+        path.write_text("previous result")
     files = [word for option, path in kept.items() for word in (option, path)]
     omnid.refused("replay", scene / "log.mcap", "--quiet", "--rig", tmp_path / "other.toml", *files)
     save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in images(scene / "log.mcap")])
     omnid.replay(tmp_path / "log.mcap", *files, rig=scene / "rig.toml")
-    assert [path.read_text() for path in kept.values()] == ["yesterday's work"] * 4
+    assert [path.read_text() for path in kept.values()] == ["previous result"] * 4
 
 
-def test_paths_that_no_file_can_have(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_refuses_impossible_paths(omnid: Command, tmp_path: Path, scene: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for path in (tmp_path / "loop", tmp_path / ("x" * 300), scene / "rig.toml" / "x", Path("-")):
         omnid.refused("replay", path, "--rig", scene / "rig.toml", "--tum", tmp_path / "x")
@@ -172,24 +172,24 @@ def test_paths_that_no_file_can_have(omnid: Command, tmp_path: Path, scene: Path
     assert not (tmp_path / "x").exists() and not Path("-").exists()
 
 
-def test_an_output_through_a_link_leaves_the_link(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_an_output_through_a_link_keeps_the_link(omnid: Command, tmp_path: Path, scene: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "real")
     assert omnid.replay(scene / "log.mcap", "--tum", tmp_path / "link", rig=scene / "rig.toml").code == 0
     assert (tmp_path / "link").is_symlink() and len(rows(tmp_path / "real")) == PAIRS
 
 
-def test_a_device_is_not_replaced_by_a_map(omnid: Command, scene: Path) -> None:
+def test_does_not_replace_a_device_by_a_map(omnid: Command, scene: Path) -> None:
     assert "device" in omnid.refused("replay", scene / "log.mcap", "--map", "/dev/null")
     assert Path("/dev/null").is_char_device()
 
 
 @pytest.mark.parametrize("setting", ["panorama.margin_px=100", "panorama.width_px=64"])
-def test_too_little_to_see(omnid: Command, scene: Path, setting: str) -> None:
+def test_refuses_a_panorama_that_is_too_small(omnid: Command, scene: Path, setting: str) -> None:
     assert "panorama" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--set",
                                        setting)
 
 
-def test_disparities_beyond_the_image(omnid: Command, scene: Path) -> None:
+def test_limits_the_disparities_to_the_image(omnid: Command, scene: Path) -> None:
     result = omnid.replay(scene / "log.mcap", "--set", "stereo.matching.disparities=512", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS
 
@@ -199,15 +199,15 @@ def test_disparities_beyond_the_image(omnid: Command, scene: Path) -> None:
     [("stereo.matching.window=9", "stereo.matching.window_px"), ("odometry.noise_px=fine", "odometry.noise_px"),
      ("pair.tolerance_ms=-1", "pair.tolerance_ms"), ("nonsense", "="), ("odometry.method=magic", "'paper'")],
 )
-def test_wrong_setting_is_named(omnid: Command, scene: Path, setting: str, named: str) -> None:
+def test_names_a_wrong_setting(omnid: Command, scene: Path, setting: str, named: str) -> None:
     assert named in omnid.refused("replay", scene / "log.mcap", "--set", setting)
 
 
-def test_wrong_arguments_are_one_line(omnid: Command) -> None:
+def test_refuses_wrong_arguments_in_one_line(omnid: Command) -> None:
     for words in ([], ["fly"], ["replay"], ["replay", "x", "--method", "magic"], ["eval", "a"], ["--what"]):
         omnid.refused(*words)
 
 
-def test_absent_motor_is_said_before_the_work(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_refuses_a_missing_motor_before_the_run(omnid: Command, tmp_path: Path, scene: Path) -> None:
     error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", tmp_path / "tty")
     assert "motor port" in error

@@ -1,4 +1,4 @@
-"""No fault ends the daemon or moves the wheels unasked; `python -m tests.replay.faults` prints what became of each."""
+"""No fault ends the daemon or moves the wheels without a command; `python -m tests.replay.faults` lists the results."""
 
 from __future__ import annotations
 

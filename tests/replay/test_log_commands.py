@@ -1,4 +1,4 @@
-"""`omnid log` and `omnid record` from the outside: killed recordings made whole, and any bytes survived."""
+"""`omnid log` and `omnid record` as programs: recovery of killed recordings, and any bytes as input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Camera(LogCamera):
     def frames(self):
         for frame in super().frames():
             line = f"{frame.camera} {frame.stamp_ns + time.time_ns() - time.monotonic_ns()}\\n"
-            os.write(1, line.encode())  # whole, whoever else writes
+            os.write(1, line.encode())  # one write, so that the lines of both threads do not mix
             yield frame
 
 cameras = {name: Camera(images, name, start_ns, pace=3.0) for name in ("lower", "upper")}
@@ -48,7 +48,7 @@ record(cameras, config, rig.read_text(), lambda *_: None)
 
 
 def recording(scene: Path, folder: Path) -> subprocess.Popen[str]:
-    """A program that records the scene at 30 images a second of either camera, and prints their stamps."""
+    """Start a program that records the scene at 30 images a second of each camera, and prints their stamps."""
     command = [sys.executable, "-c", RECORDS, str(scene / "log.mcap"), str(scene / "rig.toml"), str(folder)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
@@ -58,7 +58,7 @@ def printed(process: subprocess.Popen[str], count: int) -> list[int]:
     return [int(process.stdout.readline().split()[1]) for _ in range(count)]
 
 
-def test_a_kill_costs_at_most_a_second_and_the_rest_is_whole_again(
+def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(
     tmp_path: Path, scene: Path, omnid: Command
 ) -> None:
     folder = tmp_path / "log"
@@ -78,16 +78,16 @@ def test_a_kill_costs_at_most_a_second_and_the_rest_is_whole_again(
     with AnyReader([path]) as bag:
         times = [stamp for _, stamp, _ in bag.messages()]
     assert len(times) == saved and max(stamps) - max(times) < 10**9
-    shortly_before_ns = max(times) - 216_000_000  # what the cameras gave at the same time may come in any order
+    shortly_before_ns = max(times) - 216_000_000  # the order of simultaneous images of both cameras is arbitrary
     assert sum(stamp < shortly_before_ns for stamp in times) == sum(stamp < shortly_before_ns for stamp in stamps)
     replayed = omnid.replay(path, "--inline")
     assert replayed.code == 0, replayed.err
-    alone = replayed.count("unpaired_lower") + replayed.count("unpaired_upper")  # the busy machine was too late for it
+    alone = replayed.count("unpaired_lower") + replayed.count("unpaired_upper")  # dropped on a busy machine
     assert 2 * replayed.count("pairs") + alone == saved and replayed.count("poses") == replayed.count("pairs") > 50
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_recording_whole(tmp_path: Path, scene: Path, number: int) -> None:
+def test_a_signal_leaves_a_whole_recording(tmp_path: Path, scene: Path, number: int) -> None:
     folder = tmp_path / "log"
     with recording(scene, folder) as process:
         printed(process, 20)
@@ -100,14 +100,14 @@ def test_a_signal_ends_the_recording_whole(tmp_path: Path, scene: Path, number: 
     assert path.suffix == ".mcap" and count == 20 + rest.count("\n")
 
 
-def test_the_command_says_in_one_line_why_it_cannot(omnid: Command, tmp_path: Path) -> None:
+def test_refuses_wrong_input_in_one_line(omnid: Command, tmp_path: Path) -> None:
     code, _, err = omnid("record", tmp_path / "log", "--set", "cameras.lower=/dev/no/such")
     assert code == 2 and re.search(r"/dev/no/such", err) and "Traceback" not in err
     assert not os.path.exists(tmp_path / "log")
     assert "rig.toml" in omnid.refused("record", "--rig", tmp_path / "rig.toml")
 
 
-def test_info_tells_what_is_in_a_log(omnid: Command, tmp_path: Path) -> None:
+def test_info_shows_the_content_of_a_log(omnid: Command, tmp_path: Path) -> None:
     noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
     path = write_log(tmp_path / "log.mcap", [*pairs(11), *noise], [("rig.toml", bytes(2000))])
     code, out, err = omnid("log", "info", path)
@@ -119,7 +119,7 @@ def test_info_tells_what_is_in_a_log(omnid: Command, tmp_path: Path) -> None:
     assert re.search(r"/chatter +std_msgs/msg/String +1 +-\n", out)
 
 
-def test_info_tells_what_is_wrong_and_what_to_do(omnid: Command, tmp_path: Path) -> None:
+def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(11), [("rig.toml", bytes(2000))])
     bare = write_log(tmp_path / "bare.mcap", pairs(2), **BARE)
     os.truncate(path, path.stat().st_size - 1)
@@ -130,7 +130,7 @@ def test_info_tells_what_is_wrong_and_what_to_do(omnid: Command, tmp_path: Path)
     assert code == 2 and "No such file" in err and LOWER in out
 
 
-def test_a_log_that_is_being_written_is_said_to_be(omnid: Command, tmp_path: Path) -> None:
+def test_refuses_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log.mcap") as log:
         for entry in pairs(20):
             log.write(*entry)
@@ -139,7 +139,7 @@ def test_a_log_that_is_being_written_is_said_to_be(omnid: Command, tmp_path: Pat
         assert "being written" in omnid.refused("log", "recover", tmp_path / "log.mcap")
 
 
-def test_recover_says_what_it_did_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
+def test_recover_reports_its_result_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(30), [("rig.toml", b"1")])
     assert "was already whole" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
     os.truncate(path, path.stat().st_size - 1)
@@ -150,7 +150,7 @@ def test_recover_says_what_it_did_and_overwrites_nothing(omnid: Command, tmp_pat
     assert "No such file" in omnid.refused("log", "recover", tmp_path / "no.mcap")
 
 
-def test_no_bytes_give_a_traceback(omnid: Command, tmp_path: Path) -> None:
+def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:
     whole = write_log(tmp_path / "whole.mcap", pairs(5), [("rig.toml", b"1")], chunk_size=700).read_bytes()
     path, out, chance = tmp_path / "log.mcap", tmp_path / "out.mcap", random.Random(3)
     codes = set()

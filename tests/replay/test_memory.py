@@ -1,4 +1,4 @@
-"""Long runs: the sample forwards and backwards, again and again, must not fill the memory."""
+"""Constant memory in long runs: the sample forwards and backwards, repeated."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SETTLED, GROWTH_MIB = 200, 12.0
 
 
 def to_and_fro(frames: list[Frame], pairs: int) -> Iterator[Frame]:
-    """Frames of so many pairs, there and back, with stamps that go on."""
+    """Yield the frames of so many pairs, forwards and backwards, with rising stamps."""
     both = [frames[i : i + 2] for i in range(0, len(frames), 2)]
     path = cycle([*both, *both[-2:0:-1]])
     for k in range(pairs):
@@ -37,8 +37,8 @@ def to_and_fro(frames: list[Frame], pairs: int) -> Iterator[Frame]:
             yield replace(frame, stamp_ns=k * PERIOD_NS)
 
 
-class Watch:
-    """Notes the resident memory every hundred poses."""
+class MemoryMonitor:
+    """A sink that measures the resident memory every hundred poses."""
 
     def __init__(self) -> None:
         self.mib: dict[int, float] = {}
@@ -51,18 +51,18 @@ class Watch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threaded", [True, False])
-def test_memory_is_flat(tmp_path: Path, threaded: bool) -> None:
+def test_memory_stays_constant(tmp_path: Path, threaded: bool) -> None:
     reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
     config, frames = Config(), list(reader.frames())
     place = geometry(with_rims(parse_rig(reader.attachments()["rig.toml"]), frames), config.panorama)
-    watch, statistics = Watch(), RunStatistics()
-    poses = {"watch": watch, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
+    monitor, statistics = MemoryMonitor(), RunStatistics()
+    poses = {"monitor": monitor, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
     ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
     wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
     graph.run()
-    print(statistics.states, watch.mib)
+    print(statistics.states, monitor.mib)
     assert statistics.poses == PAIRS
-    later = np.array([mib for seq, mib in watch.mib.items() if seq >= SETTLED])
+    later = np.array([mib for seq, mib in monitor.mib.items() if seq >= SETTLED])
     assert later.max() - later[0] < GROWTH_MIB

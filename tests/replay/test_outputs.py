@@ -1,4 +1,4 @@
-"""What a replay gives: the same bytes however it is run, and files that other programs read."""
+"""Outputs of a replay: the same bytes threaded and inline, and files that other programs read."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Pat
 
 
 def assert_corridor(points: np.ndarray, T_world_odom: np.ndarray) -> None:
-    """The points of the map lie on floor, ceiling and walls of the rendered corridor, whose floor is z = 0."""
+    """Check that the map lies on floor, ceiling and walls of the rendered corridor, whose floor is z = 0."""
     z = se3.apply(T_world_odom, points.astype(float))[:, 2]
     assert len(points) > 500
     assert np.quantile(z, 0.02) > -0.15 and np.quantile(z, 0.98) < 2.6 + 0.15
@@ -96,7 +96,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     assert all(np.linalg.eigvalsh(record.covariance).min() > -1e-12 for record in found)
 
 
-def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_path: Path, scene: Path) -> None:
     out = tmp_path / "out.mcap"
     omnid.replay(scene / "log.mcap", "--record", out, "--set", "bus.robot=rover", rig=scene / "rig.toml")
     with out.open("rb") as file:
@@ -104,21 +104,21 @@ def test_record_is_whole_and_explains_itself(omnid: Command, tmp_path: Path, sce
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
-        told = [decode_diagnostics(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
+        last = [decode_diagnostics(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
                       "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 2}
-    assert told.value("omnid: summary", "poses") == told.value("omnid: stage odometry", "processed") == str(PAIRS)
-    assert float(told.value("omnid: stage stereo", "work_p50_ms")) > 0.1
+    assert last.value("omnid: summary", "poses") == last.value("omnid: stage odometry", "processed") == str(PAIRS)
+    assert float(last.value("omnid: stage stereo", "work_p50_ms")) > 0.1
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
 
 
-def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """A log that holds its rig needs no --rig: the sample's way."""
+def test_uses_the_rig_that_is_attached_to_the_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """A log with an attached rig needs no --rig, as the sample."""
     topics = {"lower": LOWER, "upper": UPPER}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
                for p in images(scene / "log.mcap")]
@@ -129,7 +129,7 @@ def test_recorded_rig_serves_as_an_attached_one(omnid: Command, tmp_path: Path, 
 
 
 def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Names that do not tell the cameras apart: the options do, and so does a rig that names its topics."""
+    """Where the names of the topics do not tell which camera is which, options or the rig do."""
     topics = {"lower": "/cam0", "upper": "/cam1"}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
                for p in images(scene / "log.mcap")]
@@ -170,22 +170,22 @@ def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Pat
         assert abs(seen.outer_px - exact.outer_px) < 4 and np.hypot(*np.subtract(seen.center, exact.center)) < 2
 
 
-def test_nobody_speaks_unasked(omnid: Command, scene: Path) -> None:
-    """A replay on a robot must not use the robot's own voice: without --publish a bus is not even opened."""
+def test_opens_no_bus_without_publish(omnid: Command, scene: Path) -> None:
+    """A replay on a robot must not publish in the place of its daemon: without --publish it opens no bus."""
     result = omnid.replay(scene / "log.mcap", "--set", 'bus.listen=["tcp/256.0.0.1:1"]', rig=scene / "rig.toml")
     assert result.code == 0
     assert "bus" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--publish",
                                   "--set", 'bus.listen=["tcp/256.0.0.1:1"]')
 
 
-def test_config_is_what_replay_reads(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_reads_the_printed_configuration(omnid: Command, tmp_path: Path, scene: Path) -> None:
     (tmp_path / "omnid.toml").write_text(omnid("config", "--set", "pair.tolerance_ms=0.5").out)
     assert tomllib.loads((tmp_path / "omnid.toml").read_text())["pair"]["tolerance_ms"] == 0.5
     result = omnid.replay(scene / "log.mcap", "--config", tmp_path / "omnid.toml", rig=scene / "rig.toml")
     assert 0 < result.count("unpaired_lower") == PAIRS - result.count("pairs")
 
 
-def test_every_knob_says_what_it_is(omnid: Command) -> None:
+def test_every_setting_has_a_description(omnid: Command) -> None:
     lines = omnid("config").out.splitlines()
     knobs = [i for i, line in enumerate(lines) if "=" in line and not line.startswith("#")]
     assert len(knobs) > 50

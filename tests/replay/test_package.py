@@ -1,4 +1,4 @@
-"""What is shipped: the README's commands, the sample, a command line that starts fast."""
+"""The package: commands of the README, the sample, a command line that starts fast."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def commands(text: str) -> list[str]:
     return re.findall(r"^(python3 -m venv .*)$", text, re.MULTILINE)
 
 
-def test_checks_run_the_tests_as_the_readme_says() -> None:
+def test_the_checks_run_the_readmes_test_command() -> None:
     job, tests = commands((ROOT / "README.md").read_text())
     assert "omnid" in job and "pytest" in tests
     assert commands((ROOT / ".ci" / "run").read_text()) == [tests]
 
 
-def test_sample_is_small_and_whole() -> None:
+def test_the_sample_is_small_and_whole() -> None:
     log = files("omnid.sample") / "log.mcap"
     assert isinstance(log, Path) and log.stat().st_size < 8e6
     reader = LogReader(log)

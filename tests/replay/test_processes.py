@@ -1,4 +1,4 @@
-"""Replays as programs of their own: stopped by signals, heard over the bus, driving a motor on a pty."""
+"""Replays as processes: stopped by signals, received over the bus, driving a motor on a pty."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def replaying(scene: Path, *words: object) -> list[str]:
 
 @contextmanager
 def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
-    """A program, ended at the latest with the block."""
+    """Yield a process that is killed at the end of the block."""
     pipe = subprocess.PIPE
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
@@ -49,7 +49,7 @@ def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
 def wait_until(happens: Callable[[], bool]) -> None:
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
-        assert time.monotonic() < deadline_s, "it did not happen"
+        assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.02)
 
 
@@ -70,7 +70,7 @@ def test_signals_leave_whole_results(tmp_path: Path, scene: Path, manner: list[s
         assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"])) == written
 
 
-def test_another_process_hears_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
+def test_another_process_receives_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
     endpoint = f"tcp/127.0.0.1:{unused_tcp_port}"
     heard: list[OdometryRecord] = []
     config = zenoh.Config()
@@ -104,12 +104,12 @@ def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Pat
         motor.close()
 
 
-def test_simulated_motor_of_the_command_itself(omnid: Command, scene: Path) -> None:
+def test_starts_a_simulated_motor(omnid: Command, scene: Path) -> None:
     result = omnid.replay(scene / "log.mcap", "--motor", "simulated", "--realtime", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("motor") > 20 and "0 errors" in result.out
 
 
-def test_motor_that_vanishes_ends_the_run(tmp_path: Path, scene: Path) -> None:
+def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     motor = SimulatedMotor()
     tum = tmp_path / "est.txt"
     with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
@@ -118,7 +118,7 @@ def test_motor_that_vanishes_ends_the_run(tmp_path: Path, scene: Path) -> None:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and "omnid: warning: motor on" in err, err
     assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
-    assert out.startswith("pairs "), "what there was until then is summed up"
+    assert out.startswith("pairs "), "the result until then is printed"
     assert len(rows(tum)) >= 3
 
 
@@ -131,7 +131,7 @@ def test_demo(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.tum", "map.ply", "plan.png", "log.mcap"}
 
 
-def test_progress_where_there_is_no_terminal(scene: Path) -> None:
+def test_progress_without_a_terminal(scene: Path) -> None:
     with started(replaying(scene)) as process:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0 and "\r" not in err and out.startswith("pairs ")
@@ -145,11 +145,11 @@ def test_progress_bar_on_a_terminal(scene: Path) -> None:
     drawn = os.read(screen, 1 << 16).decode()
     os.close(screen)
     assert f"/{PAIRS} " in drawn and "[####" in drawn and "pairs/s" in drawn and "tracking" in drawn
-    assert drawn.endswith(" \r"), "the line is left empty"
+    assert drawn.endswith(" \r"), "the line is cleared"
 
 
 @pytest.mark.parametrize("where", ["/dev/full", "&-"])
-def test_no_traceback_where_nothing_can_be_printed(where: str) -> None:
+def test_no_traceback_if_stdout_cannot_be_written(where: str) -> None:
     shell = f"{sys.executable} -m omnid config >{where}"
     with started(["sh", "-c", shell]) as process:
         _, err = process.communicate(timeout=PATIENCE_S)
@@ -158,7 +158,7 @@ def test_no_traceback_where_nothing_can_be_printed(where: str) -> None:
 
 
 @pytest.mark.parametrize("closed", ["1", "2"])
-def test_a_closed_stream_is_no_reason_to_fail(tmp_path: Path, scene: Path, closed: str) -> None:
+def test_runs_with_a_closed_stream(tmp_path: Path, scene: Path, closed: str) -> None:
     tum = tmp_path / "est.txt"
     shell = " ".join(replaying(scene, "--tum", tum)) + f" {closed}>&-"
     with started(["sh", "-c", shell]) as process:
@@ -166,15 +166,15 @@ def test_a_closed_stream_is_no_reason_to_fail(tmp_path: Path, scene: Path, close
     assert process.returncode == 0 and len(rows(tum)) == PAIRS
 
 
-def test_a_trajectory_on_stdout_stands_alone(scene: Path) -> None:
+def test_a_trajectory_on_stdout_is_the_only_output_there(scene: Path) -> None:
     with started(replaying(scene, "--quiet", "--tum", "/dev/stdout")) as process:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0 and err.startswith("pairs ")
     assert [len(line.split()) for line in out.splitlines()] == [8] * PAIRS
 
 
-def test_a_disk_that_fills_cuts_no_row_in_two(tmp_path: Path, scene: Path) -> None:
-    """A limit on the size of files stands for the disk: python ignores its signal and gets the error."""
+def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:
+    """A limit on the size of files acts as the disk: Python ignores its signal and gets the error."""
     tum = tmp_path / "est.txt"
     limited = ["prlimit", "--fsize=1000", *replaying(scene, "--quiet", "--tum", tum)]
     with started(limited) as process:
@@ -194,7 +194,7 @@ def test_progress_fits_a_narrow_terminal(scene: Path) -> None:
     assert "[##" in drawn and max(map(len, drawn.split("\r"))) < 30
 
 
-def test_a_reader_that_leaves_early_gets_no_traceback(scene: Path) -> None:
+def test_no_traceback_if_the_reader_of_stdout_leaves(scene: Path) -> None:
     shell = " ".join(replaying(scene, "--quiet")) + " | head -1"
     with started(["sh", "-c", shell]) as process:
         out, err = process.communicate(timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""The figures that the daemon is held to, on the logs beside the repository; skipped where they are not."""
+"""Accuracy on the logs beside the repository; skipped if they do not exist."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
 def measured(omnid: Command, folder: Path, name: str, *words: object) -> Metrics:
-    """What the documented commands reach on a log."""
+    """Return the errors of the documented commands on a log."""
     source = DATA / name
     if not source.is_dir():
-        pytest.skip(f"{source} is not here")
+        pytest.skip(f"{source} does not exist")
     rig, tum = folder / "rig.toml", folder / "est.txt"
     assert omnid("calibrate", "import", source / "camchain.yaml", "-o", rig).code == 0
     result = omnid.replay(source / "log.mcap", "--tum", tum, "--map", folder / "map.ply", *words, rig=rig)
@@ -40,6 +40,6 @@ def test_two_walls_crooked(omnid: Command, tmp_path: Path) -> None:
     assert math.degrees(found.heading_max_rad) <= 0.1
 
 
-def test_papers_method_runs_through(omnid: Command, tmp_path: Path) -> None:
+def test_the_papers_method(omnid: Command, tmp_path: Path) -> None:
     found = measured(omnid, tmp_path, "two_walls", "--method", "paper")
     assert found.coverage >= 0.99 and found.ate_rmse_m < 0.3

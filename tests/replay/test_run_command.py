@@ -26,7 +26,7 @@ def test_poses_flow_wheels_obey_and_sigterm_ends_it(tmp_path: Path, scene: Path)
         assert not base.line.moved_since(0.0), "nobody has asked"
         operator.drive(0.3)
         wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
-        operator.cease()
+        operator.stop_sending()
         wait_until(lambda: not base.drives, "the stop")
         stopped_s = time.monotonic()
         count = len(operator.poses)
@@ -75,13 +75,13 @@ def test_one_camera_gone_and_back(tmp_path: Path, scene: Path) -> None:
     with robot(scene, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.drives, "motion")
-        daemon.tell("upper mute")
+        daemon.write_line("upper mute")
         wait_until(lambda: operator.message("pairing") == "no images of the upper camera", "the word which is gone")
         wait_until(lambda: operator.message("odometry") == "no new pose", "stale odometry")
         wait_until(lambda: not base.drives, "the stop")
         assert operator.message("upper camera") == "no new image"
         assert operator.message("lower camera") == "streaming"
-        daemon.tell("upper ok")
+        daemon.write_line("upper ok")
         wait_until(lambda: base.drives, "motion without anybody's help")
         wait_until(lambda: operator.message("pairing") == "synchronised", "synchronised cameras")
         assert daemon.end()[0] == 0

@@ -1,4 +1,4 @@
-"""What the daemon says about itself when its eyes fail: on logs of a rendered run with silence and darkness in it."""
+"""Tracking states on rendered logs with missing and dark images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import dark, images, save
 
-NIGHT = 20  # pairs, 2 s
+DARK_PAIRS = 20  # pairs, 2 s
 
 
 def recorded(path: Path) -> list[OdometryRecord]:
@@ -24,7 +24,7 @@ def recorded(path: Path) -> list[OdometryRecord]:
 
 
 def states(path: Path) -> list[tuple[str, int]]:
-    """State and reset counter, as often as they change."""
+    """Return state and reset counter whenever they change."""
     found = []
     with path.open("rb") as file:
         for schema, _, message in make_reader(file).iter_messages(["/omnid/status"]):
@@ -40,7 +40,7 @@ def errors_m(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     return np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
 
 
-def test_camera_silent_for_a_second(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_camera_without_images_for_a_second(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = [p for p in images(scene / "log.mcap") if p.camera == "lower" or not 7 <= p.pair < 17]
     log = save(tmp_path / "log.mcap", taken)
     result = omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
@@ -53,26 +53,26 @@ def test_camera_silent_for_a_second(omnid: Command, tmp_path: Path, scene: Path)
 
 def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
-    day, evening = [p for p in taken if p.pair < 12], [p for p in taken if p.pair == 11]
-    night = [dark(p.later(1 + k)) for k in range(NIGHT) for p in evening]
-    morning = [p.later(NIGHT) for p in taken if p.pair >= 12]
-    log = save(tmp_path / "log.mcap", [*day, *night, *morning])
+    before, last_pair = [p for p in taken if p.pair < 12], [p for p in taken if p.pair == 11]
+    dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in last_pair]
+    later = [p.later(DARK_PAIRS) for p in taken if p.pair >= 12]
+    log = save(tmp_path / "log.mcap", [*before, *dark_images, *later])
     result = omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
-    assert result.code == 0 and len(rows(tmp_path / "est")) == PAIRS + NIGHT
+    assert result.code == 0 and len(rows(tmp_path / "est")) == PAIRS + DARK_PAIRS
     found = states(tmp_path / "out.mcap")
     assert ("lost", 0) in found and found[-1] == ("tracking", 0)
-    deviation = np.array([np.sqrt(np.trace(r.covariance[:3, :3])) for r in recorded(tmp_path / "out.mcap")])
-    assert (np.diff(deviation[13 : 11 + NIGHT]) > 0).all() and deviation[10 + NIGHT] > 10 * deviation[11]
-    assert deviation[-1] < 0.02
+    sigma_m = np.array([np.sqrt(np.trace(r.covariance[:3, :3])) for r in recorded(tmp_path / "out.mcap")])
+    assert (np.diff(sigma_m[13 : 11 + DARK_PAIRS]) > 0).all() and sigma_m[10 + DARK_PAIRS] > 10 * sigma_m[11]
+    assert sigma_m[-1] < 0.02
     estimate, truth = read_tum(tmp_path / "est"), read_tum(scene / "truth.txt")
-    seen = [*range(12), *range(12 + NIGHT, PAIRS + NIGHT)]
+    seen = [*range(12), *range(12 + DARK_PAIRS, PAIRS + DARK_PAIRS)]
     assert errors_m(Trajectory(estimate.stamps_ns[seen], estimate.T[seen]), truth).max() < 0.02
 
 
-def test_another_world_after_the_darkness(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
+def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
     before, after = images(scene / "log.mcap"), images(elsewhere / "log.mcap")
-    night = [dark(p.later(1 + k)) for k in range(NIGHT) for p in before[:2]]
-    log = save(tmp_path / "log.mcap", [*before[:2], *night, *(p.later(1 + NIGHT) for p in after)])
+    dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in before[:2]]
+    log = save(tmp_path / "log.mcap", [*before[:2], *dark_images, *(p.later(1 + DARK_PAIRS) for p in after)])
     omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
     found = states(tmp_path / "out.mcap")
     assert found[-1] == ("tracking", 1)

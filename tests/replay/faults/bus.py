@@ -51,7 +51,7 @@ def peer_gone(place: Place) -> Outcome:
 def peer_hangs(place: Place) -> Outcome:
     """Its process is stopped (SIGSTOP) and goes on later: its connection stays, nothing comes."""
     with driving(place) as (daemon, operator, base):
-        operator.cease()
+        operator.stop_sending()
         stands(base)
         with commander(daemon.port) as process:
             goes_on(base)
@@ -132,7 +132,7 @@ def malformed(place: Place) -> Outcome:
     rng = random.Random(5)
     good = codec.twist_stamped_cdr(time.time_ns(), "base_link", 0.5, 1.0)
     with driving(place) as (_, operator, base):
-        operator.cease()
+        operator.stop_sending()
         stands(base)
         since_s = time.monotonic()
         accepted = int(operator.values("wheels")["commands"])

@@ -9,11 +9,11 @@ from tests.replay.live import wait_until
 def spoilt(place: Place, line: str, part: str, word: str) -> Outcome:
     """What becomes of images that are spoilt for a while."""
     with driving(place, module=SPOILT) as (daemon, operator, base):
-        daemon.tell(line)
+        daemon.write_line(line)
         wait_until(lambda: word in operator.message(part), f"'{word}'")
         stands(base)
         said = f"{part}: {operator.message(part)}; odometry: {operator.message('odometry')}"
-        daemon.tell("both ok")
+        daemon.write_line("both ok")
         goes_on(base)
     return Outcome("alive, recovered by itself", "stopped, turned again with the next command", said)
 

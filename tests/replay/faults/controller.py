@@ -17,7 +17,7 @@ def unplugged(place: Place) -> Outcome:
         base.unplug()
         wait_until(lambda: operator.message("wheels") == FAILED, "an error told of the wheels")
         said = f"wheels: {operator.message('wheels')}"
-        operator.cease()
+        operator.stop_sending()
         time.sleep(1.0)
         base.plug_in()
         wait_until(lambda: len(base.line.notes) > 10, "the new controller's first commands")
@@ -37,7 +37,7 @@ def serial_garbage(place: Place) -> Outcome:
         assert base.line.moved_since(since_s), "good answers are found in the noise"
         said = f"wheels: {operator.message('wheels')}, errors {operator.values('wheels')['errors']}"
         base.twin.garbage = b""
-        operator.cease()
+        operator.stop_sending()
         stands(base)
     return Outcome("alive", "drove on as asked, stopped when commands ceased", said)
 
@@ -54,7 +54,7 @@ def only_garbage(place: Place) -> Outcome:
         wait_until(lambda: int(operator.values("wheels").get("errors", 0)) > 3, "errors counted")
         said = f"wheels: {operator.message('wheels')}"
         assert base.line.base.velocity_mps == 0, "the watchdog's stop"
-        operator.cease()
+        operator.stop_sending()
         base.twin.drop_input = False
         stands(base)
         operator.drive()
@@ -71,7 +71,7 @@ def line_garbage(place: Place) -> Outcome:
             line.write(random.Random(4).randbytes(500))
         wait_until(lambda: base.line.base.errors > 100, "the controller's count")
         said = f"wheels: {operator.message('wheels')}, errors {operator.values('wheels')['errors']}"
-        operator.cease()
+        operator.stop_sending()
         stands(base)
     return Outcome("alive", "as asked; the CRC refused the noise", said)
 
@@ -84,7 +84,7 @@ def silent(place: Place) -> Outcome:
         wait_until(lambda: int(operator.values("wheels").get("errors", 0)) > 3, "errors counted")
         wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
         said = f"wheels: {operator.message('wheels')}"
-        operator.cease()
+        operator.stop_sending()
         base.twin.drop_input = False
         stands(base)
         operator.drive()

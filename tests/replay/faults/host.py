@@ -33,7 +33,7 @@ def killed(place: Place) -> Outcome:
     with robot(place.scene, place.folder) as (daemon, operator, base):
         operator.drive()
         goes_on(base)
-        steering = daemon.steering
+        steering = daemon.controller_pid
         daemon.process.kill()
         stands(base)
         wait_until(lambda: not Path(f"/proc/{steering}").exists(), "its end")
@@ -48,7 +48,7 @@ def steering_killed(place: Place) -> Outcome:
     with robot(place.scene, place.folder) as (daemon, operator, base):
         operator.drive()
         goes_on(base)
-        os.kill(daemon.steering, signal.SIGKILL)
+        os.kill(daemon.controller_pid, signal.SIGKILL)
         _, err = daemon.process.communicate(timeout=PATIENCE_S)
         assert daemon.process.returncode == 2 and "Traceback" not in err, err
         wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
@@ -63,7 +63,7 @@ def stuck(place: Place) -> Outcome:
         daemon.process.send_signal(signal.SIGSTOP)
         stands(base)
         assert not base.twin.watchdog_expired, "stopped by what steers, not by the controller"
-        operator.cease()
+        operator.stop_sending()
         time.sleep(0.2)
         since_s = time.monotonic()
         daemon.process.send_signal(signal.SIGCONT)
@@ -80,12 +80,12 @@ def stuck(place: Place) -> Outcome:
 def overloaded(place: Place) -> Outcome:
     """Neither the daemon nor what steers gets a processor while commands go on; then they have ceased."""
     with driving(place) as (daemon, operator, base):
-        processes = [daemon.process.pid, daemon.steering]
+        processes = [daemon.process.pid, daemon.controller_pid]
         for pid in processes:
             os.kill(pid, signal.SIGSTOP)
         time.sleep(2.0)
         assert base.twin.watchdog_expired and not base.drives, "the controller's own watchdog"
-        operator.cease()
+        operator.stop_sending()
         time.sleep(0.2)
         since_s = time.monotonic()
         for pid in processes:
@@ -105,14 +105,14 @@ def clock_step(place: Place) -> Outcome:
     """The daemon's time of day is an hour ahead, an hour behind, then 30 s ahead, then right again."""
     with driving(place, module=SPOILT) as (daemon, operator, base):
         for step_s in (3600, -3600):
-            daemon.tell(f"clock {step_s}")
+            daemon.write_line(f"clock {step_s}")
             time.sleep(0.5)
             goes_on(base)
-        daemon.tell("clock 30")
+        daemon.write_line("clock 30")
         wait_until(lambda: "refused, too old" in operator.values("wheels"), "the refusals")
         stands(base)
         said = f"wheels: {operator.message('wheels')}; refused: too old"
-        daemon.tell("clock 0")
+        daemon.write_line("clock 0")
         goes_on(base)
         steps_s = [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairwise(operator.poses)]
         assert min(steps_s) > 0 and max(steps_s) < 20, "stamps of poses are of one clock and one offset"

@@ -1,4 +1,4 @@
-"""What a run says of input that is readable and yet wrong: cameras exchanged, clocks apart, darkness."""
+"""Warnings about readable input that is wrong: exchanged cameras, clocks apart, darkness."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from tests.replay.command import Command
 from tests.replay.edited import dark, images, save
 
 
-def test_exchanged_cameras_are_noticed(omnid: Command, scene: Path) -> None:
+def test_warns_of_exchanged_cameras(omnid: Command, scene: Path) -> None:
     right = omnid.replay(scene / "log.mcap", rig=scene / "rig.toml")
     wrong = omnid.replay(scene / "log.mcap", "--lower", UPPER, "--upper", LOWER, rig=scene / "rig.toml")
     assert right.code == 0 and right.err == ""
     assert "the other way round" in wrong.err and "--lower" in wrong.err
 
 
-def test_a_rig_upside_down_knows_its_topics(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """The rig's lower camera writes to a topic called upper: the rig is believed, and the motion is the same."""
+def test_the_topics_of_an_inverted_rig_are_used(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """The rig's lower camera writes to a topic named upper: the rig decides, and the motion is the same."""
     rig = read_rig(scene / "rig.toml")
     write_rig(tmp_path / "rig.toml", replace(rig, lower=rig.upper, upper=rig.lower, topics=(UPPER, LOWER)))
     for name, file in (("a", scene / "rig.toml"), ("b", tmp_path / "rig.toml")):
@@ -33,28 +33,30 @@ def test_a_rig_upside_down_knows_its_topics(omnid: Command, tmp_path: Path, scen
     np.testing.assert_allclose(a[:, :3, 3], b[:, :3, 3], atol=0.02)
 
 
-@pytest.mark.parametrize(("apart_ns", "said"), [(12_000_000, "ms apart"), (3600 * 10**9, "clocks")])
-def test_stamps_apart(omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, said: str) -> None:
+@pytest.mark.parametrize(("apart_ns", "expected"), [(12_000_000, "ms apart"), (3600 * 10**9, "clocks")])
+def test_warns_of_stamps_that_are_apart(
+    omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, expected: str
+) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
-    assert result.code == 1 and said in result.err and "pair.tolerance_ms" in result.err
+    assert result.code == 1 and expected in result.err and "pair.tolerance_ms" in result.err
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
-def test_most_images_without_a_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_warns_if_most_images_have_no_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
              for p in images(scene / "log.mcap")]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
 
 
-def test_a_run_that_is_lost_from_end_to_end_says_so(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
 
 
-def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_names_an_unknown_encoding(omnid: Command, tmp_path: Path, scene: Path) -> None:
     plain = np.zeros((256, 256, 2), np.uint8)
     topics = {"lower": "/lower/image_raw", "upper": "/upper/image_raw"}
     log = write_log(
@@ -68,7 +70,7 @@ def test_an_encoding_that_is_unknown_is_named(omnid: Command, tmp_path: Path, sc
     assert result.code == 1 and "'bayer_rggb8'" in result.err and "rgb8" in result.err
 
 
-def test_a_rim_that_is_not_found_is_said(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_warns_of_a_rim_that_is_not_found(omnid: Command, tmp_path: Path, scene: Path) -> None:
     rig = read_rig(scene / "rig.toml")
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, mask=None)))
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
