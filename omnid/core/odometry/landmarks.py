@@ -132,7 +132,8 @@ class LandmarkStore:
     def move_keyframe(self, seq: int, T_odom_rect: Array, covariance: Array) -> None:
         """Set the pose of a keyframe and its covariance (6, 6), and compute its landmarks' points in odom again.
 
-        KeyError for a keyframe that is not kept.
+        Keyframes are immutable: a caller that holds the old one (the relocaliser) keeps the old pose. Raises KeyError
+        for a keyframe that is not kept.
         """
         keyframe = replace(self.keyframes[seq], T_odom_rect=T_odom_rect, covariance=covariance)
         self.keyframes[seq] = keyframe

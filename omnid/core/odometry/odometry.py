@@ -77,7 +77,8 @@ class VisualOdometry:
             # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
             tracks = self._map.track(frame.lower, T_guess)
 
-            # 3. Estimate: RANSAC on three points (IV.B), Gauss-Newton on the bearings (IV.C, in place of eq. 9).
+            # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
+            #    on the bearings in both panoramas (IV.C, in place of eq. 9).
             coarse = self._frame_to_map.estimate(frame, tracks, T_guess)
 
             # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.

@@ -82,6 +82,21 @@ def test_the_velocity_is_in_the_rig_frame(odometry: VisualOdometry, frames: list
     assert (np.linalg.eigvalsh(estimates[4].velocity_covariance) > 0).all()
 
 
+def test_landmarks_are_observed_in_several_keyframes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    """Each observation agrees with the projection of the landmark into that keyframe."""
+    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(refresh=1.0))
+    run(odometry, frames[:5])
+    store = odometry._map.store
+    rows = np.searchsorted(store.table.id, store.observations.landmark)
+    later = np.flatnonzero(store.observations.keyframe != store.table.anchor[rows])
+    assert len(store.keyframes) >= 2 and len(later) > 50
+    for k in later:
+        T_odom_rect = store.keyframes[int(store.observations.keyframe[k])].T_odom_rect
+        points = se3.apply(se3.inverse(T_odom_rect), store.table.points[rows[k]][None])
+        error = cameras.model.residual(points, store.observations.views[k][None])
+        assert np.nanmax(np.abs(error)) < 1.5
+
+
 def test_standing_still_does_not_drift(odometry: VisualOdometry, cameras: RenderedCameras) -> None:
     estimates = run(odometry, [cameras.frame(k, PATH[0]) for k in range(8)])
     distances = [motion_errors(estimate.T_odom_rect, np.eye(4))[0] for estimate in estimates]
