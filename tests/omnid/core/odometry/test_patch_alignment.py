@@ -23,7 +23,7 @@ MOVED = se3.exp([0.25, -0.1, 0.02, 0, 0.01, 0.3])  # T_curr_ref
 
 
 def on_the_wall(pixels: Array) -> Array:
-    """Where the rays of pixels (N, 2) meet the wall."""
+    """Return the intersections (N, 3) of the rays of pixels (N, 2) with the wall."""
     rays = CYLINDER.rays(pixels)
     return np.asarray(rays * (DISTANCE_M / (rays @ NORMAL))[:, None])
 
@@ -33,7 +33,7 @@ def wall_views(pixels: Array) -> Array:
 
 
 def moved(pixels: Array) -> Array:
-    """Where pixels of the wall (N, 2) are seen after the motion."""
+    """Return the pixels (N, 2) of the same points of the wall after the motion."""
     return CYLINDER.pixels(se3.apply(MOVED, on_the_wall(pixels)))
 
 
