@@ -1,1 +1,1 @@
-"""Files that other programs read: TUM trajectories, PLY maps, PNG plan views."""
+"""File formats for other programs: TUM trajectories, PLY maps, PNG plan views."""

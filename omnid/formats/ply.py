@@ -1,4 +1,4 @@
-"""The map as a binary PLY file: position, confidence, frames and age of each point."""
+"""Maps as binary PLY files: position, confidence, frames and age of each point."""
 
 from __future__ import annotations
 
@@ -28,42 +28,45 @@ _HEADER_PATTERN = re.compile(re.escape(_HEADER).replace(r"\{count\}", r"(\d{1,12
 
 
 def write_ply(path: str | Path, points: MapPoints) -> None:
-    """Write the points as binary little-endian PLY; a reader sees the old file or the whole new one, never a part.
+    """Write the points as binary little-endian PLY; the file is replaced at once, never written in part.
 
-    Raises OmnidError where the file cannot be written.
+    Raises OmnidError if the file cannot be written.
     """
     vertices = np.empty(len(points.xyz), dtype=_VERTEX)
     for name in ("xyz", "confidence", "frames", "age"):
         vertices[name] = getattr(points, name)
-    _replace(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
+    _write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
 
 
 def read_ply(path: str | Path) -> MapPoints:
-    """The points of a file of `write_ply`; any other PLY is refused with OmnidError."""
+    """Return the points of a file of `write_ply`; OmnidError for any other PLY."""
     try:
         raw = Path(path).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise OmnidError(f"{path}: a map was asked for, it cannot be read: {error}") from error
+        raise OmnidError(f"{path}: cannot read the map: {error}") from error
     header = _HEADER_PATTERN.match(raw)
     if header is None:
-        raise OmnidError(f"{path}: a PLY map of omnid was expected, found another header: only its own are read")
+        raise OmnidError(f"{path}: expected a PLY map written by omnid, found another header")
     body, expected = raw[header.end() :], int(header[1]) * _VERTEX.itemsize
     if len(body) != expected:
-        raise OmnidError(f"{path}: {expected} bytes of points were expected, {len(body)} found: write the map again")
+        raise OmnidError(
+            f"{path}: expected {expected} bytes of points, found {len(body)}: the file is damaged, write the map again"
+        )
     vertices = np.frombuffer(body, dtype=_VERTEX)
     return MapPoints(*(np.ascontiguousarray(vertices[name]) for name in ("xyz", "confidence", "frames", "age")))
 
 
-def _replace(path: Path, content: bytes) -> None:
+def _write_whole(path: Path, content: bytes) -> None:
     try:
-        beside = path.with_name(f".{path.name}.{os.getpid()}.part")  # the same file system, or the rename is no rename
+        # On the same file system, so that the rename is atomic.
+        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
-            with beside.open("wb") as file:
+            with partial.open("wb") as file:
                 file.write(content)
                 file.flush()
-                os.fsync(file.fileno())  # a robot is switched off without a word
-            os.replace(beside, path)
+                os.fsync(file.fileno())  # a robot may be switched off at any time
+            os.replace(partial, path)
         finally:
-            beside.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: a map was to be written, it cannot be: {error}: choose another file") from error
+        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error

@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.errors import OmnidError
 
-FILE_LIMIT_BYTES = 1 << 28  # some 2.5 million poses: days of driving, and a log named by mistake is not swallowed whole
-POSITION_LIMIT_M = 1e9  # squares and sums of anything nearer stay far from overflow
-STAMP_LIMIT_NS = 1 << 62  # the difference of any two stamps still fits int64
+FILE_LIMIT_BYTES = 1 << 28  # about 2.5 million poses, days of driving; a log given by mistake is refused
+POSITION_LIMIT_M = 1e9  # of a coordinate, so that squares and sums cannot overflow
+STAMP_LIMIT_NS = 1 << 62  # so that the difference of two stamps fits int64
 _DECIMALS = 9  # nanoseconds, nanometres
+_COLUMNS = 8  # t x y z qx qy qz qw
+_MIN_QUATERNION = 1e-9  # largest component below which a quaternion counts as zero
+_SHOWN_CHARACTERS = 60  # of a wrong value in a message
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Poses T_odom_rig (or T_world_rig) over time; stamps rise strictly; both arrays are read-only."""
+    """Poses T_odom_rig (or T_world_rig) over time; stamps increase strictly; both arrays are read-only."""
 
     stamps_ns: NDArray[np.int64]  # (N,)
     T: NDArray[np.float64]  # (N, 4, 4)
@@ -32,25 +35,25 @@ class Trajectory:
 class _Row:
     line: int
     stamp_ns: int
-    pose: tuple[float, ...]  # x y z qx qy qz qw, quaternion of any length but zero
+    pose: tuple[float, ...]  # x y z qx qy qz qw, quaternion of any length above zero
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """The trajectory in a TUM file, sorted by stamp.
+    """Return the trajectory of a TUM file, sorted by stamp.
 
-    Blank lines and everything after `#` are skipped; quaternions are brought to unit length. A stamp that stands twice
-    is refused: two poses of one moment contradict each other. Raises OmnidError naming file, line and what was found.
+    Blank lines and everything after `#` are skipped; quaternions are normalised. A repeated stamp is refused: two poses
+    at one time contradict each other. Raises OmnidError that names the file, the line and what was found.
     """
     text = _read_text(Path(path))
     rows = sorted(_rows(text, str(path)), key=lambda row: row.stamp_ns)
     if not rows:
-        raise OmnidError(f"{path}: a trajectory was asked for, no pose found: expected lines 't x y z qx qy qz qw'")
+        raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
     _refuse_repeated_stamps(rows, str(path))
     return _trajectory(rows)
 
 
 def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
-    """One TUM line without its newline: 9 decimals everywhere, w >= 0, never '-0'; same bytes for the same pose."""
+    """Return a TUM line without newline: 9 decimals, w >= 0, never '-0', so the same bytes for the same pose."""
     sign, (whole_s, rest_ns) = "-" if stamp_ns < 0 else "", divmod(abs(int(stamp_ns)), 10**9)
     pose = np.concatenate([T[:3, 3], _canonical(se3.quaternion(T[:3, :3]))])
     numbers = [f"{float(value):.{_DECIMALS}f}" for value in np.round(pose, _DECIMALS) + 0.0]
@@ -58,7 +61,7 @@ def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
 
 
 def _canonical(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The one of q and -q whose last number that prints as non-zero (w, else z, y, x) is positive."""
+    """Return q or -q, so that the last component that prints as non-zero (w, else z, y, x) is positive."""
     printed: NDArray[np.float64] = np.round(q, _DECIMALS)
     visible = printed[printed != 0.0]
     return -printed if visible.size and visible[-1] < 0.0 else printed
@@ -69,9 +72,9 @@ def _read_text(path: Path) -> str:
         with path.open("rb") as file:
             raw = file.read(FILE_LIMIT_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise OmnidError(f"{path}: a trajectory was asked for, it cannot be read: {error}") from error
+        raise OmnidError(f"{path}: cannot read the trajectory: {error}") from error
     if len(raw) > FILE_LIMIT_BYTES:
-        raise OmnidError(f"{path}: at most {FILE_LIMIT_BYTES >> 20} MiB were expected, more found: split it")
+        raise OmnidError(f"{path}: expected at most {FILE_LIMIT_BYTES >> 20} MiB: split the file")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -92,13 +95,15 @@ def _rows(text: str, name: str) -> Iterator[_Row]:
 
 
 def _row(words: list[str], line: int) -> _Row:
-    if len(words) != 8:
-        found = _shortened(" ".join(words[:9]))
-        raise ValueError(f"expected 8 numbers parted by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
+    if len(words) != _COLUMNS:
+        found = _shortened(" ".join(words[: _COLUMNS + 1]))
+        raise ValueError(
+            f"expected {_COLUMNS} numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}"
+        )
     pose = tuple(_number(word) for word in words[1:])
     if max(abs(value) for value in pose[:3]) > POSITION_LIMIT_M:
         raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {_shortened(' '.join(words[1:4]))}")
-    if max(abs(value) for value in pose[3:]) < 1e-9:
+    if max(abs(value) for value in pose[3:]) < _MIN_QUATERNION:
         raise ValueError(f"expected a unit quaternion, found zero: {_shortened(' '.join(words[4:]))}")
     return _Row(line, _stamp_ns(words[0]), pose)
 
@@ -114,32 +119,32 @@ def _number(word: str) -> float:
 
 
 def _stamp_ns(word: str) -> int:
-    """Nanoseconds of a stamp in decimal seconds, never through float64, whose step at today's Unix time is 238 ns."""
+    """Return the ns of a stamp in decimal seconds, without float64, whose resolution at Unix times is 238 ns."""
     try:
         stamp_s = Decimal(word)
     except InvalidOperation:
         stamp_s = Decimal("nan")
-    # adjusted() comes first: int() of 1e999999999 would never end
+    # adjusted() is checked first: int() of 1e999999999 would not end
     if not stamp_s.is_finite() or stamp_s.adjusted() > 12 or abs(stamp_s.scaleb(9)) >= STAMP_LIMIT_NS:
         raise ValueError(f"expected a stamp in seconds, found {_shortened(word)}")
     return int(stamp_s.scaleb(9).to_integral_value())
 
 
 def _shortened(text: str) -> str:
-    return repr(text if len(text) <= 60 else text[:57] + "...")
+    return repr(text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "...")
 
 
 def _refuse_repeated_stamps(rows: list[_Row], name: str) -> None:
     for first, second in pairwise(rows):
         if first.stamp_ns == second.stamp_ns:
             found = f"found that of line {first.line} again"
-            raise OmnidError(f"{name}, line {second.line}: expected each stamp once, {found}: remove one of them")
+            raise OmnidError(f"{name}, line {second.line}: expected each stamp once, {found}: remove one of the two")
 
 
 def _trajectory(rows: list[_Row]) -> Trajectory:
     stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
     pose = np.array([row.pose for row in rows], dtype=np.float64)
-    q = pose[:, 3:] / np.abs(pose[:, 3:]).max(axis=1, keepdims=True)  # se3 normalises; here its squares cannot overflow
+    q = pose[:, 3:] / np.abs(pose[:, 3:]).max(axis=1, keepdims=True)  # scaled so that squares in se3 cannot overflow
     T = se3.transform(se3.rotation(q), pose[:, :3])
     stamps_ns.setflags(write=False)
     T.setflags(write=False)

@@ -1,1 +1,1 @@
-"""What panoramas say about the calibration of the rig."""
+"""Check of the rig's calibration by its panoramas."""

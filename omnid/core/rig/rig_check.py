@@ -1,4 +1,4 @@
-"""Whether the rig is still as it was calibrated: points that both panoramas show must lie on one column in both."""
+"""Check of the rig's calibration: a point seen in both panoramas must lie on the same column in both."""
 
 from __future__ import annotations
 
@@ -21,33 +21,38 @@ Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 Verdict = Literal["good", "drifted", "broken", "unknown"]
 
-POINTS = 160
-COARSE = 4  # points are first looked for in images so many times smaller,
-PATCH_PX = 4  # by patches that reach so far about them there,
-ASIDE_PX = 5  # so far aside (some five degrees of a panorama of 1300 columns), and
-DOWN_PX = 30  # so far down: nearer than a baseline and a half is nothing
-MIN_LIKENESS = 0.8
+POINTS = 160  # corners per pair
+COARSE = 4  # the coarse search uses images reduced by this factor
+PATCH_PX = 4  # half the side of its patches, in the reduced image
+ASIDE_PX = 5  # searched to either side there: about five degrees of a panorama of 1300 columns
+DOWN_PX = 30  # searched downwards there: down to a distance of one and a half baselines
+MIN_CORRELATION = 0.8  # of a coarse match
+MAX_STEP_PX = 2 * COARSE  # from the coarse match to the tracked point
+MIN_DISPARITY_PX = 0.5
 KLT = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 MAX_PAIRS = 64
-# Less is no verdict. Verdicts are by the turn: a rig as good as new, rendered or real, stays below the first.
-MIN_MATCHES = 120
-DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
-# A viewpoint aside moves near points only, by a tenth of its angle: it matters that much later.
-SHIFT_PART = 0.2
-SIGMAS = 4.0
-# Of a rig that is wrong by many degrees no more match than by accident. Only points that stand out so far [grey levels]
-# in the coarse image tell so: what noise makes in the dark matches nowhere either.
-MIN_SHARE, MIN_CLEAR, CLEAR_GREY = 0.08, 400, 6.0
-SECTORS, MIN_IN_SECTOR = 12, 20
-# A camera that is no more what it was bends the columns all around; one wall alone may mislead all its matches.
-DRIFTED_PX = 0.3
+MIN_MATCHES = 120  # for a verdict
+DRIFTED_DEG = 0.2  # rotation of the upper camera; rendered and real rigs as calibrated stay below
+BROKEN_DEG = 2.0
+SHIFT_WEIGHT = 0.2  # of the shift's angle against the rotation's: a shifted viewpoint affects near points only
+SIGMAS = 4.0  # standard deviations subtracted from rotation and shift before the verdict
+# With a rig that is wrong by many degrees, points match by chance only. Corners in noise match nowhere either, so only
+# points with contrast are counted.
+MIN_MATCHED_PART = 0.08  # of the points with contrast: fewer matches mean a broken rig
+MIN_CONTRAST_POINTS = 400  # for this verdict
+CONTRAST_GREY = 6.0  # standard deviation of a coarse patch with contrast, grey levels
+SECTORS = 12  # of azimuth
+MIN_IN_SECTOR = 20  # matches
+# A camera whose intrinsics have changed bends the columns all around; the matches of one wall alone may be misled.
+DRIFTED_PX = 0.3  # median residual of the sectors
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)
 class Matches:
     """Points of the lower panorama found in the upper one: (column, row) (N, 2) each.
 
-    tried is how many were sought, clear how many of these are no noise.
+    tried: number of points searched; clear: number of these with contrast.
     """
 
     lower: Array
@@ -58,25 +63,25 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class RigFinding:
-    """What the columns say of the rig."""
+    """Result of the check."""
 
     verdict: Verdict
     matches: int
     tried: int
-    offset_px: float  # median of the upper columns less the lower ones
-    spread_px: float  # 1.48 times the median distance from it
+    offset_px: float  # median of upper minus lower columns
+    spread_px: float  # 1.48 times the median absolute deviation
     by_azimuth: tuple[tuple[float, float, int], ...]  # degrees, median offset [px] or NaN, matches
-    left_px: float  # what half of these exceed once the drift is taken away: no turn of a camera explains it
+    left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
     drift: RigDrift | None
 
     @property
     def turn_deg(self) -> float:
-        """By how much the upper camera has turned from where the rig's file has it; NaN where nobody can tell."""
+        """Rotation of the upper camera against the rig's file, degrees; NaN without a verdict."""
         return float(np.rad2deg(np.linalg.norm(self.drift.turn))) if self.drift else float("nan")
 
     @property
     def summary(self) -> str:
-        """One line."""
+        """Summary in one line."""
         if self.drift is None:
             return f"{self.verdict}: {self.matches} of {self.tried} points found in both panoramas"
         x, y, z = np.rad2deg(self.drift.turn)
@@ -85,45 +90,45 @@ class RigFinding:
 
 
 class RigCheck:
-    """Gathers matches of some pairs and judges the rig by them; remembers MAX_PAIRS pairs at most."""
+    """Collects the matches of the newest pairs, at most MAX_PAIRS, and checks the rig by them."""
 
     def __init__(self, cylinder: Cylinder, pairs: int = 16) -> None:
         self._cylinder = cylinder
         self._found: deque[Matches] = deque(maxlen=min(pairs, MAX_PAIRS))
 
     def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> None:
-        """Looks at one pair of panoramas; visible (H, W) is where both show the world."""
+        """Add a pair of panoramas; visible (H, W): where both show the world."""
         self._found.append(match(lower, upper, visible))
 
     def finding(self) -> RigFinding:
-        """What all pairs that are remembered say."""
+        """Return the result of all pairs collected."""
         return judge(together(self._found), self._cylinder)
 
 
 def together(found: Iterable[Matches]) -> Matches:
-    """The matches of several pairs as one."""
+    """Return the matches of several pairs as one."""
     parts = [Matches(np.zeros((0, 2)), np.zeros((0, 2)), 0, 0), *found]
     lower, upper = (np.concatenate([getattr(part, side) for part in parts]) for side in ("lower", "upper"))
     return Matches(lower, upper, sum(part.tried for part in parts), sum(part.clear for part in parts))
 
 
 def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> Matches:
-    """Corners of the lower panorama found in the upper one, wherever they are, to a fraction of a pixel."""
+    """Return the corners of the lower panorama found in the upper one, by coarse search and tracking."""
     points = corners(lower, visible, POINTS)
     guess, likely, clear = _coarse(lower, upper, points)
     there, good = track(lower, upper, points, guess, KLT)
     step = there - guess
     step[:, 0] = (step[:, 0] + lower.width / 2) % lower.width - lower.width / 2
-    good &= likely & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + 0.5)
+    good &= likely & (np.abs(step).max(axis=1) < MAX_STEP_PX) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
     return Matches(points[good], there[good], len(points), clear)
 
 
 def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tuple[Array, Flags, int]:
-    """Where points (N, 2) are most likely in the upper panorama, to COARSE pixels, and whether that is like enough.
+    """Return the best positions (N, 2) of points in the upper panorama, to COARSE pixels, and flags of good ones (N,).
 
-    Also how many of the points stand out clearly.
+    Also the number of points with contrast.
     """
-    small_lower, small_upper = (_smaller(wrapped.image) for wrapped in (lower, upper))
+    small_lower, small_upper = (_reduced(wrapped.image) for wrapped in (lower, upper))
     height, width = small_upper.shape
     guess, likely, clear = points.copy(), np.zeros(len(points), bool), 0
     padded = points + np.array([lower.pad_px, 0])
@@ -136,26 +141,26 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
             continue
         _, best, _, (aside, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
         guess[index] += COARSE * (low + aside - left), COARSE * down
-        likely[index] = best >= MIN_LIKENESS
-        clear += bool(patch.std() > CLEAR_GREY)
+        likely[index] = best >= MIN_CORRELATION
+        clear += bool(patch.std() > CONTRAST_GREY)
     return guess, likely, clear
 
 
-def _smaller(image: Image) -> Image:
+def _reduced(image: Image) -> Image:
     width, height = image.shape[1] // COARSE, image.shape[0] // COARSE
     whole = image[:height * COARSE, :width * COARSE]
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
-    """The verdict on a rig by matches of some pairs."""
+    """Return the result for a rig by matches of some pairs."""
     aside = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
     offset = float(np.median(aside)) if len(aside) else float("nan")
-    spread = 1.4826 * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
     enough = len(aside) >= MIN_MATCHES
     drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
-    left = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
-    offsets = [abs(median) for _, median, count in left if count >= MIN_IN_SECTOR]
+    residuals = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
+    offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
     return RigFinding(_verdict(drift, left_px, (len(aside), found.clear)), len(aside), found.tried, offset, spread,
                       _by_azimuth(found.lower, aside, cylinder), left_px, drift)
@@ -163,20 +168,20 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
 
 def _verdict(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> Verdict:
     matches, clear = counts
-    if clear >= MIN_CLEAR and matches < MIN_SHARE * clear:
+    if clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
         return "broken"
     if drift is None:
         return "unknown"
     turn, shift = np.rad2deg(np.linalg.norm(drift.turn)), np.rad2deg(np.linalg.norm(drift.shift))
     unsure = np.rad2deg(SIGMAS * np.array([np.linalg.norm(drift.turn_sigma), np.linalg.norm(drift.shift_sigma)]))
-    worst = max(max(0.0, turn - unsure[0]), SHIFT_PART * max(0.0, shift - unsure[1]))
+    worst = max(max(0.0, turn - unsure[0]), SHIFT_WEIGHT * max(0.0, shift - unsure[1]))
     if worst > BROKEN_DEG:
         return "broken"
     return "drifted" if worst > DRIFTED_DEG or left_px > DRIFTED_PX else "good"
 
 
 def _by_azimuth(lower: Array, aside: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
-    """Azimuth of a sector's middle [deg], median offset [px], matches, all around; sectors without matches are NaN."""
+    """Return azimuth of the middle [deg], median offset [px], NaN without matches, and matches of each sector."""
     azimuth = np.pi - (lower[:, 0] + 0.5) / cylinder.focal_px
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     middle = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS

@@ -1,4 +1,4 @@
-"""The plan view: what is drawn where, bounded, and still readable without colour."""
+"""Plan view: positions, heights, size limits, readable without colour."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ EMPTY = points(np.empty((0, 3)))
 
 
 def box(x_m: float, y_m: float, z_m: float = 0.0) -> NDArray[np.float64]:
-    """A filled square of 0.4 m about a point."""
+    """Return a filled square of 0.4 m about a point."""
     grid = np.arange(-0.2, 0.21, 0.05)
     x, y = np.meshgrid(x_m + grid, y_m + grid)
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, z_m)], axis=1)
 
 
 def area(image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """The drawn area without its border, as grey levels."""
+    """Return the drawn area without its border, as grey levels."""
     inside = image[MARGIN_PX + 2 : -MARGIN_PX - 2, MARGIN_PX + 2 : -MARGIN_PX - 2]
     return np.asarray(cv2.cvtColor(inside, cv2.COLOR_BGR2GRAY), dtype=np.float64)
 
 
-def inked(image: NDArray[np.uint8]) -> tuple[float, float]:
-    """Mean column and row of the dark pixels, as shares of the drawn area."""
+def dark_centre(image: NDArray[np.uint8]) -> tuple[float, float]:
+    """Return mean column and row of the dark pixels, as fractions of the drawn area."""
     grey = area(image)
     rows, columns = np.nonzero(grey < 200)
     return float(columns.mean() / grey.shape[1]), float(rows.mean() / grey.shape[0])
@@ -47,7 +47,7 @@ def test_forward_is_right_and_left_is_up() -> None:
     frame = np.array([[-3.0, -3.0], [3.0, 3.0]])
     for x_m, y_m in ((2.0, 1.0), (-2.0, -1.0), (0.5, -2.0)):
         cloud = np.vstack([box(x_m, y_m), [[*corner, 0.0] for corner in frame]])
-        column, row = inked(plan_view(points(cloud), NO_PATH))
+        column, row = dark_centre(plan_view(points(cloud), NO_PATH))
         assert column == pytest.approx(0.5 + x_m / 6.36, abs=0.02)
         assert row == pytest.approx(0.5 - y_m / 6.36, abs=0.02)
 
@@ -59,7 +59,7 @@ def test_only_the_height_band_is_drawn() -> None:
     assert (area(plan_view(cloud, NO_PATH, z_low_m=-2.5)) < 200).any()
 
 
-def test_confidence_and_density_are_darkness() -> None:
+def test_cells_are_darker_with_confidence_and_density() -> None:
     sure, unsure, tall = box(-1, 0), box(0, 0), np.vstack([box(1, 0, z) for z in np.arange(-0.5, 0.5, 0.1)])
     cloud = MapPoints(
         xyz=np.vstack([sure, unsure, tall]).astype(np.float32),
@@ -86,7 +86,7 @@ def test_path_start_and_end_without_colour() -> None:
     assert not np.array_equal(plan_view(EMPTY, path), plan_view(EMPTY, path[::-1]))  # which end is which
 
 
-def test_path_is_seen_on_a_dark_map() -> None:
+def test_the_path_is_visible_on_a_dark_map() -> None:
     wall = np.vstack([box(x, 0.0, z) for x in np.arange(0, 5, 0.2) for z in np.arange(0, 1, 0.2)])
     image = plan_view(points(wall), np.array([[0.0, 0.0], [2.5, 0.0], [5.0, 0.0]]))
     grey = area(image)
@@ -97,7 +97,7 @@ def test_path_is_seen_on_a_dark_map() -> None:
 
 
 @pytest.mark.parametrize("path", [NO_PATH, np.zeros((1, 2)), np.full((3, 2), np.nan), OVERFLOWING])
-def test_next_to_nothing_is_still_a_image(path: NDArray[np.float64]) -> None:
+def test_draws_an_image_of_an_almost_empty_map(path: NDArray[np.float64]) -> None:
     image = plan_view(EMPTY, path)
     assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
     assert (image[MARGIN_PX - 20 :] < 100).any()  # axes
@@ -105,19 +105,19 @@ def test_next_to_nothing_is_still_a_image(path: NDArray[np.float64]) -> None:
 
 @pytest.mark.parametrize("extent_m", [0.01, 3.0, 250.0, 1e6, 1e9])
 @pytest.mark.parametrize("side_px", [1, 300, 1400, 10**6])
-def test_size_is_bounded_whatever_the_extent(extent_m: float, side_px: int) -> None:
+def test_size_is_bounded_for_any_extent(extent_m: float, side_px: int) -> None:
     for shape in ([1.0, 0.0], [0.0, 1.0], [1.0, -0.7]):
         path = np.linspace(0, extent_m, 30)[:, None] * shape
         image = plan_view(points(box(0, 0)), path, max_side_px=side_px)
         assert max(image.shape) <= max(256, min(side_px, 2000)) and min(image.shape[:2]) > 2 * MARGIN_PX + 10
 
 
-def test_a_few_far_points_do_not_shrink_the_room() -> None:
+def test_a_few_far_points_do_not_shrink_the_rest() -> None:
     room = np.vstack([box(x, y) for x in np.arange(-3, 3, 0.4) for y in (-3, 3)])
     far = np.array([[500.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [3e38, 0.0, 0.0]])
     clean, littered = (plan_view(points(cloud), NO_PATH) for cloud in (room, np.vstack([room, far])))
     assert abs(clean.shape[1] - littered.shape[1]) < 9
-    assert inked(littered) == pytest.approx(inked(clean), abs=0.02)
+    assert dark_centre(littered) == pytest.approx(dark_centre(clean), abs=0.02)
 
 
 def test_same_input_gives_the_same_image() -> None:

@@ -1,4 +1,4 @@
-"""PLY maps: exact round trip, the format other programs read, atomic writing, plain refusals."""
+"""PLY maps: exact round trip, layout of the file, atomic writing, refused files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def some_points(count: int) -> MapPoints:
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
-def test_what_is_written_is_read(tmp_path: Path, count: int) -> None:
+def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
     path, points = tmp_path / "map.ply", some_points(count)
     write_ply(path, points)
     read = read_ply(path)
@@ -32,7 +32,7 @@ def test_what_is_written_is_read(tmp_path: Path, count: int) -> None:
         assert found.dtype == expected.dtype and np.array_equal(found, expected)
 
 
-def test_layout_is_the_one_in_the_header(tmp_path: Path) -> None:
+def test_the_layout_agrees_with_the_header(tmp_path: Path) -> None:
     path, points = tmp_path / "map.ply", some_points(3)
     write_ply(path, points)
     header, body = path.read_bytes().split(b"end_header\n")
@@ -45,14 +45,14 @@ def test_layout_is_the_one_in_the_header(tmp_path: Path) -> None:
     assert np.array_equal(vertices["y"], points.xyz[:, 1]) and np.array_equal(vertices["age"], points.age)
 
 
-def test_replaces_the_old_map_and_leaves_nothing_beside(tmp_path: Path) -> None:
+def test_replaces_the_old_map_and_leaves_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     for count in (5, 2):
         write_ply(str(path), some_points(count))
     assert len(read_ply(str(path)).xyz) == 2 and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_reader_keeps_the_old_map_while_a_new_one_comes(tmp_path: Path) -> None:
+def test_a_reader_keeps_the_old_map_while_a_new_one_is_written(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, some_points(5))
     with path.open("rb") as reader:
@@ -67,18 +67,18 @@ def test_same_points_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_unwritable_places(tmp_path: Path) -> None:
+def test_refuses_paths_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     for name in ("absent/map.ply", "file/map.ply", "folder", "nul\0.ply", "x" * 300):
-        with pytest.raises(OmnidError, match="cannot be"):
+        with pytest.raises(OmnidError, match="cannot write"):
             write_ply(tmp_path / name, some_points(1))
     with pytest.raises(OmnidError):
         write_ply("/", some_points(1))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def test_refuses_other_files(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, some_points(4))
     good = path.read_bytes()
@@ -89,5 +89,5 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(OmnidError, match=r"map\.ply"):
             read_ply(path)
     for absent in (tmp_path / "absent.ply", tmp_path):
-        with pytest.raises(OmnidError, match="cannot be read"):
+        with pytest.raises(OmnidError, match="cannot read"):
             read_ply(absent)

@@ -1,4 +1,4 @@
-"""TUM files: exact stamps, tolerant of layout, strict about content."""
+"""TUM files: exact stamps, tolerant layout, strict content."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_rows_written_are_read_back(tmp_path: Path) -> None:
     assert all(float(row.split()[7]) >= 0.0 for row in rows)
 
 
-def test_row_is_fixed_text() -> None:
+def test_formats_a_row() -> None:
     assert tum_row(0, np.eye(4)) == " ".join(["0.000000000"] * 7 + ["1.000000000"])
     quarter = se3.transform(se3.rotation([0.0, 0.0, -1.0, -1.0]), [-1e-12, 12.5, -0.25])
     assert tum_row(-1_000_000_005, quarter) == (
@@ -53,7 +53,7 @@ def test_row_is_fixed_text() -> None:
 
 
 @pytest.mark.parametrize("noise_rad", [1e-12, -1e-12])
-def test_half_turn_has_one_sign(noise_rad: float) -> None:
+def test_a_half_turn_has_one_sign(noise_rad: float) -> None:
     T = se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, np.pi + noise_rad])
     assert tum_row(0, T).endswith("0.000000000 0.000000000 1.000000000 0.000000000")
 
@@ -74,7 +74,7 @@ def test_stamps_are_exact(tmp_path: Path, word: str, stamp_ns: int) -> None:
     assert read_tum(written(tmp_path, f"{word} 0 0 0 0 0 0 1")).stamps_ns.tolist() == [stamp_ns]
 
 
-def test_layout_is_forgiven(tmp_path: Path) -> None:
+def test_accepts_other_layouts(tmp_path: Path) -> None:
     text = "\ufeff# t x y z\r\n\r\n  2.0\t1 2 3   0 0 0 2  # late\r\n#\r\n1.0 4 5 6 0 0 1e300 -1e300 \r\n\n"
     read = read_tum(written(tmp_path, text))
     assert read.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
@@ -109,17 +109,17 @@ def test_arrays_are_read_only(tmp_path: Path) -> None:
         ("\x00\x1b[2J", "found 1: '\\x00\\x1b[2J'"),
     ],
 )
-def test_bad_line_is_named(tmp_path: Path, line: str, found: str) -> None:
+def test_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
     message = refusal(tmp_path, f"# poses\n{GOOD}{line}\n{GOOD}")
     assert "line 3: expected" in message and found in message
 
 
-def test_bytes_that_are_no_text(tmp_path: Path) -> None:
+def test_refuses_binary_files(tmp_path: Path) -> None:
     assert "line 2: expected" in refusal(tmp_path, GOOD.encode() + b"1 \xff\n")
     assert "found byte 0x89" in refusal(tmp_path, b"\x89MCAP0\r\n\x01\x0c")
 
 
-def test_random_bytes_never_crash(tmp_path: Path) -> None:
+def test_refuses_random_bytes(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     letters = np.frombuffer(b"0123456789.-+eE naif_#,\t\n\r\x00\xc3\xa9", dtype=np.uint8)
     for size in range(1, 400, 3):
@@ -142,5 +142,5 @@ def test_repeated_stamp_names_both_lines(tmp_path: Path) -> None:
 
 def test_unreadable_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "absent.txt", tmp_path / "a\0b"):
-        with pytest.raises(OmnidError, match="cannot be read"):
+        with pytest.raises(OmnidError, match="cannot read"):
             read_tum(path)
