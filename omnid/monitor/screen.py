@@ -33,13 +33,13 @@ class Screen:
     def show(self, state: RobotState, dropped: int = 0) -> None:
         """Write the state; dropped: messages that the inbox could not hold."""
         if self._out.isatty():
-            self._out.write(_CLEAR + "\n".join(table(self._robot, state, dropped)) + "\n")
+            self._out.write(_CLEAR + "\n".join(status_table(self._robot, state, dropped)) + "\n")
         else:
-            self._out.write(line(self._robot, state) + "\n")
+            self._out.write(summary_line(self._robot, state) + "\n")
         self._out.flush()
 
 
-def line(robot: str, state: RobotState) -> str:
+def summary_line(robot: str, state: RobotState) -> str:
     """Return pose, rate, losses and latencies in one line."""
     if state.pose is None:
         return f"{robot}: no pose yet"
@@ -47,9 +47,9 @@ def line(robot: str, state: RobotState) -> str:
     return f"{robot}: {state.state}  {_position(state.pose)}  {counts}  {_latencies(state)}"
 
 
-def table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
+def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
     """Yield the same line, the uncertainty of the pose, and a line for each part of the robot."""
-    yield line(robot, state)
+    yield summary_line(robot, state)
     if state.pose is not None:
         sigma = np.sqrt(np.maximum(0.0, state.pose.covariance.diagonal()))
         details = state.pose.attachment

@@ -26,7 +26,7 @@ from omnid.transport.codec import (
     POINT_CLOUD_SCHEMA,
     TWIST_SCHEMA,
     OdometryRecord,
-    Twist,
+    TwistRecord,
     odometry_from_cdr,
     twist_from_cdr,
 )
@@ -40,7 +40,7 @@ TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
-Content: TypeAlias = OdometryRecord | Diagnostics | Cloud | Twist | RosImage
+Content: TypeAlias = OdometryRecord | Diagnostics | Cloud | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[memoryview], Content]
 
 
@@ -113,7 +113,7 @@ def _decoder(name: str, schema: str) -> Decoder | None:
     return decoder if schema == expected else None
 
 
-def _finite_twist(data: memoryview) -> Twist:
+def _finite_twist(data: memoryview) -> TwistRecord:
     twist = twist_from_cdr(bytes(data))
     if not (math.isfinite(twist.velocity_mps) and math.isfinite(twist.yaw_rate_radps)):
         raise OmnidError(f"a command of {twist.velocity_mps} m/s and {twist.yaw_rate_radps} rad/s: expected numbers")

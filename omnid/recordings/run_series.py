@@ -21,7 +21,7 @@ from omnid.recordings.recording_reader import DRIVE, ODOMETRY, STATUS, Recording
 from omnid.recordings.series_differences import Series
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import OdometryRecord, Twist
+from omnid.transport.codec import OdometryRecord, TwistRecord
 from omnid.transport.decode import Diagnostics
 from omnid.transport.status_names import Key
 
@@ -56,7 +56,7 @@ def read_run_series(path: Path, topic: str | None = None) -> RunSeries:
                 columns[ODOMETRY].add(stamp_ns, (*T[:3, 3].tolist(), *se3.quaternion(T[:3, :3]).tolist()))
             case Diagnostics():
                 _add_state(columns[STATUS], message.content)
-            case Twist(stamp_ns, _, velocity_mps, yaw_rate_radps):
+            case TwistRecord(stamp_ns, _, velocity_mps, yaw_rate_radps):
                 columns[DRIVE].add(stamp_ns, (velocity_mps, yaw_rate_radps))
     poses, states, drive = (columns[name].series() for name in (ODOMETRY, STATUS, DRIVE))
     if not poses.stamps_ns.size:

@@ -1,4 +1,4 @@
-"""Charts over time, all with the same axis of time and the same shades for the states."""
+"""Charts over time, all with the same time axis and the same shades for the states."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from omnid.report.svg import (
     Axis,
     Point,
     axis_for,
+    coord,
     hidden,
     key,
     label,
-    number,
     pieces,
     polyline,
     rectangles,
@@ -33,42 +33,42 @@ Spans: TypeAlias = tuple[list[Point], ...]  # of tracking, degraded and lost, as
 
 
 class ChartLine(NamedTuple):
-    """A course to draw; each of a chart has a style of its own."""
+    """A curve of a chart; each has a style of its own."""
 
     name: str
     points: Sequence[Point]
 
 
-def line(name: str, course: Downsampled) -> ChartLine:
-    """A course as a line."""
-    return ChartLine(name, course.points())
+def curve(name: str, series: Downsampled) -> ChartLine:
+    """Return a series as a curve."""
+    return ChartLine(name, series.points())
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The time that is shown, s since the first pose, and in what unit."""
+    """The time range that is shown, s since the first pose, and its unit."""
 
     start_s: float
     end_s: float
 
     @property
     def unit(self) -> tuple[float, str]:
-        """Seconds in it, and its name."""
+        """Length of the unit in seconds, and its name."""
         return next((seconds, name) for most, seconds, name in _UNITS if self.end_s - self.start_s <= most)
 
     def axis(self, start_px: float, end_px: float) -> Axis:
-        """Values are in the unit."""
+        """Return the axis of the time range, in the unit."""
         seconds, _ = self.unit
         return Axis(self.start_s / seconds, self.end_s / seconds, start_px, end_px)
 
     def shown(self, points: Sequence[Point]) -> list[Point]:
-        """Those of the points within the time, in the unit."""
+        """Return the points within the time range, with times in the unit."""
         seconds, _ = self.unit
         return [(t / seconds, value) for t, value in points if self.start_s <= t <= self.end_s]
 
 
 def spans_of(states: Sequence[Point], end_s: float) -> Spans:
-    """From when to when [s] the odometry was in each state, out of ranks at times: a state holds until the next one."""
+    """Return start and end [s] of each state from points (time, rank); a state lasts until the next one."""
     found: Spans = ([], [], [])
     for (t, rank), (until, _) in pairwise([*states, (end_s, 0.0)]):
         spans = found[int(rank)]
@@ -80,7 +80,7 @@ def spans_of(states: Sequence[Point], end_s: float) -> Spans:
 
 
 def shades(spans: Spans, clock: Clock) -> str:
-    """The background of all charts, to be put into the page once."""
+    """Return the background of all charts, to be put into the page once."""
     seconds, _ = clock.unit
     axis = clock.axis(_LEFT, _RIGHT)
     areas = (rectangles([(axis.px(a / seconds), axis.px(b / seconds)) for a, b in spans[rank]],
@@ -99,26 +99,26 @@ def chart(
     zero: bool = False,
     note: str = "",
 ) -> str:
-    """A figure with some courses over time; "" where there is nothing to draw."""
+    """Return a figure with curves over time; "" where all are empty."""
     shown = [ChartLine(name, [p for p in clock.shown(points) if p[1] > 0 or not log]) for name, points in lines]
     styled = list(zip(cycle(STYLES), (drawn for drawn in shown if drawn.points), strict=False))
     if not styled:
         return ""
     x = clock.axis(_LEFT, _RIGHT)
     y = axis_for([value for _, drawn in styled for _, value in drawn.points], (_BOTTOM, _TOP), log=log, zero=zero)
-    courses = [polyline([(x.px(t), y.px(value)) for t, value in piece], style)
-               for style, drawn in styled for piece in pieces(drawn.points)]
+    curves = [polyline([(x.px(t), y.px(value)) for t, value in piece], style)
+              for style, drawn in styled for piece in pieces(drawn.points)]
     keys = "".join(key(style, drawn.name) for style, drawn in styled if drawn.name)
     caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''} {keys}"
     remark = f"<small>{escape(note)}</small>" if note else ""
-    image = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *courses])
+    image = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *curves])
     return (f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
             f"aria-label='{escape(title)}'>{image}</svg>{remark}</figure>")
 
 
 def _grid(x: Axis, y: Axis) -> Iterator[str]:
-    rows = "".join(f"M{_LEFT} {number(y.px(v))}H{_RIGHT}" for v in y.ticks(5))
-    columns = "".join(f"M{number(x.px(v))} {_TOP}V{_BOTTOM}" for v in x.ticks(8))
+    rows = "".join(f"M{_LEFT} {coord(y.px(v))}H{_RIGHT}" for v in y.ticks(5))
+    columns = "".join(f"M{coord(x.px(v))} {_TOP}V{_BOTTOM}" for v in x.ticks(8))
     yield f"<path class='grid' d='{rows}{columns}'/>"
 
 
@@ -130,9 +130,9 @@ def _frame(x: Axis, y: Axis, clock: Clock) -> Iterator[str]:
 
 
 def time_ticks(x: Axis, bottom: float, clock: Clock) -> Iterator[str]:
-    """Ticks with their times, below a row [px]."""
+    """Yield ticks with their times, below a row [px]."""
     ticks = x.ticks(8)
-    yield f"<path class='axis' d='{''.join(f'M{number(x.px(v))} {number(bottom)}v4' for v in ticks)}'/>"
+    yield f"<path class='axis' d='{''.join(f'M{coord(x.px(v))} {coord(bottom)}v4' for v in ticks)}'/>"
     for value in ticks:
         last = value == ticks[-1]
         words = f"{label(value)} {clock.unit[1]}" if last else label(value)

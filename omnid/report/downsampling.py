@@ -1,4 +1,4 @@
-"""What a log of any length comes to in bounded memory, such that no spike is lost."""
+"""Downsampling of series and paths of any length in bounded memory, without loss of spikes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 BINS: Final = 500
-LARGEST: Final = 1e9  # what is beyond is no measure of a robot
+LARGEST: Final = 1e9  # values beyond are invalid
 _FINEST_S: Final = 1e-3
 _FINEST_M: Final = 0.01
 _CORNERS: Final = 4000
@@ -21,9 +21,9 @@ class _Bin(NamedTuple):
 
 
 class Downsampled:
-    """The course of one quantity: the lowest and the highest value in each of at most BINS spans of time.
+    """Lowest and highest value of a series in each of at most BINS bins of time.
 
-    The spans are equally long and double in length whenever there are too many; values may come in any order.
+    All bins have the same length, which doubles whenever there are too many; values may come in any order.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Downsampled:
         self.newest = math.nan
 
     def add(self, t_s: float, value: float) -> None:
-        """Takes a value; one that is not finite, or absurd, is left out."""
+        """Add a value; one that is not finite, or larger than LARGEST, is left out."""
         if not (abs(value) <= LARGEST and abs(t_s) <= LARGEST):
             return
         self.count, self.newest = self.count + 1, value
@@ -42,12 +42,12 @@ class Downsampled:
             self._widen()
 
     def points(self) -> list[Point]:
-        """At most two points for each span, in the order of time."""
+        """Return at most two points for each bin, in the order of time."""
         return sorted({point for bin_ in self._bins.values() for point in bin_})
 
     @property
     def highest(self) -> float:
-        """The highest value of all; NaN without any."""
+        """Highest of all values; NaN without any."""
         return max((bin_.high[1] for bin_ in self._bins.values()), default=math.nan)
 
     def _put(self, key: int, new: _Bin) -> None:
@@ -64,16 +64,16 @@ _value: Callable[[Point], float] = lambda point: point[1]  # noqa: E731 - a key 
 
 
 class Corner(NamedTuple):
-    """A place on a path."""
+    """A vertex of a path."""
 
     x_m: float
     y_m: float
     t_s: float
-    rank: int  # the worst state on the way here
+    rank: int  # worst state since the previous vertex
 
 
 class PathTrace:
-    """A path in at most 4000 corners: one for each step of a length that doubles whenever there are too many."""
+    """A path in at most 4000 vertices, one for each step of a length that doubles whenever there are too many."""
 
     def __init__(self) -> None:
         self._step_m = _FINEST_M
@@ -81,7 +81,7 @@ class PathTrace:
         self._newest: Corner | None = None
 
     def add(self, corner: Corner) -> None:
-        """Takes the next place."""
+        """Add the next position."""
         if self._newest is not None and self._newest is not self._last:
             corner = corner._replace(rank=max(corner.rank, self._newest.rank))
         self._newest = corner
@@ -92,7 +92,7 @@ class PathTrace:
 
     @property
     def corners(self) -> list[Corner]:
-        """The corners, and the place where it ends."""
+        """The vertices and the end of the path."""
         unfinished = self._newest is not None and self._newest is not self._last
         return [*self._corners, *([self._newest] if unfinished and self._newest else [])]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Final
 
-from omnid.report.chart import ChartLine, Clock, chart, line
+from omnid.report.chart import ChartLine, Clock, chart, curve
 from omnid.report.page import facts, grid, note, table
 from omnid.report.report_data import ReportData
 from omnid.report.status_history import StatusHistory
@@ -42,12 +42,12 @@ def timing(data: ReportData, clock: Clock) -> list[str]:
     p50, p99 = (statuses.series(ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for p in ("p50", "p99"))
     work = {name: statuses.series(stage_name(name), time_key(WORK, "p50")) for name in _STAGES}
     figures = [
-        chart("Poses per second", [line("", statuses.series(ODOMETRY, Key.RATE_HZ))], clock, zero=True),
-        chart("Age of the newest pose at each report", [line("", statuses.series(ODOMETRY, Key.AGE_S))], clock,
+        chart("Poses per second", [curve("", statuses.series(ODOMETRY, Key.RATE_HZ))], clock, zero=True),
+        chart("Age of the newest pose at each report", [curve("", statuses.series(ODOMETRY, Key.AGE_S))], clock,
               unit="s", zero=True),
-        chart("From the image to its pose", [line("median", p50), line("99th percentile", p99)], clock, unit="ms",
+        chart("From the image to its pose", [curve("median", p50), curve("99th percentile", p99)], clock, unit="ms",
               zero=True, note="Of all poses since the start of the run."),
-        chart("Median work of a stage", [line(name, series) for name, series in work.items() if series.count],
+        chart("Median work of a stage", [curve(name, series) for name, series in work.items() if series.count],
               clock, unit="ms", log=True, note="Of all messages since the start of the run."),
         chart("Messages dropped, deadlines missed, so far", _losses(statuses), clock, zero=True)]
     return [*head, _stage_table(statuses), grid(figures)]
@@ -57,7 +57,7 @@ def _losses(statuses: StatusHistory) -> list[ChartLine]:
     found = [(statuses.series(stage_name(name), key), f"{name}, {key}") for name, _ in statuses.stages()
              for key in (Key.DROPPED, Key.MISSED)]
     worst = sorted((series.newest, name, series) for series, name in found if series.newest > 0)[::-1]
-    return [line(name, series) for _, name, series in worst[:_MAX_LOSSES]]
+    return [curve(name, series) for _, name, series in worst[:_MAX_LOSSES]]
 
 
 def _stage_table(statuses: StatusHistory) -> str:
@@ -89,9 +89,9 @@ def parts(data: ReportData, clock: Clock) -> list[str]:
     rows = [(escape(short_name(name)), escape(statuses.newest[name].message),
              ", ".join(f"{escape(key)} {escape(value)}" for key, value in statuses.values(name).items()))
             for name in names]
-    rates = [line(short_name(name), statuses.series(name, Key.RATE_HZ)) for name in names
+    rates = [curve(short_name(name), statuses.series(name, Key.RATE_HZ)) for name in names
              if statuses.series(name, Key.RATE_HZ).count]
-    late = [line(title, statuses.series(WHEELS, time_key(TICK_LATE, statistic)))
+    late = [curve(title, statuses.series(WHEELS, time_key(TICK_LATE, statistic)))
             for title, statistic in (("99th percentile", "p99"), ("maximum", "max"))]
     figures = [chart("Images per second", rates, clock, zero=True),
                chart("Lateness of the wheels' tick, so far", late, clock, unit="ms", zero=True)]

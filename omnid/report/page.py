@@ -1,4 +1,4 @@
-"""The pieces of a page that needs nothing beside itself: a head, tables, images within the text."""
+"""Elements of a self-contained HTML page: head, tables, embedded images."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1
 
 
 def page(title: str, parts: Sequence[str], style: str = "") -> str:
-    """A whole HTML page of parts, which are HTML; style comes after the usual one."""
+    """Return an HTML page of parts, which are HTML; style is appended to STYLE."""
     return (f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta name='viewport' content='width=device-"
             f"width'><title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
             f"<body>{''.join(parts)}</body></html>\n")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; cells are HTML."""
+    """Return a table; cells are HTML."""
     titles = "".join(f"<th>{title}</th>" for title in head)
     lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
 
 
 def facts(rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values; both are HTML."""
+    """Return a table of names and values; both are HTML."""
     return f"<div class='words facts'>{table(('', ''), rows)}</div>"
 
 
-def note(words: str) -> str:
-    """A remark, such as one about what is missing."""
-    return f"<p class='note'>{escape(words)}</p>"
+def note(text: str) -> str:
+    """Return a paragraph with a remark."""
+    return f"<p class='note'>{escape(text)}</p>"
 
 
 def grid(figures: Sequence[str]) -> str:
-    """Figures side by side where there is room."""
+    """Return figures side by side where there is room."""
     return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
 
 
 def figure(image: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
-    """A image within the page."""
+    """Return an embedded image with a caption."""
     data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     source = base64.b64encode(data.tobytes()).decode()
     img_tag = f"<img src='data:image/jpeg;base64,{source}' alt=''>"

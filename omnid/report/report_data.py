@@ -24,7 +24,7 @@ from omnid.report.downsampling import Downsampled
 from omnid.report.events import Events
 from omnid.report.poses import PoseHistory
 from omnid.report.status_history import StatusHistory
-from omnid.transport.codec import OdometryRecord, Twist
+from omnid.transport.codec import OdometryRecord, TwistRecord
 from omnid.transport.decode import Cloud, Diagnostics
 
 MAX_EARLY: Final = 64  # status messages before the first pose
@@ -114,7 +114,7 @@ class _Collector:
                     self._add_diagnostics(message.content)
                 case Cloud():
                     self._data.cloud = message.content
-                case Twist():
+                case TwistRecord():
                     self._add_twist(message.name, message.content)
         self._add_pending()
         self._data.unreadable += reader.unreadable.total()
@@ -143,7 +143,7 @@ class _Collector:
         else:
             self._data.statuses.add(diagnostics, self._data.poses.seconds)
 
-    def _add_twist(self, name: str, twist: Twist) -> None:
+    def _add_twist(self, name: str, twist: TwistRecord) -> None:
         if self._offset_ns is None:
             return
         drive = self._data.drives.setdefault(name, DriveHistory())

@@ -8,7 +8,7 @@ from html import escape
 from typing import Final
 
 from omnid.recordings.recording_reader import DRIVE, TWIST_COMMAND
-from omnid.report.chart import ChartLine, Clock, chart, line
+from omnid.report.chart import ChartLine, Clock, chart, curve
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import Event, Events
 from omnid.report.health import rounded
@@ -96,14 +96,14 @@ def _event_text(event: Event) -> str:
 def motion(data: ReportData, clock: Clock) -> list[str]:
     """Return the section with speed, yaw rate and height, beside the commands."""
     series, drives = data.poses.series, data.drives
-    speed, yaw_rate = [line("measured", series["speed"])], [line("measured", series["yaw_rate"])]
+    speed, yaw_rate = [curve("measured", series["speed"])], [curve("measured", series["yaw_rate"])]
     for topic, name in ((DRIVE, "sent to the wheels"), (TWIST_COMMAND, "commanded")):
         if topic in drives:
-            speed.append(line(name, drives[topic].speed))
-            yaw_rate.append(line(name, drives[topic].yaw_rate))
+            speed.append(curve(name, drives[topic].speed))
+            yaw_rate.append(curve(name, drives[topic].yaw_rate))
     figures = [chart("Forward speed", speed, clock, unit="m/s", zero=True),
                chart("Yaw rate, to the left", yaw_rate, clock, unit="deg/s", zero=True),
-               chart("Height of the robot", [line("", series["height"])], clock, unit="m")]
+               chart("Height of the robot", [curve("", series["height"])], clock, unit="m")]
     missing = [] if drives else [note("The log holds no commands to the wheels (…/drive, …/cmd/twist).")]
     return ["<h2>Motion</h2>", grid(figures), *missing]
 
@@ -112,12 +112,12 @@ def uncertainty(data: ReportData, clock: Clock) -> list[str]:
     """Return the section with the standard deviations of the covariances, and the landmarks."""
     series, statuses = data.poses.series, data.statuses
     tracked, inliers = (statuses.series(ODOMETRY, key) for key in (Key.TRACKED, Key.INLIERS))
-    position, heading = [line("", series["sigma_position"])], [line("", series["sigma_heading"])]
+    position, heading = [curve("", series["sigma_position"])], [curve("", series["sigma_heading"])]
     figures = [chart("Standard deviation of the position, all axes", position, clock, unit="m", log=True),
                chart("Standard deviation of the heading", heading, clock, unit="deg", log=True)]
     missing = [] if any(figures) else [note("The covariances in the log are zero or negative: they were not set.")]
     if tracked.count > 2 and statuses.reports:
-        figures.append(chart("Landmarks", [line("tracked", tracked), line("inliers of the pose", inliers)], clock,
+        figures.append(chart("Landmarks", [curve("tracked", tracked), curve("inliers of the pose", inliers)], clock,
                              zero=True, note="One value per report, not per pose."))
     else:
         missing.append(note(_few_landmarks(tracked, inliers)))

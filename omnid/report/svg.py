@@ -1,4 +1,4 @@
-"""Series of numbers as pieces of SVG, told apart by dashes and greys: they survive a black and white print."""
+"""Elements of SVG figures; lines differ by dashes and greys, so that a black and white print can be read."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ patternTransform="rotate(45)"><rect width="7" height="7" fill="#fff"/>
 <path d="M0 0V7" stroke="#a8a8a8" stroke-width="1.6"/></pattern>
 <pattern id="gone" width="5" height="5" patternUnits="userSpaceOnUse">
 <rect width="5" height="5" fill="#d2d2d2"/><path d="M0 0L5 5M5 0L0 5" stroke="#8a8a8a" stroke-width=".9"/></pattern>"""
-_BREAK: Final = 6.0  # times the usual distance of points: a line is not drawn across
+_BREAK: Final = 6.0  # times the median distance of points in time, across which a line is interrupted
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Where values stand [px]."""
+    """Linear or logarithmic mapping of values to pixels."""
 
     low: float
     high: float
@@ -38,13 +38,13 @@ class Axis:
     log: bool = False
 
     def px(self, value: float) -> float:
-        """The place of a value; the nearest end for one that is outside."""
+        """Return the position of a value; the nearer end for one that is outside."""
         low, high, at = (_scaled(v, self.log) for v in (self.low, self.high, value))
         share = min(1.0, max(0.0, (at - low) / (high - low)))
         return self.start_px + share * (self.end_px - self.start_px)
 
     def ticks(self, most: int) -> list[float]:
-        """Round values within, at most so many."""
+        """Return at most so many round values within the axis."""
         if self.log:
             return _decades(self.low, self.high)
         step = round_step((self.high - self.low) / most)
@@ -53,7 +53,7 @@ class Axis:
 
 
 def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool = False, zero: bool = False) -> Axis:
-    """An axis on which all values fit with a little room; zero: it starts or ends there at the latest."""
+    """Return an axis that holds all values and a margin; zero: it holds 0 as well."""
     if log:
         first, last = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
         return Axis(10.0**first, 10.0 ** max(last, first + 1), *px, log=True)
@@ -63,37 +63,37 @@ def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool = Fa
 
 
 def round_step(least: float) -> float:
-    """The smallest of 1, 2, 5, 10 ... (and their tenths) that is not less."""
+    """Return the smallest of 1, 2, 5 times a power of ten that is not less."""
     decade = 10.0 ** math.floor(math.log10(least))
     return float(next(digit * decade for digit in (1, 2, 5, 10) if digit * decade >= least * (1 - 1e-9)))
 
 
-def number(value: float) -> str:
-    """A coordinate."""
+def coord(value: float) -> str:
+    """Return a coordinate in px with one decimal."""
     text = f"{value:.1f}"
     return text[:-2] if text.endswith(".0") else text
 
 
 def label(value: float) -> str:
-    """A value beside a tick."""
+    """Return the text of a value beside a tick."""
     return f"{value + 0.0:.6g}" if abs(value) < 1e5 or value == 0 else f"{value:.0e}"
 
 
 def path_d(points: Iterable[Point]) -> str:
-    """The data of a path through points [px]."""
-    return "M" + "L".join(f"{number(x)} {number(y)}" for x, y in points)
+    """Return the data of a path through points [px]."""
+    return "M" + "L".join(f"{coord(x)} {coord(y)}" for x, y in points)
 
 
 def polyline(points: Sequence[Point], style: str) -> str:
-    """A line through points [px]; a single one is a dot."""
+    """Return a line through points [px]; a single point becomes a dot."""
     if len(points) == 1:
         (x, y), = points
-        return f"<path {style} d='M{number(x - 1.3)} {number(y)}h2.6'/>"
+        return f"<path {style} d='M{coord(x - 1.3)} {coord(y)}h2.6'/>"
     return f"<path {style} d='{path_d(points)}'/>" if points else ""
 
 
 def pieces(points: Sequence[Point]) -> Iterator[Sequence[Point]]:
-    """The points [s, value], parted where they are much further apart in time than usual."""
+    """Yield the points [s, value] in pieces, split where they are much further apart in time than their median."""
     steps = sorted(b[0] - a[0] for a, b in pairwise(points))
     limit_s = _BREAK * steps[len(steps) // 2] if len(steps) > 2 and steps[len(steps) // 2] > 0 else math.inf
     start = 0
@@ -106,33 +106,33 @@ def pieces(points: Sequence[Point]) -> Iterator[Sequence[Point]]:
 
 
 def text(at: Point, words: str, more: str = "") -> str:
-    """Words at a point [px]; more: attributes."""
-    return f"<text x='{number(at[0])}' y='{number(at[1])}' {more}>{escape(words)}</text>"
+    """Return a text at a point [px]; more: attributes."""
+    return f"<text x='{coord(at[0])}' y='{coord(at[1])}' {more}>{escape(words)}</text>"
 
 
 def rectangles(spans: Iterable[Point], rows: Point) -> str:
-    """The data of a path of upright rectangles from x to x, all between two rows [px]."""
-    top, height = number(rows[0]), number(rows[1] - rows[0])
-    return "".join(f"M{number(a)} {top}H{number(max(b, a + 0.6))}v{height}H{number(a)}z" for a, b in spans)
+    """Return the data of a path of rectangles from x to x, all between two rows [px]."""
+    top, height = coord(rows[0]), coord(rows[1] - rows[0])
+    return "".join(f"M{coord(a)} {top}H{coord(max(b, a + 0.6))}v{height}H{coord(a)}z" for a, b in spans)
 
 
 def hidden(definitions: str) -> str:
-    """Definitions that the page's images refer to."""
+    """Return an invisible element with definitions that figures refer to."""
     return f"<svg style='position:absolute;width:0;height:0' aria-hidden='true'><defs>{definitions}</defs></svg>"
 
 
 def key(style: str, name: str) -> str:
-    """A sample of a line and its name, for a caption."""
+    """Return a legend entry: a sample of a line and its name."""
     return mark_key(f"<path {style} d='M1 6H33'/>", name)
 
 
 def area_key(style: str, name: str) -> str:
-    """A sample of a filled area and its name."""
+    """Return a legend entry: a sample of a filled area and its name."""
     return mark_key(f"<rect {style} x='1' y='1' width='32' height='10'/>", name)
 
 
 def mark_key(drawn: str, name: str) -> str:
-    """What is drawn in 34 x 12 px, and its name."""
+    """Return a legend entry: a drawing of 34 x 12 px and its name."""
     return f"<span class='key'><svg viewBox='0 0 34 12' aria-hidden='true'>{drawn}</svg>{escape(name)}</span>"
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 from omnid.report.chart import Clock, Spans, time_ticks
 from omnid.report.events import ERROR, GOOD, Event
-from omnid.report.svg import Axis, Point, area_key, mark_key, number, rectangles, text
+from omnid.report.svg import Axis, Point, area_key, coord, mark_key, rectangles, text
 
 _LEFT, _RIGHT, _BAND, _LANE = 124, 1030, (8, 36), 26
 _LANES: Final = 14
@@ -55,25 +55,25 @@ def _is_reset(event: Event) -> bool:
 
 def _reset(x: float, bottom: float) -> str:
     """Return a black arrow that points down."""
-    return f"<path d='M{number(x)} {number(bottom)}l-5.5 -11h11z' fill='#000'/>"
+    return f"<path d='M{coord(x)} {coord(bottom)}l-5.5 -11h11z' fill='#000'/>"
 
 
 def _lane(source: str, top: float, events: Sequence[Event], axis: tuple[Axis, float]) -> Iterator[str]:
     x, seconds = axis
     middle = top + _LANE / 2
     yield text((_LEFT - 8, middle + 4), source[:18], "text-anchor='end'")
-    yield f"<path class='grid' d='M{_LEFT} {number(middle)}H{_RIGHT}'/>"
+    yield f"<path class='grid' d='M{_LEFT} {coord(middle)}H{_RIGHT}'/>"
     for event in events:
         a, b = x.px(event.start_s / seconds), x.px(event.end_s / seconds)
         if b - a > 3:
-            yield f"<path d='M{number(a)} {number(middle)}H{number(b)}' stroke='#555' stroke-width='5'/>"
+            yield f"<path d='M{coord(a)} {coord(middle)}H{coord(b)}' stroke='#555' stroke-width='5'/>"
         yield _mark(event.level, a, middle)
 
 
 def _mark(level: int, x: float, y: float) -> str:
     """Return a ring for a good event, a triangle for a warning, a black square for an error."""
     if level == GOOD:
-        return f"<circle cx='{number(x)}' cy='{number(y)}' r='4' fill='#fff' stroke='#111'/>"
+        return f"<circle cx='{coord(x)}' cy='{coord(y)}' r='4' fill='#fff' stroke='#111'/>"
     if level == ERROR:
-        return f"<rect x='{number(x - 4.5)}' y='{number(y - 4.5)}' width='9' height='9' fill='#111'/>"
-    return f"<path d='M{number(x)} {number(y - 5.5)}l5.5 10h-11z' fill='#fff' stroke='#111' stroke-width='1.4'/>"
+        return f"<rect x='{coord(x - 4.5)}' y='{coord(y - 4.5)}' width='9' height='9' fill='#111'/>"
+    return f"<path d='M{coord(x)} {coord(y - 5.5)}l5.5 10h-11z' fill='#fff' stroke='#111' stroke-width='1.4'/>"

@@ -64,7 +64,7 @@ class FrameTransform:
     T_parent_child: Array  # (4, 4)
 
 
-class Twist(NamedTuple):
+class TwistRecord(NamedTuple):
     """Content of a TwistStamped of a ground robot."""
 
     stamp_ns: int
@@ -73,7 +73,7 @@ class Twist(NamedTuple):
     yaw_rate_radps: float
 
 
-class HeadingCommand(NamedTuple):
+class HeadingRecord(NamedTuple):
     """Content of a Vector3Stamped that commands a heading."""
 
     stamp_ns: int
@@ -256,19 +256,19 @@ def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes
     return _cdr(ros.geometry_msgs__msg__Vector3Stamped(_header(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
 
 
-def twist_from_cdr(payload: bytes) -> Twist:
+def twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, TWIST_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
-    return Twist(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
+    return TwistRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
                  message.twist.angular.z)
 
 
-def heading_from_cdr(payload: bytes) -> HeadingCommand:
+def heading_from_cdr(payload: bytes) -> HeadingRecord:
     """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, VECTOR_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
-    return HeadingCommand(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
+    return HeadingRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
                           message.vector.z)
 
 

@@ -44,8 +44,8 @@ class RecordingView:
                                   record.velocity_covariance, PoseAttachment(state=self._state), record.stamp_ns))
 
     def _diagnostics(self, diagnostics: Diagnostics) -> None:
-        self._state = status_plots.tracking_state(diagnostics) or self._state
-        counts = status_plots.landmark_counts(diagnostics)
+        self._state = status_plots.odometry_state(diagnostics) or self._state
+        counts = status_plots.odometry_landmarks(diagnostics)
         if counts is not None:
             self._scene.landmarks(diagnostics.stamp_ns, *counts)
         status_plots.draw(diagnostics, self._changes, self._scene)

@@ -30,14 +30,14 @@ def latencies(diagnostics: Diagnostics) -> Iterator[tuple[tuple[str, ...], float
                 yield (status.name.removeprefix(STAGE_PREFIX),), value_ms
 
 
-def tracking_state(diagnostics: Diagnostics) -> TrackingState | None:
+def odometry_state(diagnostics: Diagnostics) -> TrackingState | None:
     """Return the tracking state; None where the message has none."""
     found = (status_names.tracking_state(status.message, status.values) for status in diagnostics.statuses
              if status.name == ODOMETRY)
     return next((state for state in found if state is not None), None)
 
 
-def landmark_counts(diagnostics: Diagnostics) -> tuple[int, int] | None:
+def odometry_landmarks(diagnostics: Diagnostics) -> tuple[int, int] | None:
     """Return inliers and tracked landmarks; None where the message has none."""
     found = (status_names.landmark_counts(status.values) for status in diagnostics.statuses if status.name == ODOMETRY)
     return next((counts for counts in found if counts is not None), None)

@@ -1,4 +1,4 @@
-"""Logs for the programs that others wrote, and where these programs are."""
+"""Logs that are read by programs of other projects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POSES = 12  # of the live run
 
 
 class Known(NamedTuple):
-    """A log and what is in it."""
+    """A log and its expected content."""
 
     path: Path
     expected: Expected
@@ -22,12 +22,12 @@ class Known(NamedTuple):
 
 @pytest.fixture(scope="session", params=("lz4", "none"))
 def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Known:
-    """Known numbers, with chunks as `--record` and as `omnid run` writes them."""
+    """A log of known numbers, with chunks as `--record` and as `omnid run` writes them."""
     path = tmp_path_factory.mktemp("known") / f"{request.param}.mcap"
     return Known(path, write_known(path, request.param))
 
 
 @pytest.fixture(scope="session")
 def live(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run of the daemon recorded: images, poses, map, states, commands to the wheels."""
+    """The recording of a live run: images, poses, map, states, commands to the wheels."""
     return recorded_run(scene, tmp_path_factory.mktemp("live"), POSES)

@@ -1,6 +1,6 @@
-"""A log of known numbers, written by omnid; and messages in one form for all readers: nested dicts and lists.
+"""A log of known numbers, written by omnid, and messages as nested dicts and lists, the same for all readers.
 
-Bytes stand as their length and SHA-256, the points of a cloud beside it, as read_log.mjs gives them.
+Bytes are represented by length and SHA-256, clouds also by their points, as read_log.mjs prints them.
 """
 
 from __future__ import annotations
@@ -29,39 +29,39 @@ Expected = dict[str, list[dict[str, Any]]]  # topic -> its messages, in order
 
 
 def write_known(path: Path, compression: Any = "lz4") -> Expected:
-    """Writes the log with omnid's own writers; gives what must come out of it."""
+    """Write the log with omnid's own writers and return its expected content."""
     numbers = np.random.default_rng(5)
     expected: Expected = {}
     with LogWriter(path, ATTACHED, compression=compression) as log:
         for index in range(COUNT):
-            for topic, schema, data, message in _said(START_NS + index * PERIOD_NS, numbers):
+            for topic, schema, data, message in _messages(START_NS + index * PERIOD_NS, numbers):
                 log.write(topic, schema, data, START_NS + index * PERIOD_NS)
                 expected.setdefault(topic, []).append(message)
     return expected
 
 
 def digest(data: bytes) -> dict[str, Any]:
-    """What stands for bytes."""
+    """Return length and SHA-256 of bytes."""
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def plain(value: Any) -> Any:
-    """A message of rosbags in the one form."""
+    """Return a message of rosbags as nested dicts and lists."""
     if isinstance(value, np.ndarray):
         return digest(value.tobytes()) if value.dtype == np.uint8 else value.tolist()
     if isinstance(value, list):
         return [plain(entry) for entry in value]
     if not hasattr(value, "__dataclass_fields__"):
         return value
-    fields = [name for name in value.__dataclass_fields__ if not name.isupper()]  # which constants are
+    fields = [name for name in value.__dataclass_fields__ if not name.isupper()]  # constants are upper case
     found = {name: plain(getattr(value, name)) for name in fields if name != "__msgtype__"}
     if value.__msgtype__ == CLOUD:
         found["points"] = value.data.view("<f4").reshape(-1, value.point_step // 4).astype(float).tolist()
     return found
 
 
-def _said(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, str, bytes, dict[str, Any]]]:
-    """One message of each kind: topic, type, bytes, and what they must say."""
+def _messages(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, str, bytes, dict[str, Any]]]:
+    """Return one message of each kind: topic, type, bytes, expected content."""
     T, twist = se3.exp(numbers.normal(size=6)), numbers.normal(size=6)
     covariances = [0.01 * factor @ factor.T for factor in numbers.normal(size=(2, 6, 6))]
     return [
@@ -104,7 +104,7 @@ def _cloud(stamp_ns: int, numbers: np.random.Generator) -> tuple[str, str, bytes
 
 
 def _frames(stamp_ns: int, numbers: np.random.Generator) -> list[Frame]:
-    """A JPEG of the lower camera, raw pixels of the upper one."""
+    """Return a JPEG of the lower camera and raw pixels of the upper one."""
     pixels = numbers.integers(0, 256, (24, 32), dtype=np.uint8)
     jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
     return [Frame(0, stamp_ns, "lower", "jpeg", jpeg), Frame(0, stamp_ns, "upper", "mono8", pixels, 32, 24)]

@@ -1,4 +1,4 @@
-"""Programs that others wrote, found or set up for the tests; a test is skipped where there is none, and says why."""
+"""Programs of other projects, found or installed for the tests; tests of missing programs are skipped."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from typing import Any
 import pytest
 
 HERE = Path(__file__).parent
-PATIENCE_S = 300.0
-UNOBSERVED = {"CI": "1"}  # with which Rerun tells nobody that it is used
+TIMEOUT_S = 300.0
+NO_ANALYTICS = {"CI": "1"}  # with it Rerun sends no usage statistics
 NPM = ("package.json", "read_log.mjs")
 
 
 def run(words: Sequence[object], folder: Path) -> str:
-    """What a program says on stdout; AssertionError with what it said on stderr where it fails."""
-    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S,
-                          env=os.environ | UNOBSERVED)
+    """Return the stdout of a program; raise AssertionError with its stderr where it fails."""
+    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, timeout=TIMEOUT_S,
+                          env=os.environ | NO_ANALYTICS)
     assert done.returncode == 0, f"{words}: {done.stderr[-2000:]}"
     return done.stdout
 
 
 def lines(words: Sequence[object], folder: Path) -> list[Any]:
-    """What a program says, as JSON line by line."""
+    """Return the stdout of a program, parsed as JSON line by line."""
     return [json.loads(line) for line in run(words, folder).splitlines()]
 
 
 def program(name: str, package: str) -> Path:
-    """A program on the PATH."""
+    """Return the path of a program on the PATH."""
     found = shutil.which(name)
     if found is None:
-        pytest.skip(f"there is no {name} on the PATH: python3 -m venv VENV && VENV/bin/pip install {package}, then "
+        pytest.skip(f"{name} is not on the PATH: python3 -m venv VENV && VENV/bin/pip install {package}, then "
                     "PATH=VENV/bin:$PATH")
     return Path(found)
 
 
 def npm_reader() -> Path:
-    """read_log.mjs beside the packages of package.json, which are installed at the first use.
+    """Return read_log.mjs beside the packages of package.json, which are installed at the first use.
 
     In $OMNID_INTEROP_CACHE, else in ~/.cache/omnid-interop.
     """
     if not shutil.which("node") or not shutil.which("npm"):
-        pytest.skip("there is no node or npm on the PATH: apt install nodejs npm (node 18 or newer)")
+        pytest.skip("node or npm is not on the PATH: apt install nodejs npm (node 18 or newer)")
     folder = Path(os.environ.get("OMNID_INTEROP_CACHE") or Path.home() / ".cache" / "omnid-interop")
     wanted = (HERE / "package.json").read_bytes()
     fresh = not (folder / "node_modules").is_dir() or (folder / "package.json").read_bytes() != wanted
@@ -59,7 +59,7 @@ def npm_reader() -> Path:
 
 
 def _install(folder: Path) -> None:
-    """Without the scripts of packages, and without a lock file."""
+    """Install the packages without running their scripts and without a lock file."""
     words = ["npm", "install", "--no-audit", "--no-fund", "--no-package-lock", "--ignore-scripts"]
     try:
         run(words, folder)

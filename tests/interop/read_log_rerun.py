@@ -1,7 +1,7 @@
-"""Every message of an MCAP log as Rerun's viewer gets it: a line of JSON for each on stdout. For rerun-sdk 0.41.
+"""Print every message of an MCAP log as Rerun's viewer reads it, one line of JSON each. For rerun-sdk 0.41.
 
     python read_log_rerun.py FILE.mcap
-Bytes are given by length and SHA-256.
+Bytes are printed as length and SHA-256.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TIME = "message_log_time"
 
 
 def plain(values: Any) -> Any:
-    """The values of a cell; bytes as their digest."""
+    """Return the values of a cell, bytes as their digest."""
     if pyarrow.types.is_uint8(values.type.value_type if hasattr(values.type, "value_type") else values.type):
         data = bytes(values.as_py())
         return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -26,7 +26,7 @@ def plain(values: Any) -> Any:
 
 
 def cell(scalar: Any) -> Any:
-    """What stands in a column for one message: a list of one entry, or of one for each instance."""
+    """Return the entries of a column for one message: one, or one per instance."""
     return [plain(value) for value in scalar.values] if scalar.is_valid else None
 
 
@@ -36,5 +36,5 @@ for chunk in McapReader(sys.argv[1]).stream():
     if TIME in names:
         parts = [name for name in names if pyarrow.types.is_list(batch.schema.field(name).type)]
         for row in range(batch.num_rows):
-            said = {name: cell(batch.column(name)[row]) for name in parts}
-            print(json.dumps({"topic": chunk.entity_path, "log_ns": batch.column(TIME)[row].value, "parts": said}))
+            row_parts = {name: cell(batch.column(name)[row]) for name in parts}
+            print(json.dumps({"topic": chunk.entity_path, "log_ns": batch.column(TIME)[row].value, "parts": row_parts}))

@@ -1,4 +1,4 @@
-"""evo reads poses straight out of a recording (evo 1.38.1 here); transforms it reads with ROS only."""
+"""evo reads poses from a recording without conversion (tested with evo 1.38.1); it reads transforms with ROS only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MICROSECOND_NS = 1000  # its stamps are float64 seconds, steps of 0.24 us these 
 
 
 @pytest.mark.parametrize("topic", ["odom", "pose"])
-def test_poses_are_those_that_were_written(known: Known, tmp_path: Path, topic: str) -> None:
+def test_reads_the_poses_that_were_written(known: Known, tmp_path: Path, topic: str) -> None:
     found = trajectory(known.path, tmp_path, topic)
     wanted = known.expected[f"/omnid/{topic}"]
     poses = [message["pose"]["pose"] if topic == "odom" else message["pose"] for message in wanted]
@@ -28,13 +28,13 @@ def test_poses_are_those_that_were_written(known: Known, tmp_path: Path, topic: 
         np.testing.assert_allclose(row[4:], list(pose["orientation"].values()), atol=1e-15)
 
 
-def test_poses_of_a_live_run_are_those_that_omnid_reads(live: Path, tmp_path: Path) -> None:
+def test_reads_the_poses_of_a_live_run_as_omnid_does(live: Path, tmp_path: Path) -> None:
     found, own = trajectory(live, tmp_path, "odom"), read_run_series(live).poses
     assert (np.abs(read_tum(tmp_path / "omnid_odom.tum").stamps_ns - own.stamps_ns) < MICROSECOND_NS).all()
     np.testing.assert_allclose(found[:, 1:], own.values, atol=1e-12)
 
 
 def trajectory(log: Path, folder: Path, topic: str) -> np.ndarray:
-    """Rows t x y z qx qy qz qw, as evo writes what it has read."""
+    """Return rows t x y z qx qy qz qw, as read and saved by evo."""
     run([program("evo_traj", "evo"), "mcap", log, f"/omnid/{topic}", "--save_as_tum"], folder)
     return np.atleast_2d(np.loadtxt(folder / f"omnid_{topic}.tum"))

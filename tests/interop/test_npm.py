@@ -16,7 +16,7 @@ pytestmark = pytest.mark.interop
 
 
 def read(log: Path) -> tuple[dict[str, Any], Expected]:
-    """The head of the log, and its messages by topic; what omnid says must be logged at its own stamp."""
+    """Return the header of the log and its messages by topic; assert that log times are the stamps."""
     reader = npm_reader()
     head, *messages = lines(["node", reader, log], reader.parent)
     found: Expected = {}
@@ -29,13 +29,13 @@ def read(log: Path) -> tuple[dict[str, Any], Expected]:
     return head, found
 
 
-def test_the_numbers_are_those_that_were_written(known: Known) -> None:
+def test_reads_the_numbers_that_were_written(known: Known) -> None:
     head, found = read(known.path)
     assert head == {"profile": "ros2", "attachments": {name: digest(data) for name, data in ATTACHED.items()}}
     assert found == known.expected
 
 
-def test_a_live_recording_reads_as_by_rosbags(live: Path) -> None:
+def test_reads_a_live_recording_as_rosbags_does(live: Path) -> None:
     expected: Expected = {}
     with AnyReader([live]) as bag:
         for place, _, data in bag.messages():

@@ -1,5 +1,5 @@
-"""Rerun checks and reads what omnid records (rerun-sdk 0.41.0 here): poses, transforms, points and images as its own
-three-dimensional things, in float32; the rest field by field.
+"""Rerun checks and reads recordings (tested with rerun-sdk 0.41.0): poses, transforms, points and images as its own
+three-dimensional entities, in float32; all other messages field by field.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ FIELDS = {"/omnid/odom": "nav_msgs.msg.Odometry", "/omnid/status": "diagnostic_m
           "/omnid/drive": "geometry_msgs.msg.TwistStamped"}
 FLOAT32 = 1e-6  # of numbers around 1
 
-Parts = dict[str, list[dict[str, Any]]]  # topic -> what there is of each of its messages, in order
+Parts = dict[str, list[dict[str, Any]]]  # topic -> components of each message, in order
 
 
 @pytest.fixture
 def parts(known: Known) -> Parts:
-    """The known log as Rerun's own reader gives it."""
+    """The known log as read by Rerun."""
     return read(known.path)
 
 
 def read(log: Path) -> Parts:
-    """All messages of a log; Rerun may split one into several rows."""
+    """Return all messages of a log; Rerun may split one into several rows."""
     python = program("rerun", "rerun-sdk").resolve().with_name("python")
     found: dict[str, dict[int, dict[str, Any]]] = {}
     for entry in lines([python, HERE / "read_log_rerun.py", log], log.parent):
@@ -38,18 +38,18 @@ def read(log: Path) -> Parts:
     return {topic: [messages[at_ns] for at_ns in sorted(messages)] for topic, messages in found.items()}
 
 
-def test_every_message_is_there(known: Known, parts: Parts) -> None:
+def test_reads_every_message(known: Known, parts: Parts) -> None:
     assert {topic: len(messages) for topic, messages in parts.items()} == {
         topic: len(messages) for topic, messages in known.expected.items()}
 
 
 @pytest.mark.parametrize("topic", FIELDS)
-def test_fields_are_those_that_were_written(known: Known, parts: Parts, topic: str) -> None:
+def test_reads_the_fields_that_were_written(known: Known, parts: Parts, topic: str) -> None:
     assert [message[f"{FIELDS[topic]}:message"] for message in parts[topic]] == [
         [message] for message in known.expected[topic]]
 
 
-def test_poses_and_transforms_are_those_that_were_written(known: Known, parts: Parts) -> None:
+def test_reads_the_poses_and_transforms_that_were_written(known: Known, parts: Parts) -> None:
     written: Expected = known.expected
     for found, pose in zip(parts["/omnid/pose"], written["/omnid/pose"], strict=True):
         assert found["CoordinateFrame:frame"] == ["odom"]
@@ -62,7 +62,7 @@ def test_poses_and_transforms_are_those_that_were_written(known: Known, parts: P
         close(found["Transform3D:quaternion"][0], edge["transform"]["rotation"])
 
 
-def test_points_and_images_are_those_that_were_written(known: Known, parts: Parts) -> None:
+def test_reads_the_points_and_images_that_were_written(known: Known, parts: Parts) -> None:
     for found, cloud in zip(parts["/omnid/cloud"], known.expected["/omnid/cloud"], strict=True):
         points = np.column_stack([found["Points3D:positions"], found["Points3D:confidence"]])
         assert points.tolist() == cloud["points"]
@@ -71,18 +71,18 @@ def test_points_and_images_are_those_that_were_written(known: Known, parts: Part
     for found, image in zip(parts[lower], known.expected[lower], strict=True):
         assert found["EncodedImage:blob"] == [image["data"]]
     for found, image in zip(parts[upper], known.expected[upper], strict=True):
-        (shape,) = found["DepthImage:format"]  # so it takes all raw images of one channel
+        (shape,) = found["DepthImage:format"]  # as for all raw images with one channel
         assert found["DepthImage:buffer"] == [image["data"]] and (shape["width"], shape["height"]) == (32, 24)
 
 
-def test_it_finds_nothing_wrong_with_the_order(known: Known, live: Path, tmp_path: Path) -> None:
-    """`rerun mcap check` exits 0 whatever it finds. With --full it finds fault with how it splits clouds itself."""
+def test_check_finds_no_problem(known: Known, live: Path, tmp_path: Path) -> None:
+    """`rerun mcap check` always exits 0. With --full it reports its own splitting of clouds as a fault."""
     for log in (known.path, live):
-        said = run([program("rerun", "rerun-sdk"), "mcap", "check", log], tmp_path)
-        assert "PROBLEM" not in said and said.count("\nok ") >= 8, said
+        output = run([program("rerun", "rerun-sdk"), "mcap", "check", log], tmp_path)
+        assert "PROBLEM" not in output and output.count("\nok ") >= 8, output
 
 
-def test_a_live_recording_is_whole(live: Path) -> None:
+def test_reads_a_complete_live_recording(live: Path) -> None:
     counts = {topic: len(messages) for topic, messages in read(live).items()}
     assert len(counts) >= 8 and counts["/omnid/odom"] == counts["/omnid/pose"] == counts["/tf"] > 5
 

@@ -1,4 +1,4 @@
-"""rosbags reads what omnid records; it is a dependency anyway, so this always runs (rosbags 0.11.9 here)."""
+"""rosbags reads recordings; it is a dependency, so this test always runs (tested with rosbags 0.11.9)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from calib import se3
 from omnid.formats.tum import read_tum
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
-from omnid.monitor.screen import Screen, line, table
+from omnid.monitor.screen import Screen, status_table, summary_line
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
@@ -150,9 +150,8 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
     assert len(shown.splitlines()) == 4 and "1 sigma 1.0 mm" in shown
-    assert line("omnid", RobotState()) == "omnid: no pose yet" and list(table("omnid", RobotState(), 0)) == [
-        "omnid: no pose yet"
-    ]
+    assert summary_line("omnid", RobotState()) == "omnid: no pose yet"
+    assert list(status_table("omnid", RobotState(), 0)) == ["omnid: no pose yet"]
 
 
 def test_the_inbox_drops_the_oldest_when_full() -> None:

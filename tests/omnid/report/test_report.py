@@ -178,7 +178,7 @@ def test_shows_stages_and_latencies(tmp_path: Path) -> None:
     assert "no status of the daemon" not in text
 
 
-def test_names_what_a_foreign_log_lacks(tmp_path: Path) -> None:
+def test_names_the_missing_parts_of_a_foreign_log(tmp_path: Path) -> None:
     entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
     for words in ("Run of wheels", "does not hold the state", "they were not set", "no numbers of landmarks",
@@ -217,8 +217,8 @@ def attached_rig_of_sample() -> Rig:
 def test_a_log_of_images_is_refused_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = SAMPLE / "log.mcap"
     assert main(["report", str(log), "-o", str(tmp_path / "out.html")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"omnid replay {log} --record out.mcap" in said
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"omnid replay {log} --record out.mcap" in error
     assert not (tmp_path / "out.html").exists()
 
 

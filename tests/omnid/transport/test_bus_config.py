@@ -23,8 +23,8 @@ def refused(**knobs: Any) -> str:
 @pytest.mark.parametrize("knob", ["config", "tls_ca", "tls_listen_key", "tls_connect_certificate", "users_file",
                                   "password_file"])
 def test_a_missing_file_is_named(knob: str, tmp_path: Path) -> None:
-    told = refused(**{knob: str(tmp_path / "nowhere")})
-    assert f"bus.{knob}" in told and "nowhere" in told and "No such file" in told
+    error = refused(**{knob: str(tmp_path / "nowhere")})
+    assert f"bus.{knob}" in error and "nowhere" in error and "No such file" in error
 
 
 @pytest.mark.parametrize("knob", ["config", "tls_ca", "users_file"])

@@ -170,9 +170,9 @@ time.sleep(30)
 
 def listed(router: str) -> set[str]:
     """Return the lines of its list; peers discover each other a moment after they have found the router."""
-    said = subprocess.run([f"{SDK}/bin/zenoh-ros2", "--no-daemon", "--router", router.removeprefix("tcp/"),
+    result = subprocess.run([f"{SDK}/bin/zenoh-ros2", "--no-daemon", "--router", router.removeprefix("tcp/"),
                            "--timeout", "3", "topic", "list", "-t"], capture_output=True, text=True, timeout=60)
-    return set(said.stdout.splitlines())
+    return set(result.stdout.splitlines())
 
 
 @pytest.mark.skipif(not SDK or shutil.which(f"{SDK}/bin/zenoh-ros2") is None,

@@ -28,12 +28,12 @@ def test_plots_latencies_of_the_stages_that_make_a_pose() -> None:
 
 def test_reads_state_and_landmarks() -> None:
     found = report(DiagnosticStatus("omnid: odometry", 1, "degraded", {"inliers": "31", "tracked": "60"}))
-    assert status_plots.tracking_state(found) == "degraded" and status_plots.landmark_counts(found) == (31, 60)
+    assert status_plots.odometry_state(found) == "degraded" and status_plots.odometry_landmarks(found) == (31, 60)
     stale = report(
         DiagnosticStatus("omnid: odometry", 3, "no new pose", {"landmarks": "none"}),
         DiagnosticStatus("x", 0, "lost", {}),
     )
-    assert status_plots.tracking_state(stale) is None and status_plots.landmark_counts(stale) is None
+    assert status_plots.odometry_state(stale) is None and status_plots.odometry_landmarks(stale) is None
 
 
 def test_logs_changes_only_in_bounded_memory_and_plain_text() -> None:
