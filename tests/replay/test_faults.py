@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.replay.faults import TRIALS, Place
+from tests.replay.faults import TRIALS, Setting
 
 
 @pytest.mark.slow
@@ -14,4 +14,4 @@ from tests.replay.faults import TRIALS, Place
 def test_fault(tmp_path: Path, scene: Path, fault: str) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
-    assert TRIALS[fault](Place(scene, folder)).process
+    assert TRIALS[fault](Setting(scene, folder)).process

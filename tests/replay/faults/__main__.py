@@ -1,7 +1,7 @@
-"""Faults injected into a running daemon, and what became of each: `python -m tests.replay.faults` prints the table.
+"""Inject faults into a running daemon: `python -m tests.replay.faults` prints a table of the results.
 
-In each the operator drives, the fault comes, the wheels must come to a stand or go on as asked, and where it can the
-daemon recovers by itself. A fault that went wrong raises AssertionError.
+In each trial the operator drives and the fault comes; the wheels must stop, or go on as commanded, and the daemon must
+recover by itself where it can. A trial that fails raises AssertionError.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ import tempfile
 from pathlib import Path
 
 from tests.replay.faults import TRIALS
-from tests.replay.faults.trial import Outcome, Place
+from tests.replay.faults.trial import Outcome, Setting
 from tests.simulation import build, write_log
 
 
 def scene(folder: Path) -> Path:
-    """A small rendered run."""
+    """Render a small run into the folder."""
     run = build("two_walls", seed=3, size=256, pairs=24)
     write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
     return folder
 
 
 def main() -> int:
-    """Prints the table as Markdown; 1 where a trial has failed. Words: only the trials whose names hold one of them."""
+    """Print the table as Markdown; return 1 where a trial has failed. Arguments: words in the names of the trials."""
     wanted = [name for name in TRIALS if not sys.argv[1:] or any(word in name for word in sys.argv[1:])]
-    print("| fault | process | wheels | what the status said |\n|---|---|---|---|", flush=True)
+    print("| fault | process | wheels | status |\n|---|---|---|---|", flush=True)
     failed = 0
     with tempfile.TemporaryDirectory() as name:
         recorded = scene(Path(name) / "scene")
@@ -33,7 +33,7 @@ def main() -> int:
             folder = Path(name) / str(number) / "in"
             folder.mkdir(parents=True)
             try:
-                outcome = TRIALS[fault](Place(recorded, folder))
+                outcome = TRIALS[fault](Setting(recorded, folder))
             except AssertionError as error:
                 failed += 1
                 outcome = Outcome("FAILED", "", " ".join(str(error).split())[:200])

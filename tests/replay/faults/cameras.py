@@ -1,54 +1,54 @@
-"""Faults of the cameras, done to the frames of a LogCamera."""
+"""Faults of the cameras, injected into the frames of a LogCamera."""
 
 from __future__ import annotations
 
-from tests.replay.faults.trial import SPOILT, Outcome, Place, driving, goes_on, stands, trial
+from tests.replay.faults.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
 from tests.replay.live import wait_until
 
 
-def spoilt(place: Place, line: str, part: str, word: str) -> Outcome:
-    """What becomes of images that are spoilt for a while."""
-    with driving(place, module=SPOILT) as (daemon, operator, base):
+def camera_fault(setting: Setting, line: str, part: str, word: str) -> Outcome:
+    """Inject a fault into the images for a while."""
+    with driving(setting, module=FAULTY_DAEMON) as (daemon, operator, base):
         daemon.write_line(line)
         wait_until(lambda: word in operator.message(part), f"'{word}'")
-        stands(base)
-        said = f"{part}: {operator.message(part)}; odometry: {operator.message('odometry')}"
+        expect_stop(base)
+        status = f"{part}: {operator.message(part)}; odometry: {operator.message('odometry')}"
         daemon.write_line("both ok")
-        goes_on(base)
-    return Outcome("alive, recovered by itself", "stopped, turned again with the next command", said)
+        expect_motion(base)
+    return Outcome("alive, recovered by itself", "stopped, turned again with the next setpoint", status)
 
 
 @trial("upper camera stuck")
-def upper_stuck(place: Place) -> Outcome:
+def upper_stuck(setting: Setting) -> Outcome:
     """No more images of one camera."""
-    return spoilt(place, "upper mute", "pairing", "no images of the upper camera")
+    return camera_fault(setting, "upper mute", "pairing", "no images of the upper camera")
 
 
 @trial("lower camera stuck")
-def lower_stuck(place: Place) -> Outcome:
+def lower_stuck(setting: Setting) -> Outcome:
     """No more images of the other."""
-    return spoilt(place, "lower mute", "pairing", "no images of the lower camera")
+    return camera_fault(setting, "lower mute", "pairing", "no images of the lower camera")
 
 
 @trial("both cameras stuck")
-def both_stuck(place: Place) -> Outcome:
+def both_stuck(setting: Setting) -> Outcome:
     """No more images at all."""
-    return spoilt(place, "both mute", "pairing", "no images of the lower and the upper camera")
+    return camera_fault(setting, "both mute", "pairing", "no images of the lower and the upper camera")
 
 
 @trial("garbage JPEG")
-def garbage(place: Place) -> Outcome:
+def garbage(setting: Setting) -> Outcome:
     """Noise between a JPEG's first and last bytes."""
-    return spoilt(place, "lower garbage", "pairing", "cannot be decoded")
+    return camera_fault(setting, "lower garbage", "pairing", "cannot be decoded")
 
 
 @trial("JPEG cut in half")
-def cut(place: Place) -> Outcome:
+def cut(setting: Setting) -> Outcome:
     """Images whose end is missing."""
-    return spoilt(place, "both cut", "pairing", "cannot be decoded")
+    return camera_fault(setting, "both cut", "pairing", "cannot be decoded")
 
 
 @trial("black frames")
-def black(place: Place) -> Outcome:
+def black(setting: Setting) -> Outcome:
     """The light goes off."""
-    return spoilt(place, "both black", "odometry", "lost")
+    return camera_fault(setting, "both black", "odometry", "lost")

@@ -1,4 +1,4 @@
-"""What a trial is: the robot drives, a fault comes, and in the end it is told what became of it."""
+"""A trial: the robot drives, a fault comes, and the outcome is checked and described."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from typing import NamedTuple
 
 from tests.replay.live import Base, Daemon, Operator, robot, started, wait_until
 
-WATCHED_S = 1.5  # for so long wheels are watched that must not turn
-SPOILT = "tests.replay.faulty"
+WATCH_S = 1.5  # time in which stopped wheels must not turn
+FAULTY_DAEMON = "tests.replay.faulty"
 
 
 class Outcome(NamedTuple):
-    """What became of a fault."""
+    """The outcome of a fault, for the table."""
 
     process: str
     wheels: str
     status: str
 
 
-class Place(NamedTuple):
+class Setting(NamedTuple):
     """A recorded scene, and a folder to use."""
 
     scene: Path
     folder: Path
 
 
-Trial = Callable[[Place], Outcome]
+Trial = Callable[[Setting], Outcome]
 TRIALS: dict[str, Trial] = {}
 
 
 def trial(name: str) -> Callable[[Trial], Trial]:
-    """Enters a trial in the table."""
+    """Register a trial in the table."""
 
     def enter(run: Trial) -> Trial:
         TRIALS[name] = run
@@ -44,33 +44,33 @@ def trial(name: str) -> Callable[[Trial], Trial]:
 
 
 @contextlib.contextmanager
-def driving(place: Place, *words: object, module: str = "omnid") -> Iterator[tuple[Daemon, Operator, Base]]:
-    """A robot that drives as its operator wants; at the end its daemon lives, and ends with 0."""
-    with robot(place.scene, place.folder, *words, module=module) as (daemon, operator, base):
+def driving(setting: Setting, *words: object, module: str = "omnid") -> Iterator[tuple[Daemon, Operator, Base]]:
+    """Start a robot that drives; at the end its daemon must still run, and end with exit code 0."""
+    with robot(setting.scene, setting.folder, *words, module=module) as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion")
         yield daemon, operator, base
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, (code, err)
-        assert not base.drives, "the wheels stand at the end"
+        assert not base.drives, "the wheels stop at the end"
 
 
-def stands(base: Base) -> None:
-    """The wheels come to a stand and stay so for a while."""
+def expect_stop(base: Base) -> None:
+    """Wait until the wheels stop; they must not turn for WATCH_S after that."""
     wait_until(lambda: not base.drives, "the stop")
-    wait_until(lambda: base.line.base.velocity_mps == 0, "the stand")
+    wait_until(lambda: base.line.base.velocity_mps == 0, "standstill")
     since_s = time.monotonic()
-    time.sleep(WATCHED_S)
-    assert not base.line.moved_since(since_s), "the wheels moved unasked"
+    time.sleep(WATCH_S)
+    assert not base.line.moved_since(since_s), "the wheels moved without a setpoint"
 
 
-def goes_on(base: Base) -> None:
-    """The wheels turn again."""
+def expect_motion(base: Base) -> None:
+    """Wait until the wheels turn."""
     wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion again")
 
 
 def ended(command: list[str]) -> tuple[int, str]:
-    """Exit code and stderr of a program that ends by itself."""
+    """Return exit code and stderr of a program that ends by itself."""
     with started(command, 0) as daemon:
         _, err = daemon.process.communicate(timeout=60)
         return daemon.process.returncode, err
