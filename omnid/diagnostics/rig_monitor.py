@@ -1,7 +1,7 @@
-"""The daemon's own look at its rig: now and then, from the panoramas that it makes anyway, without a board.
+"""Monitoring of the rig's calibration on the panoramas of a live run, without a board.
 
-Who stands still sees the same wall again and again, and one wall alone may mislead all its points: only views that
-differ count, and of a place that is seen again only the newest view is kept.
+A robot that stands still views the same wall again and again, and a single wall may give biased points. So only views
+of different places count, and of every place the newest view is kept.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from omnid.transport.status_names import RIG
 
 Array = NDArray[np.float64]
 
-PAIRS = 16  # views that are remembered, and how many new ones make a new finding
-# Fewer different views are no verdict. Two thumbnails that are so alike show one place: some 15 cm of a corridor.
-MIN_PLACES, ALIKE = 6, 0.8
+VIEWS = 16  # views that are kept, and new views after which the rig is checked again
+MIN_PLACES = 6  # fewer different views are not enough for a check
+MIN_CORRELATION = 0.8  # of the thumbnails of two views of one place: some 15 cm of a corridor
 THUMBNAIL = (128, 24)  # columns, rows
 LEVELS: dict[Verdict, int] = {"good": OK, "unknown": OK, "drifted": WARN, "broken": ERROR}
 ADVICE: dict[Verdict, str] = {
-    "good": "good", "unknown": "cannot tell: too few points are found in both panoramas",
-    "drifted": "drifted: run omnid calibrate check on a recording; --refine turns the upper camera back",
+    "good": "good", "unknown": "unknown: too few points are matched in both panoramas",
+    "drifted": "drifted: run omnid calibrate check on a recording; --refine corrects the upper camera's rotation",
     "broken": "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
               "calibrate check on a recording",
 }
@@ -42,18 +42,20 @@ class _View:
 
 
 class RigMonitor:
-    """A sink of panoramas that takes one every every_s of their stamps; give it an inbox that forgets.
+    """A sink of panoramas that uses one every every_s, by their stamps; its inbox drops the oldest (policy NEWEST).
 
-    10 to 20 ms for a view that is new, 20 to 50 ms more once in PAIRS of them; next to nothing for all others.
+    A view of a new place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more, all other panoramas almost
+    nothing.
     """
 
     def __init__(self, cylinder: Cylinder, every_s: float) -> None:
         self._cylinder, self._every_ns = cylinder, every_s * 1e9
-        self._views: deque[_View] = deque(maxlen=PAIRS)
-        self._looked_ns: float = math.inf
+        self._views: deque[_View] = deque(maxlen=VIEWS)
+        self._used_ns: float = math.inf
         self._new = 0
         self._newest_ns = 0
-        self._found: tuple[RigFinding, int] | None = None  # with the stamp; put in one go: status() has another thread
+        # With its stamp, set in one assignment: status() runs in another thread.
+        self._found: tuple[RigFinding, int] | None = None
 
     @property
     def finding(self) -> RigFinding | None:
@@ -61,33 +63,33 @@ class RigMonitor:
         return self._found[0] if self._found else None
 
     def process(self, panoramas: Panoramas) -> None:
-        """Looks at a pair when it is time, and at all that is remembered when there is enough that is new."""
+        """Use a pair if it is due, and check the rig when there are enough new views."""
         self._newest_ns = panoramas.stamp_ns
-        if self._looked_ns <= panoramas.stamp_ns < self._looked_ns + self._every_ns:
+        if self._used_ns <= panoramas.stamp_ns < self._used_ns + self._every_ns:
             return
-        self._looked_ns = panoramas.stamp_ns
-        if self._remembered(panoramas):
+        self._used_ns = panoramas.stamp_ns
+        if self._add_view(panoramas):
             self._new += 1
-        if self._new >= PAIRS and len(self._views) >= MIN_PLACES:
+        if self._new >= VIEWS and len(self._views) >= MIN_PLACES:
             self._found = judge(together(view.matches for view in self._views), self._cylinder), panoramas.stamp_ns
             self._new = 0
 
-    def _remembered(self, panoramas: Panoramas) -> bool:
-        """Whether the pair shows another place than the last one; then it replaces an older look at that place."""
+    def _add_view(self, panoramas: Panoramas) -> bool:
+        """Keep the view unless it is of the same place as the last one; return True if it was kept."""
         thumbnail = _thumbnail(panoramas)
-        alike = [float(thumbnail @ view.thumbnail) > ALIKE for view in self._views]
-        if any(alike[-1:]) or not thumbnail.any():
+        same_place = [float(thumbnail @ view.thumbnail) > MIN_CORRELATION for view in self._views]
+        if any(same_place[-1:]) or not thumbnail.any():
             return False
-        if any(alike):
-            del self._views[alike.index(True)]
+        if any(same_place):  # an older view of this place
+            del self._views[same_place.index(True)]
         self._views.append(_View(thumbnail, match(panoramas.lower, panoramas.upper, panoramas.visible)))
         return True
 
     def status(self) -> DiagnosticStatus:
-        """What the newest finding says of the rig; age_s is the time in stamps since then."""
-        values = {"new_views": str(self._new), "needed_views": str(PAIRS)}
+        """Return the newest finding as a status; age_s is the time since then, by the stamps."""
+        values = {"new_views": str(self._new), "needed_views": str(VIEWS)}
         if self._found is None:
-            return DiagnosticStatus(RIG, OK, "not looked yet: that takes some driving", values)
+            return DiagnosticStatus(RIG, OK, "not checked yet: the robot must drive past different places", values)
         finding, stamp_ns = self._found
         values |= {"verdict": finding.verdict, "turn_deg": f"{finding.turn_deg:.3f}",
                    "offset_px": f"{finding.offset_px:+.2f}", "left_px": f"{finding.left_px:.2f}",
@@ -97,7 +99,7 @@ class RigMonitor:
 
 
 def _thumbnail(panoramas: Panoramas) -> Array:
-    """What both cameras see of the lower panorama, shrunk to THUMBNAIL: (N,) of mean 0 and length 1, or all 0."""
+    """Return the common view of both cameras in the lower panorama as a vector (N,) of mean 0 and norm 1, or all 0."""
     small = cv2.resize(panoramas.lower.panorama, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(float)
     seen = cv2.resize(panoramas.visible.astype(np.uint8), THUMBNAIL, interpolation=cv2.INTER_AREA) > 0
     grey = small[seen] - small[seen].mean() if seen.any() else np.zeros(0)

@@ -19,7 +19,7 @@ from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
 from omnid.settings import dump
-from omnid.sinks.encoder import Encoder, clouds_of
+from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
@@ -70,7 +70,7 @@ class Session:
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
         """Return an encoder that gives at most so many points of the map."""
-        return Encoder(rig.T_base_rig, clouds_of(self.config, cloud_points), self.offset_ns)
+        return Encoder(rig.T_base_rig, map_encoding(self.config, cloud_points), self.offset_ns)
 
     def dropped_messages(self) -> int:
         """Return the number of messages that were dropped in front of the stages and sinks."""

@@ -1,4 +1,4 @@
-"""The robot's voice: every message on the bus as `<robot>/odom` and the like."""
+"""Publication of poses, commands, maps and panoramas on the bus, as `<robot>/odom` and so on."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from omnid.transport.pose_attachment import PoseAttachment
 
 
 class BusSink:
-    """Publishes what the encoder makes; give it an inbox that forgets, for the bus may be slow."""
+    """Publishes encoded messages; its inbox drops the oldest (policy NEWEST), because the bus may be slow."""
 
     def __init__(self, bus: Bus, encode: Encoder) -> None:
         self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
 
     def process(self, message: Outgoing) -> None:
-        """Sends what there is to say about a message."""
+        """Publish a message, a pose with its attachment and the state of the odometry where it has changed."""
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
@@ -37,14 +37,14 @@ def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
 
 
 class PanoramaSink:
-    """Publishes the lower camera's panorama as JPEG, rate_hz times a second at most; offset_ns: as the Encoder's."""
+    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second; offset_ns: the Encoder's."""
 
     def __init__(self, bus: Bus, rate_hz: float, offset_ns: int = 0) -> None:
         self._bus, self._period_ns, self._offset_ns = bus, 1e9 / rate_hz, offset_ns
         self._next_ns = 0.0
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Sends the image that a pose was found in, and beside it its features, when it is time."""
+        """Publish the panorama of a pose, with its features as the attachment, when it is due."""
         if odometry.stamp_ns < self._next_ns:
             return
         self._next_ns = odometry.stamp_ns + self._period_ns

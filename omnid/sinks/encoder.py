@@ -1,4 +1,4 @@
-"""What leaves the daemon, as topic, schema and CDR bytes: the same for the log and the bus."""
+"""Encoding of poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes), for the bus and for logs."""
 
 from __future__ import annotations
 
@@ -22,37 +22,35 @@ Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate
 
 
 class OutgoingMessage(NamedTuple):
-    """A message ready to go."""
+    """An encoded message; a topic without a leading '/' is below the robot's name."""
 
     topic: str
     schema: str
     payload: bytes
 
 
-class Clouds(NamedTuple):
-    """What is told of the map."""
+class MapEncoding(NamedTuple):
+    """Encoding of the map."""
 
-    points: int  # most points of the cloud: the surest ones
-    heights_m: tuple[float, float] = (-1.0, 1.5)  # of what stands in the way, in the base's frame at the start
+    points: int  # largest number of points of the cloud: the most confident ones
+    heights_m: tuple[float, float] = (-1.0, 1.5)  # of obstacles, in the base's frame at the start
     cell_m: float = 0.05  # of the grid
 
 
-def clouds_of(config: Config, points: int) -> Clouds:
-    """The same from the settings."""
-    return Clouds(points, config.mapping.heights_m, config.mapping.voxel_m)
+def map_encoding(config: Config, points: int) -> MapEncoding:
+    """Return the encoding of the configuration, with at most so many points."""
+    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m)
 
 
 class Encoder:
-    """Turns messages into those of ROS 2; their odom is the base's frame at the first pair, not the rig's.
+    """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
-    offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
-    """
-
-    def __init__(self, T_base_rig: NDArray[np.float64], clouds: Clouds, offset_ns: int = 0) -> None:
-        self._T_base_rig, self._clouds, self.offset_ns = T_base_rig, clouds, offset_ns
+    def __init__(self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0) -> None:
+        """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time."""
+        self._T_base_rig, self._map_encoding, self.offset_ns = T_base_rig, map_encoding, offset_ns
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
-        """All that is said about a message."""
+        """Yield the encoded messages of a message."""
         match message:
             case OdometryUpdate():
                 yield from self._poses(message)
@@ -74,16 +72,17 @@ class Encoder:
 
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
-        payload = codec.point_cloud_cdr(stamp_ns, "odom", *_surest(update.points, self._clouds.points),
-                                        T_frame_points=self._T_base_rig)
+        points = _most_confident(update.points, self._map_encoding.points)
+        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self._T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
-        grid = occupancy(self._moved(update.points.xyz), update.points.confidence,
-                         self._moved(_level(update.path_xy))[:, :2], self._clouds.heights_m, self._clouds.cell_m)
-        yield OutgoingMessage("map", codec.GRID_SCHEMA, codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m,
-                                                                grid.corner))
+        path_xy = self._in_base(_on_ground(update.path_xy))[:, :2]
+        grid = occupancy(self._in_base(update.points.xyz), update.points.confidence, path_xy,
+                         self._map_encoding.heights_m, self._map_encoding.cell_m)
+        payload = codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m, grid.corner)
+        yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
 
-    def _moved(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Points (N, 3) of the rig's first frame in the base's: single, for a map is large and a cell is wide."""
+    def _in_base(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return points (N, 3) of the rig's first frame in the base's; float32 is enough for a grid of large cells."""
         T = self._T_base_rig.astype(np.float32)
         if np.array_equal(T, np.eye(4)):
             return points.astype(np.float32, copy=False)
@@ -91,37 +90,37 @@ class Encoder:
 
 
 class StateReports:
-    """A diagnostic message whenever the state of the odometry changes; offset_ns: as the Encoder has it."""
+    """Yields a status whenever the state of the odometry changes; offset_ns: the Encoder's."""
 
     def __init__(self, offset_ns: int = 0) -> None:
         self._offset_ns = offset_ns
         self._last: tuple[str, int] | None = None
 
     def __call__(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
-        """What there is to report about a pose."""
+        """Yield the status of a pose if its state differs from the last one."""
         now = (odometry.state, odometry.reset_counter)
         if now != self._last:
             self._last = now
             level = list(TrackingState).index(odometry.state)
             values: dict[str, str] = {Key.STATE: odometry.state, Key.RESETS: str(odometry.reset_counter),
-                      Key.INLIERS: str(odometry.inliers), Key.TRACKED: str(odometry.tracks)}
-            said = codec.DiagnosticStatus(ODOMETRY, level, odometry.state, values)
-            yield status_report(odometry.stamp_ns + self._offset_ns, [said])
+                                      Key.INLIERS: str(odometry.inliers), Key.TRACKED: str(odometry.tracks)}
+            status = codec.DiagnosticStatus(ODOMETRY, level, odometry.state, values)
+            yield status_report(odometry.stamp_ns + self._offset_ns, [status])
 
 
 def status_report(stamp_ns: int, statuses: Sequence[codec.DiagnosticStatus]) -> OutgoingMessage:
-    """Statuses as one diagnostic message."""
+    """Return statuses as one encoded message."""
     return OutgoingMessage("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
 
 
-def _level(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (N, 2) on the ground, z = 0."""
+def _on_ground(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (N, 2) as points (N, 3) with z = 0."""
     return np.column_stack([xy, np.zeros(len(xy))])
 
 
-def _surest(points: MapPoints, most: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Positions and confidence of the most confident points, in their own order."""
-    if len(points.xyz) <= most:
+def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return positions and confidence of the most confident points, in the order of the map."""
+    if len(points.xyz) <= count:
         return points.xyz, points.confidence
-    kept = np.sort(np.argsort(-points.confidence, kind="stable")[:most])
+    kept = np.sort(np.argsort(-points.confidence, kind="stable")[:count])
     return points.xyz[kept], points.confidence[kept]

@@ -24,7 +24,7 @@ from omnid.client import Diagnostics, Robot, Subscription
 from omnid.engine.telemetry import Histogram
 from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink
-from omnid.sinks.encoder import Clouds, Encoder
+from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wait_until
@@ -106,7 +106,7 @@ def publish(sinks: list[BusSink], first: int, count: int) -> Histogram:
 
 
 def sink_on(bus: Bus) -> BusSink:
-    return BusSink(bus, Encoder(np.eye(4), Clouds(1000)))
+    return BusSink(bus, Encoder(np.eye(4), MapEncoding(1000)))
 
 
 @pytest.mark.parametrize("way", ["direct", "router"])

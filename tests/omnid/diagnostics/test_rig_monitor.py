@@ -1,4 +1,4 @@
-"""The daemon's own look at its rig: on the panoramas of rendered rooms, with a rig that is true and one that is not."""
+"""Monitoring of the rig on panoramas of rendered rooms, with a correct and with wrong rigs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calib.rig_file import read_rig
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
-from omnid.diagnostics.rig_monitor import MIN_PLACES, PAIRS, RigMonitor
+from omnid.diagnostics.rig_monitor import MIN_PLACES, VIEWS, RigMonitor
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
@@ -26,104 +26,106 @@ from tests.simulation.logs import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
 
 SECONDS = 10**9
-LOOK_S = 5.0
+PERIOD_S = 5.0
 
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of a round through a room, 24 places."""
+    """Write the log of a loop through a room, 24 places."""
     folder = tmp_path_factory.mktemp("rooms")
     run = build("rooms", seed=31, size=256, pairs=24)
     write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=31)
     return folder
 
 
-class Kept(list[Panoramas]):
-    """A sink that keeps everything."""
+class Collector(list[Panoramas]):
+    """A sink that keeps all panoramas."""
 
     def process(self, panoramas: Panoramas) -> None:
         self.append(panoramas)
 
 
-def watched(folder: Path, rig: Rig) -> tuple[RigMonitor, Kept]:
-    """A whole run over a log, as the daemon does it."""
+def monitored(folder: Path, rig: Rig) -> tuple[RigMonitor, Collector]:
+    """Run a log through the stages; return the monitor and the panoramas."""
     place, config, graph = geometry(rig, PanoramaConfig()), PanoramaConfig(), Graph(threaded=False)
-    watch, kept = RigMonitor(place.cylinder, PERIOD_NS / SECONDS), Kept()
+    monitor, kept = RigMonitor(place.cylinder, PERIOD_NS / SECONDS), Collector()
     frames = graph.source("log", LogReader(folder / "log.mcap").frames)
     pairs = graph.stage("pair", Synchronise(rig, PairConfig()), frames)
     panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
-    graph.sink("rig", watch, panoramas, policy=NEWEST, depth=1)
+    graph.sink("rig", monitor, panoramas, policy=NEWEST, depth=1)
     graph.sink("kept", kept, panoramas)
     graph.run()
-    return watch, kept
+    return monitor, kept
 
 
 @pytest.fixture(scope="module")
-def true(rooms: Path) -> tuple[RigMonitor, Kept]:
-    return watched(rooms, read_rig(rooms / "rig.toml"))
+def true(rooms: Path) -> tuple[RigMonitor, Collector]:
+    return monitored(rooms, read_rig(rooms / "rig.toml"))
 
 
-def fed(true: tuple[RigMonitor, Kept], panoramas: Sequence[Panoramas], every_s: float = LOOK_S) -> RigMonitor:
-    """A new watch after those panoramas, LOOK_S apart."""
-    watch = RigMonitor(true[0]._cylinder, every_s)
+def monitor_after(
+    true: tuple[RigMonitor, Collector], panoramas: Sequence[Panoramas], every_s: float = PERIOD_S
+) -> RigMonitor:
+    """Return a new monitor after these panoramas, PERIOD_S apart."""
+    monitor = RigMonitor(true[0]._cylinder, every_s)
     for number, one in enumerate(panoramas):
-        watch.process(replace(one, seq=number, stamp_ns=round(number * LOOK_S * SECONDS)))
-    return watch
+        monitor.process(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+    return monitor
 
 
-def test_a_true_rig_is_good(true: tuple[RigMonitor, Kept]) -> None:
+def test_a_correct_rig_is_good(true: tuple[RigMonitor, Collector]) -> None:
     status = true[0].status()
     assert (status.name, status.level, status.message) == ("omnid: rig", 0, "good")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
-    assert status.values["verdict"] == "good" and int(status.values["new_views"]) == len(true[1]) - PAIRS
+    assert status.values["verdict"] == "good" and int(status.values["new_views"]) == len(true[1]) - VIEWS
     found, sought = int(status.values["matches"]), int(status.values["tried"])
     assert 500 < found < sought and status.values["age_s"] == "1"
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
 def test_half_a_degree_is_a_warning(rooms: Path, turn_deg: tuple[float, float, float]) -> None:
-    watch, _ = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), turn_deg))
-    status = watch.status()
-    assert status.level == 1 and status.message.startswith("drifted: ") and watch.finding and watch.finding.drift
-    assert np.rad2deg(watch.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
+    monitor, _ = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), turn_deg))
+    status = monitor.status()
+    assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
+    assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
     assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
 
 
 def test_three_degrees_are_an_error(rooms: Path) -> None:
-    status = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0].status()
+    status = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0].status()
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
-def test_who_stands_still_is_told_nothing(true: tuple[RigMonitor, Kept]) -> None:
-    status = fed(true, true[1][:1] * 100).status()
-    assert (status.level, status.values) == (0, {"new_views": "1", "needed_views": str(PAIRS)})
-    assert status.message.startswith("not looked yet")
+def test_a_robot_that_stands_gets_no_finding(true: tuple[RigMonitor, Collector]) -> None:
+    status = monitor_after(true, true[1][:1] * 100).status()
+    assert (status.level, status.values) == (0, {"new_views": "1", "needed_views": str(VIEWS)})
+    assert status.message.startswith("not checked yet")
 
 
-def test_few_places_seen_again_and_again_are_no_verdict(true: tuple[RigMonitor, Kept]) -> None:
+def test_few_places_give_no_finding_however_often(true: tuple[RigMonitor, Collector]) -> None:
     places = true[1][::3]
-    assert fed(true, places[:MIN_PLACES - 1] * 8).finding is None
-    found = fed(true, places[:MIN_PLACES] * 6).finding
+    assert monitor_after(true, places[:MIN_PLACES - 1] * 8).finding is None
+    found = monitor_after(true, places[:MIN_PLACES] * 6).finding
     assert found is not None and found.verdict == "good" and found.tried <= MIN_PLACES * POINTS
 
 
-def test_it_looks_no_more_often_than_it_is_told_to(true: tuple[RigMonitor, Kept]) -> None:
-    assert fed(true, true[1], every_s=LOOK_S + 1).status().values["new_views"] == str(len(true[1]) // 2)
-    back = fed(true, true[1][:4])
-    back.process(replace(true[1][9], stamp_ns=1))  # a clock that was set back does not silence it
+def test_uses_no_more_views_than_its_period_allows(true: tuple[RigMonitor, Collector]) -> None:
+    assert monitor_after(true, true[1], every_s=PERIOD_S + 1).status().values["new_views"] == str(len(true[1]) // 2)
+    back = monitor_after(true, true[1][:4])
+    back.process(replace(true[1][9], stamp_ns=1))  # also after the clock was set back
     assert back.status().values["new_views"] == "5"
 
 
-def test_a_rig_that_was_knocked_on_the_way_is_noticed(rooms: Path, true: tuple[RigMonitor, Kept]) -> None:
-    _, after = watched(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
-    watch = fed(true, [*true[1], *after, *after])  # on the same round, where every place has been seen
-    assert watch.finding is not None and watch.status().level == 1
-    assert watch.finding.turn_deg == pytest.approx(0.5, abs=0.05)
+def test_a_rig_that_moves_during_the_run_is_detected(rooms: Path, true: tuple[RigMonitor, Collector]) -> None:
+    _, after = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
+    monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
+    assert monitor.finding is not None and monitor.status().level == 1
+    assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
-def test_the_dark_is_no_alarm(true: tuple[RigMonitor, Kept], gain: float, noise: float) -> None:
-    """Lights go out on the way: noise makes points that match nowhere."""
+def test_darkness_is_no_alarm(true: tuple[RigMonitor, Collector], gain: float, noise: float) -> None:
+    """In the dark, noise gives points without a match."""
     rng = np.random.default_rng(4)
 
     def dark(one: Panoramas) -> Panoramas:
@@ -131,11 +133,11 @@ def test_the_dark_is_no_alarm(true: tuple[RigMonitor, Kept], gain: float, noise:
                   for w in (one.lower, one.upper)]
         return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
 
-    status = fed(true, [dark(one) for one in true[1]]).status()
+    status = monitor_after(true, [dark(one) for one in true[1]]).status()
     assert status.level == 0, status
 
 
-def test_a_covered_camera_is_an_error(true: tuple[RigMonitor, Kept]) -> None:
+def test_a_covered_camera_is_an_error(true: tuple[RigMonitor, Collector]) -> None:
     covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
-    status = fed(true, covered).status()
+    status = monitor_after(true, covered).status()
     assert status.level == 2 and "covered" in status.message

@@ -19,7 +19,7 @@ from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.encoder import Clouds, Encoder
+from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose
 from omnid.transport.features_attachment import MOST, features_from_bytes, features_to_bytes
@@ -39,7 +39,7 @@ def odometry(seq: int) -> OdometryUpdate:
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), Clouds(10), OFFSET_NS))
+        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), OFFSET_NS))
         robot.on_message(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
     pose = decode_pose(*came["odom"])

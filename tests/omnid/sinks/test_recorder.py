@@ -23,7 +23,7 @@ from omnid.engine.graph import NEWEST, Graph
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder, record
-from omnid.sinks.encoder import Clouds, Encoder, status_report
+from omnid.sinks.encoder import Encoder, MapEncoding, status_report
 from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
@@ -102,7 +102,7 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 
 def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None:
-    encode = Encoder(np.eye(4), Clouds(100), OFFSET_NS)
+    encode = Encoder(np.eye(4), MapEncoding(100), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode,
                              offset_ns=OFFSET_NS)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
@@ -128,7 +128,7 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
 
 def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -> None:
     """A pose tells its state at the time of its images, when reports of later times have been made already."""
-    encode = Encoder(np.eye(4), Clouds(9), OFFSET_NS)
+    encode = Encoder(np.eye(4), MapEncoding(9), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=encode, offset_ns=OFFSET_NS)
     report = status_report(START_NS + 2, [DiagnosticStatus("omnid: test", 0, "fine", {})])
     recorder.process(frame(-1, "lower"))
@@ -154,7 +154,7 @@ def attached(path: Path) -> list[str]:
 
 def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
     config = settings(tmp_path / "log", file_s=1.0)
-    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), Clouds(0)))
+    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
     recorder.finish()
@@ -166,7 +166,7 @@ def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
 
 
 def test_no_message_ends_the_run(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), Clouds(0)))
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
     for stamp_ns in (-1, 2**31 * 10**9, 2**70, START_NS):
         recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
         recorder.process(replace(odometry(0), stamp_ns=stamp_ns))
