@@ -27,14 +27,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Print a line for each check; return 1 if something is wrong."""
     from omnid.config import load_config
-    from omnid.doctor.finding import verdict
+    from omnid.doctor.finding import summary
 
     found: list[Finding] = []
     for finding in examine(load_config(args.config, args.overrides)):
         print(finding, flush=True)
         found.append(finding)
-    print(verdict(found))
-    return int(any(finding.level == "wrong" for finding in found))
+    print(summary(found))
+    return int(any(finding.level == "error" for finding in found))
 
 
 def examine(config: Config) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""The cameras: there, two of them, with the modes that are asked for, and room for their images on USB.
+"""Checks of the cameras: presence, modes, and the bandwidth of USB.
 
 A high-speed USB 2 bus carries 480 Mbit/s, of which all streams together get 80 %, and one stream 3 packets of 1024
 bytes per microframe of 125 us (USB 2.0, 5.6.3 and 5.6.4).
@@ -30,21 +30,21 @@ _OTHER_PORT = "plug one into a port of another USB controller, see `lsusb -t`"
 
 @dataclass(frozen=True, slots=True)
 class CameraStream:
-    """What a camera will send, and where to."""
+    """Data rate of a camera and its USB bus."""
 
     name: str
     pixel_format: str
-    rate_mbps: float  # 0: compressed, so not known
-    bus: str  # number of the USB bus, "" if it is none
+    rate_mbps: float  # 0: unknown, since compressed
+    bus: str  # number of the USB bus, "" without one
     bus_mbps: float  # speed of the camera on it
 
 
 def cameras(
     wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path = Path("/")
 ) -> Iterator[Finding]:
-    """A finding for each camera that is wanted, and one for each USB bus; `known` are those that are plugged in.
+    """Yield findings for each configured camera and each USB bus; known: the cameras that are connected.
 
-    root: holds sys, dev and proc.
+    root: folder of sys, dev and proc.
     """
     streams: list[CameraStream] = []
     for name, settings in wanted.items():
@@ -54,12 +54,13 @@ def cameras(
             streams.append(stream)
     nodes = {_resolved(settings.device, root) for settings in wanted.values()}
     if len(nodes) < len(wanted):
-        yield Finding("wrong", "cameras", "all lead to one device", "give each its own, see `omnid cameras`")
+        yield Finding("error", "cameras", "both names lead to one device",
+                      "configure one device for each, see `omnid cameras`")
     yield from buses(streams)
 
 
 def buses(streams: list[CameraStream]) -> Iterator[Finding]:
-    """Whether what the cameras send fits through each USB bus."""
+    """Yield a finding per USB bus: its bandwidth against the data rate of its cameras."""
     by_bus: defaultdict[str, list[CameraStream]] = defaultdict(list)
     for stream in streams:
         by_bus[stream.bus].append(stream)
@@ -72,10 +73,10 @@ def _bus(subject: str, sharing: list[CameraStream]) -> Finding:
     needed_mbps = sum(stream.rate_mbps for stream in slow)
     for stream in slow:
         if stream.rate_mbps > STREAM_MBPS:
-            return Finding("wrong", subject, f"{stream.name} would send {stream.rate_mbps:.0f} Mbit/s, one camera can "
-                           f"send {STREAM_MBPS:.0f} over USB 2", "lower cameras.rate_hz or the size, or take MJPG")
+            return Finding("error", subject, f"{stream.name} would send {stream.rate_mbps:.0f} Mbit/s, one camera can "
+                           f"send {STREAM_MBPS:.0f} over USB 2", "lower cameras.rate_hz or the size, or use MJPG")
     if needed_mbps > BUS_MBPS:
-        return Finding("wrong", subject, f"{_names(slow)} would send {needed_mbps:.0f} Mbit/s over one USB 2 bus, "
+        return Finding("error", subject, f"{_names(slow)} would send {needed_mbps:.0f} Mbit/s over one USB 2 bus, "
                        f"which carries {BUS_MBPS:.0f}", f"{_OTHER_PORT}, or lower cameras.rate_hz")
     if len(slow) > 1 and not all(stream.rate_mbps for stream in slow):
         return Finding("warning", subject, f"{_names(slow)} share a USB 2 bus, on which many cameras reserve more than "
@@ -85,29 +86,30 @@ def _bus(subject: str, sharing: list[CameraStream]) -> Finding:
 
 
 def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, root: Path) -> Iterator[Finding]:
-    """That one camera can be used as it is asked to be, or all that speaks against it."""
+    """Yield ok if a camera can be used as configured, else all reasons against it."""
     subject, path = f"camera {name}", root / settings.device.lstrip("/")
     if not path.exists():
-        yield Finding("wrong", subject, f"{settings.device} is not there",
-                      "plug it in; `omnid cameras` lists what is there and the udev rule for this name")
+        yield Finding("error", subject, f"{settings.device} does not exist",
+                      "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name")
     elif device is None:
-        yield Finding("wrong", subject, f"{settings.device} is no camera", "choose one of `omnid cameras`")
+        yield Finding("error", subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists")
     else:
-        against = [*access(subject, path), *_troubles(subject, settings, device)]
+        problems = [*access(subject, path), *_problems(subject, settings, device)]
         others = [holder for holder in holders(path, root) if not is_ours(holder)]
         if others:
-            against.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}", "end it"))
-        yield from against or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}")]
+            problems.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}",
+                                    "end that program"))
+        yield from problems or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}")]
 
 
-def _troubles(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:
+def _problems(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:
     if device.problem:
-        yield Finding("wrong", subject, device.problem)
+        yield Finding("error", subject, device.problem)
         return
     try:
         _format(settings, device)
     except DriverError as error:
-        yield Finding("wrong", subject, str(error), "change [cameras] in the configuration")
+        yield Finding("error", subject, str(error), "change section [cameras] of the configuration")
 
 
 def _format(settings: V4l2Settings, device: CaptureDevice) -> str:
@@ -121,7 +123,7 @@ def _image(settings: V4l2Settings, device: CaptureDevice) -> str:
 
 
 def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path) -> CameraStream | None:
-    """What the camera will send; None where it cannot send what is asked for."""
+    """Return the stream of a camera; None if the configured mode is not offered."""
     try:
         pixel_format = _format(settings, device)
     except DriverError:
@@ -131,9 +133,9 @@ def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path
 
 
 def _usb(device: CaptureDevice, root: Path) -> tuple[str, float]:
-    """Number of the USB bus and speed of the camera on it, Mbit/s; ("", 0) where it is on none."""
+    """Return number of the USB bus and speed of the camera on it, Mbit/s; ("", 0) without USB."""
     port = (root / "sys/class/video4linux" / Path(device.node).name / "device").resolve()
-    with suppress(OSError, ValueError):  # it is being unplugged, or its speed is unknown
+    with suppress(OSError, ValueError):  # being unplugged, or of unknown speed
         for folder in (port, *port.parents):
             if (folder / "busnum").is_file():
                 return (folder / "busnum").read_text().strip(), float((folder / "speed").read_text())

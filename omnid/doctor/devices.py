@@ -1,4 +1,4 @@
-"""Who may open a device, and who has."""
+"""Checks of access to devices: permissions, groups, processes that use them."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ from typing import Final
 from omnid.doctor.finding import Finding
 
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
-OURSELVES: Final = "omnid"
+OWN_NAME: Final = "omnid"  # of the processes of the daemon
 _MAX_PROCESSES: Final = 100_000
 
 
 def access(subject: str, device: Path) -> Iterator[Finding]:
-    """Whether we may open the device, and whether the service may; nothing where all is well."""
+    """Yield a finding if this user or the service may not open the device."""
     found = device.stat()
     group = _group(found.st_gid)
     if group not in GROUPS and found.st_mode & 0o006 != 0o006:
         yield Finding("warning", subject, f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
-                      "put GROUP=\"video\" or GROUP=\"dialout\" into its udev rule, see 90-omnid.rules")
+                      "set GROUP=\"video\" or GROUP=\"dialout\" in its udev rule, see 90-omnid.rules")
     elif not os.access(device, os.R_OK | os.W_OK):
-        yield Finding("wrong", subject, f"no permission for {device} of group {group}",
+        yield Finding("error", subject, f"no permission for {device} of group {group}",
                       f"`sudo usermod -aG {group} $USER`, then log in again")
 
 
 def memberships(names: Sequence[str] = GROUPS) -> Finding:
-    """Whether whoever asks is in the groups of cameras and serial ports."""
+    """Check that this user is in the groups of cameras and serial ports."""
     missing = [name for name in names if _gid(name) not in {*os.getgroups(), os.getegid()}]
     if os.geteuid() == 0:
         return Finding("ok", "groups", "root may open all devices")
     if missing:
-        return Finding("warning", "groups", f"you are not in {' and '.join(missing)}; the service is",
+        return Finding("warning", "groups", f"you are not in group {' and '.join(missing)}; the service is",
                        f"`sudo usermod -aG {','.join(missing)} $USER`, then log in again")
     return Finding("ok", "groups", f"you are in {' and '.join(names)}")
 
 
 def holders(device: Path, root: Path = Path("/")) -> list[str]:
-    """The other processes that have the device open, as "name (pid 12)"; without root only one's own are seen."""
+    """Return the other processes with the device open, as "name (pid 12)"; without root only those of this user."""
     target, found = device.resolve(), []
     processes = [entry for entry in (root / "proc").glob("[0-9]*") if entry.name != str(os.getpid())]
     for process in processes[:_MAX_PROCESSES]:
-        with suppress(OSError):  # it ended, or it is not ours to ask
+        with suppress(OSError):  # it has ended, or belongs to another user
             if any(_leads_to(entry, target) for entry in (process / "fd").iterdir()):
                 found.append(f"{(process / 'comm').read_text('utf-8', 'replace').strip()} (pid {process.name})")
     return found
 
 
 def is_ours(holder: str) -> bool:
-    """Whether a holder is the daemon."""
-    return holder.startswith(OURSELVES)
+    """True if a process is the daemon."""
+    return holder.startswith(OWN_NAME)
 
 
 def _leads_to(entry: Path, target: Path) -> bool:

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""Result of a check."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-Level = Literal["ok", "warning", "wrong"]
+Level = Literal["ok", "warning", "error"]
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the report."""
+    """One line of the report: level, what was checked, what was found, what to do."""
 
     level: Level
     subject: str
     found: str
-    mend: str = ""  # what to do about it
+    advice: str = ""  # what to do
 
     def __str__(self) -> str:
-        return f"{self.level:<8} {self.subject:<13} {self.found}" + (f"; {self.mend}" if self.mend else "")
+        return f"{self.level:<8} {self.subject:<13} {self.found}" + (f"; {self.advice}" if self.advice else "")
 
 
-def verdict(findings: Sequence[Finding]) -> str:
-    """The last line."""
-    wrong, warnings = (sum(finding.level == level for finding in findings) for level in ("wrong", "warning"))
-    if not wrong and not warnings:
+def summary(findings: Sequence[Finding]) -> str:
+    """Return the last line of the report."""
+    errors, warnings = (sum(finding.level == level for finding in findings) for level in ("error", "warning"))
+    if not errors and not warnings:
         return f"all {len(findings)} checks are ok"
-    return f"{wrong} wrong, {warnings} to be looked at, {len(findings) - wrong - warnings} ok"
+    return f"{errors} errors, {warnings} warnings, {len(findings) - errors - warnings} ok"

@@ -1,4 +1,4 @@
-"""The machine: its clocks, the rights to real time, the disk, the programs omnid is built on."""
+"""Checks of the machine: clocks, real-time rights, disk, packages."""
 
 from __future__ import annotations
 
@@ -17,63 +17,64 @@ from omnid.config import RecordConfig
 from omnid.doctor.finding import Finding
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 
-PARTS: Final = {"numpy": "numpy", "opencv-python-headless": "cv2", "eclipse-zenoh": "zenoh", "mcap": "mcap",
+PACKAGES: Final = {"numpy": "numpy", "opencv-python-headless": "cv2", "eclipse-zenoh": "zenoh", "mcap": "mcap",
                 "rosbags": "rosbags", "pyserial": "serial", "filterpy": "filterpy"}  # package: module
-BUILT_S: Final = 1_735_689_600  # the start of 2025: no clock that is right shows less
+BUILT_S: Final = 1_735_689_600  # the start of 2025: an earlier time is wrong
 _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
-_TIMEX_BYTES: Final = 1024  # more than struct timex has anywhere
+_TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
 _SLOW_CLOCKS: Final = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
-STATE: Final = Path("/var/lib/omnid")  # the unit's StateDirectory, in which it works
+STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
 
 
 def clock(now_s: float | None = None, synchronised: bool | None = None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Whether the time of day is right and kept so, and whether asking for the time is quick."""
+    """Check that the system's time is plausible and synchronised, and that the monotonic clock is fast."""
     now_s = time.time() if now_s is None else now_s
     synchronised = is_synchronised() if synchronised is None else synchronised
     shown = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
     if now_s < BUILT_S:
-        yield Finding("wrong", "clock", f"it is not {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`")
+        yield Finding("error", "clock", f"the time is wrong: {shown}",
+                      "`timedatectl set-ntp true`, or `sudo date -s ...`")
     elif not synchronised:
-        yield Finding("warning", "clock", f"{shown}, nobody keeps it right: logs of several machines will not match",
+        yield Finding("warning", "clock", f"{shown}, not synchronised: logs of several machines will not match",
                       "`timedatectl set-ntp true`, or install chrony")
     else:
         yield Finding("ok", "clock", f"{shown}, synchronised")
     source = _word(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
     if source in _SLOW_CLOCKS:
         yield Finding("warning", "monotonic", f"the kernel reads time from {source}, which takes microseconds",
-                      "see `dmesg | grep -i clocksource` for why it left the processor's own")
+                      "`dmesg | grep -i clocksource` has the reason why the processor's counter is not used")
     else:
         yield Finding("ok", "monotonic", f"CLOCK_MONOTONIC from {source or 'an unnamed source'}")
 
 
 def is_synchronised() -> bool:
-    """Whether the kernel is told the right time by somebody, be it chrony, ntpd or systemd-timesyncd."""
-    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # all zeros: only asks
+    """True if the kernel's clock is synchronised, by chrony, ntpd or systemd-timesyncd."""
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # all zeros: read only
     return state not in (-1, _UNSYNCHRONISED)
 
 
 def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
-    """Whether whoever asks may have the real-time priority, and may lock memory."""
+    """Check that this user may have the real-time priority, and may lock memory."""
     highest = highest_priority()
     if priority > highest:
-        yield Finding("warning", "real time", f"priority {priority} is refused, {highest} is the highest here; the "
-                      "unit has LimitRTPRIO", priority_advice(priority))
+        yield Finding("warning", "real time", f"priority {priority} is not allowed, this user may have {highest}; the "
+                      "unit sets LimitRTPRIO", priority_advice(priority))
     else:
         yield Finding("ok", "real time", f"priorities up to {highest} are allowed")
     if lock_memory and not may_lock():
-        yield Finding("warning", "memory", "here it cannot be locked; the unit has LimitMEMLOCK", LOCK_ADVICE)
+        yield Finding("warning", "memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
     else:
-        yield Finding("ok", "memory", "it can be locked" if may_lock() else "it is not to be locked")
+        yield Finding("ok", "memory", "may be locked" if may_lock() else "not locked: realtime.lock_memory = false")
 
 
 def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:
-    """Whether recordings fit into the folder, or onto the disk where it will be, for how long, and may go there."""
+    """Check the space for recordings in the folder (or where it will be), and that the service may write there."""
     place = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(place).free
     room = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
     if room <= 0:
-        yield Finding("wrong" if config.enabled else "warning", "disk", f"{free / 1e9:.1f} GB free at {place}: nothing "
-                      f"is recorded below record.free_mb = {config.free_mb}", "delete something, or record elsewhere")
+        yield Finding("error" if config.enabled else "warning", "disk", f"{free / 1e9:.1f} GB free at {place}: nothing "
+                      f"is recorded below record.free_mb = {config.free_mb}", "delete files, or change record.folder")
     else:
         yield Finding("ok", "disk", f"{free / 1e9:.1f} GB free at {place}: the newest {room / 1e9:.1f} GB, about "
                       f"{room / bytes_per_s / 3600:.1f} h, are kept of what is recorded")
@@ -83,21 +84,21 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Fin
 
 
 def programs() -> Iterator[Finding]:
-    """What omnid is built on, each with its version; what is missing or cannot be loaded."""
+    """Check that the packages omnid depends on can be imported; list their versions."""
     loaded: list[str] = []
-    for package, module in PARTS.items():
+    for package, module in PACKAGES.items():
         try:
             import_module(module)
             loaded.append(f"{module} {_version(package)}")
         except ImportError as error:
-            yield Finding("wrong", "programs", f"{package}: {error}", f"/opt/omnid/bin/pip install {package}")
+            yield Finding("error", "programs", f"{package}: {error}", f"/opt/omnid/bin/pip install {package}")
     yield Finding("ok", "programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
 
 
 def _version(package: str) -> str:
     with suppress(PackageNotFoundError):
         return version(package)
-    return "(of another package)"  # OpenCV has four, and distributions their own
+    return "(of another package)"  # OpenCV has four, and distributions have their own
 
 
 def _word(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""The doctor: what is well is ok, and every fault is found and comes with what to do about it."""
+"""The doctor: each check finds its faults, with advice, and is ok otherwise."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from omnid.config import RecordConfig
 from omnid.doctor import machine
 from omnid.doctor.cameras import CameraStream, buses, cameras
 from omnid.doctor.devices import access, holders, memberships
-from omnid.doctor.finding import Finding, verdict
+from omnid.doctor.finding import Finding, summary
 from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
 from omnid.doctor.wiring import bus, motor, rig
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
-NOBODY = 65534
+UNPRIVILEGED = 65534
 FORMATS = (Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0,)),
            Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)))
 
 
 class Robot:
-    """A tree like /sys and /dev with two cameras, and what they say of themselves."""
+    """A tree like /sys and /dev with two cameras and their properties."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -59,7 +59,7 @@ class Robot:
         return CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "usb", "", "", "", FORMATS)
 
     def examined(self, lower: str = "/dev/omnid/lower", **how: int | str | float) -> list[Finding]:
-        """What is found of both cameras, set in this way."""
+        """Return the findings for both cameras with these settings."""
         wanted = {name: V4l2Settings(device, **{"width_px": 1280, "height_px": 960, **how})  # type: ignore[arg-type]
                   for name, device in (("lower", lower), ("upper", "/dev/omnid/upper"))}
         return list(cameras(wanted, self.known, self.root))
@@ -84,40 +84,40 @@ def opened_elsewhere(path: Path | str) -> Iterator[None]:
         it.communicate()
 
 
-def test_cameras_that_can_do_what_is_asked(robot: Robot) -> None:
+def test_accepts_cameras_with_the_configured_mode(robot: Robot) -> None:
     first, second, usb = robot.examined(pixel_format="YUYV", width_px=640, height_px=480)
     assert str(first) == "ok       camera lower  HD Webcam at /dev/video0, YUYV 640x480 at 30 Hz"
     assert second.level == "ok" and "/dev/video2" in second.found
     assert (usb.level, usb.subject) == ("ok", "usb bus 1") and "295 of 384 Mbit/s" in usb.found
 
 
-def test_a_mode_that_is_not_offered(robot: Robot) -> None:
+def test_finds_a_mode_that_is_not_offered(robot: Robot) -> None:
     found = robot.examined(rate_hz=60.0)
-    assert levels(found) == ["wrong", "wrong"] and "MJPG 1280x960 at 30, 15 Hz" in found[0].found
-    assert "[cameras]" in found[0].mend
+    assert levels(found) == ["error", "error"] and "MJPG 1280x960 at 30, 15 Hz" in found[0].found
+    assert "[cameras]" in found[0].advice
 
 
-def test_a_camera_that_is_not_there(robot: Robot) -> None:
+def test_finds_a_missing_camera(robot: Robot) -> None:
     found = robot.examined(lower="/dev/omnid/lowest")
-    assert found[0].level == "wrong" and "/dev/omnid/lowest is not there" in found[0].found
-    assert "omnid cameras" in found[0].mend and found[1].level == "ok"
+    assert found[0].level == "error" and "/dev/omnid/lowest does not exist" in found[0].found
+    assert "omnid cameras" in found[0].advice and found[1].level == "ok"
 
 
-def test_what_is_no_camera(robot: Robot) -> None:
+def test_finds_a_device_that_is_no_camera(robot: Robot) -> None:
     (robot.root / "dev/null").touch()
     assert "is no camera" in robot.examined(lower="/dev/null")[0].found
 
 
-def test_a_camera_that_does_not_let_itself_be_asked(robot: Robot) -> None:
+def test_finds_a_camera_that_cannot_be_queried(robot: Robot) -> None:
     robot.known[0] = CaptureDevice("/dev/video0", "", "", "", "", "", "", (), "is broken; mend it")
-    assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "wrong"
+    assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "error"
 
 
-def test_one_camera_for_both(robot: Robot) -> None:
-    assert any("all lead to one device" in finding.found for finding in robot.examined(lower="/dev/video2"))
+def test_finds_one_device_for_both_cameras(robot: Robot) -> None:
+    assert any("lead to one device" in finding.found for finding in robot.examined(lower="/dev/video2"))
 
 
-def test_a_camera_that_somebody_else_has_open(robot: Robot) -> None:
+def test_finds_a_camera_open_in_another_process(robot: Robot) -> None:
     (robot.root / "proc").symlink_to("/proc")
     with opened_elsewhere(robot.root / "dev/video0"):
         assert "is open in python" in robot.examined()[0].found
@@ -134,12 +134,12 @@ def test_a_camera_that_somebody_else_has_open(robot: Robot) -> None:
         ),
         (
             [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "1", 480)],
-            "wrong",
+            "error",
             "390 Mbit/s over",
         ),
         (
             [CameraStream("lower", "YUYV", 590, "1", 480), CameraStream("upper", "GREY", 9, "1", 480)],
-            "wrong",
+            "error",
             "would send 590",
         ),
         (
@@ -156,13 +156,13 @@ def test_a_camera_that_somebody_else_has_open(robot: Robot) -> None:
         ([CameraStream("lower", "MJPG", 0, "1", 480)], "ok", "480 Mbit/s"),
     ],
 )
-def test_the_room_on_usb(streams: list[CameraStream], level: str, words: str) -> None:
+def test_checks_the_bandwidth_of_usb(streams: list[CameraStream], level: str, words: str) -> None:
     (found,) = buses(streams)
     assert found.level == level and words in found.found
-    assert (found.level == "ok") == (not found.mend)
+    assert (found.level == "ok") == (not found.advice)
 
 
-def test_each_bus_has_its_own_room() -> None:
+def test_checks_each_bus_alone() -> None:
     streams = [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "3", 480)]
     found = [(finding.level, finding.subject) for finding in buses(streams)]
     assert found == [("ok", "usb bus 1"), ("ok", "usb bus 3")]
@@ -170,46 +170,46 @@ def test_each_bus_has_its_own_room() -> None:
 
 @pytest.fixture
 def port() -> Iterator[str]:
-    """A serial port, as far as a pty is one."""
+    """A pseudo-terminal as a serial port."""
     controller, own = os.openpty()
     yield os.ttyname(own)
     os.close(own)
     os.close(controller)
 
 
-def test_a_motor_that_can_be_had(port: str) -> None:
+def test_accepts_a_motor_port(port: str) -> None:
     os.chmod(port, 0o666)
     assert [str(finding) for finding in motor(port)] == [f"ok       motor         {port}"]
 
 
-def test_a_port_of_a_group_that_the_service_is_not_in(port: str) -> None:
+def test_finds_a_port_of_another_group(port: str) -> None:
     os.chmod(port, 0o660)
     group = grp.getgrgid(os.stat(port).st_gid).gr_name
     (found,) = motor(port)
-    assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.mend
+    assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.advice
 
 
-def test_a_port_that_is_in_use(port: str) -> None:
+def test_finds_a_port_in_use(port: str) -> None:
     os.chmod(port, 0o666)
     with opened_elsewhere(port):
         (found,) = motor(port)
-    assert found.level == "wrong" and "in use by python" in found.found
+    assert found.level == "error" and "in use by python" in found.found
     assert levels(list(motor(port))) == ["ok"]
 
 
 @pytest.mark.parametrize(
     ("name", "level", "words"),
-    [("", "ok", "motor.port is empty"), ("simulated", "ok", "simulated"), ("/dev/ttyNOWHERE", "wrong", "is not there"),
-     ("/etc/passwd", "wrong", "is no serial port")],
+    [("", "ok", "motor.port is empty"), ("simulated", "ok", "simulated"), ("/dev/ttyNONE", "error", "does not exist"),
+     ("/etc/passwd", "error", "is no serial port")],
 )
-def test_other_motors(name: str, level: str, words: str) -> None:
+def test_checks_other_motor_settings(name: str, level: str, words: str) -> None:
     (found,) = motor(name)
     assert found.level == level and words in found.found
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to group video")
-def test_a_device_that_is_closed_to_us() -> None:
-    """Asked by a user without rights, in a process of its own."""
+def test_finds_a_device_without_permission() -> None:
+    """As an unprivileged user, in a process of its own."""
     with tempfile.NamedTemporaryFile(prefix="omnid-doctor-") as file:
         _closed_then_open(Path(file.name))
 
@@ -218,7 +218,7 @@ def _closed_then_open(device: Path) -> None:
     device.chmod(0)
     os.chown(device, -1, grp.getgrnam("video").gr_gid)
     script = (f"import os, json; from pathlib import Path; from omnid.doctor.devices import access\n"
-              f"os.getuid() or os.setuid({NOBODY})\n"
+              f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
               f"print(json.dumps([str(finding) for finding in access('motor', Path('{device}'))]))")
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert "no permission" in json.loads(done.stdout)[0] and "usermod" in done.stdout, done.stderr
@@ -226,29 +226,29 @@ def _closed_then_open(device: Path) -> None:
     assert list(access("motor", device)) == []
 
 
-def test_who_has_a_device_open_is_told_by_name() -> None:
+def test_names_the_process_that_has_a_device_open() -> None:
     with open(os.devnull), opened_elsewhere(ROOT / "pyproject.toml"):
         (holder,) = holders(ROOT / "pyproject.toml")
     assert holder.startswith("python") and "pid" in holder
     assert holders(ROOT / "pyproject.toml") == []
 
 
-def test_groups() -> None:
+def test_checks_the_groups() -> None:
     assert memberships(()).level == "ok"
     if os.geteuid():
         missing = memberships(("no-such-group",))
-        assert missing.level == "warning" and "no-such-group" in missing.mend
+        assert missing.level == "warning" and "no-such-group" in missing.advice
 
 
-def test_a_rig_that_fits_its_cameras(scene: Path) -> None:
+def test_checks_the_image_size_of_the_rig(scene: Path) -> None:
     file = scene / "rig.toml"
     size = read_rig(file).lower.camera.size
-    assert all(finding.level != "wrong" for finding in rig(file, size))
-    wrong = [finding for finding in rig(file, (1280, 960)) if finding.level == "wrong"]
+    assert all(finding.level != "error" for finding in rig(file, size))
+    wrong = [finding for finding in rig(file, (1280, 960)) if finding.level == "error"]
     assert len(wrong) == 2 and "256x256" in wrong[0].found and "asks for 1280x960" in wrong[0].found
 
 
-def test_a_rig_with_and_without_masks(scene: Path, tmp_path: Path) -> None:
+def test_warns_of_a_rig_without_masks(scene: Path, tmp_path: Path) -> None:
     bare, masked = tmp_path / "bare.toml", tmp_path / "masked.toml"
     whole = read_rig(scene / "rig.toml")
     write_rig(masked, whole)
@@ -260,24 +260,24 @@ def test_a_rig_with_and_without_masks(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [None, "", "nonsense = [", "schema = 99"])
-def test_a_rig_that_cannot_be_read(tmp_path: Path, text: str | None) -> None:
+def test_finds_a_rig_that_cannot_be_read(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         (tmp_path / "rig.toml").write_text(text)
     (found,) = rig(tmp_path / "rig.toml", (1280, 960))
-    assert found.level == "wrong" and "omnid calibrate" in found.mend
+    assert found.level == "error" and "omnid calibrate" in found.advice
 
 
 @pytest.mark.parametrize(
     ("now_s", "synchronised", "level"),
-    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "wrong")],
+    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "error")],
 )
-def test_the_time_of_day(now_s: float, synchronised: bool, level: str, tmp_path: Path) -> None:
+def test_checks_the_system_time(now_s: float, synchronised: bool, level: str, tmp_path: Path) -> None:
     assert next(clock(now_s, synchronised, tmp_path)).level == level
     assert is_synchronised() in (True, False)
 
 
 @pytest.mark.parametrize(("source", "level"), [("tsc", "ok"), ("arch_sys_counter", "ok"), ("hpet", "warning")])
-def test_the_source_of_time(source: str, level: str, tmp_path: Path) -> None:
+def test_checks_the_clock_source(source: str, level: str, tmp_path: Path) -> None:
     folder = tmp_path / "sys/devices/system/clocksource/clocksource0"
     folder.mkdir(parents=True)
     (folder / "current_clocksource").write_text(f"{source}\n")
@@ -285,10 +285,10 @@ def test_the_source_of_time(source: str, level: str, tmp_path: Path) -> None:
     assert found.level == level and source in found.found
 
 
-def test_rights_are_those_of_whoever_asks() -> None:
+def test_checks_the_rights_of_this_user() -> None:
     script = ("import os, resource; from omnid.doctor.machine import rights\n"
               "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
-              f"os.getuid() or os.setuid({NOBODY})\n"
+              f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
               "print(*rights(20, True), *rights(0, False), sep='\\n')")
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     lines = done.stdout.splitlines()
@@ -296,51 +296,51 @@ def test_rights_are_those_of_whoever_asks() -> None:
     assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
-def test_room_for_recordings() -> None:
+def test_checks_the_space_for_recordings() -> None:
     (found,) = disk(machine.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
     assert found.level == "ok" and f"free at {machine.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
     full = 10**9
     (found,) = disk(machine.STATE, RecordConfig(free_mb=full), 1e6)
     assert found.level == "warning" and f"record.free_mb = {full}" in found.found
     (found,) = disk(machine.STATE, RecordConfig(enabled=True, free_mb=full), 1e6)
-    assert found.level == "wrong"
+    assert found.level == "error"
 
 
-def test_a_folder_that_the_service_may_not_write_to(tmp_path: Path) -> None:
+def test_warns_of_a_folder_outside_the_state_directory(tmp_path: Path) -> None:
     *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
-    assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.mend
+    assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.advice
     unit = (ROOT / "systemd" / "omnid.service").read_text()
     assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
 
 
-def test_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checks_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     (found,) = programs()
     assert found.level == "ok" and "cv2" in found.found and "zenoh 1." in found.found
-    monkeypatch.setitem(machine.PARTS, "missing-part", "missing_part")  # type: ignore[attr-defined]
-    assert [finding.level for finding in programs()] == ["wrong", "ok"]
+    monkeypatch.setitem(machine.PACKAGES, "missing-package", "missing_part")  # type: ignore[attr-defined]
+    assert [finding.level for finding in programs()] == ["error", "ok"]
 
 
 def router(endpoint: str) -> list[Finding]:
     return [finding for finding in bus(BusConfig(connect=(endpoint,))) if finding.subject == "router"]
 
 
-def test_a_router_that_answers_and_one_that_does_not() -> None:
+def test_checks_that_a_router_answers() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         here = f"tcp/127.0.0.1:{server.getsockname()[1]}"
         assert [finding.level for finding in router(here)] == ["ok"]
     (found,) = router(here)
     assert found.level == "warning" and f"{here} does not answer: Connection refused" in found.found
-    assert "lan.conf" in found.mend
+    assert "lan.conf" in found.advice
 
 
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:7447", "unixsock-stream//tmp/x", "nonsense", ""])
-def test_a_router_that_cannot_be_tried(endpoint: str) -> None:
+def test_does_not_check_other_protocols(endpoint: str) -> None:
     (found,) = router(endpoint)
-    assert found.level == "ok" and "is not tried" in found.found
+    assert found.level == "ok" and "is not checked" in found.found
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/no such host:1", "tcp/127.0.0.1:99999", "tcp/" + "x" * 300 + ":1"])
-def test_a_router_that_cannot_be(endpoint: str) -> None:
+def test_warns_of_an_impossible_router(endpoint: str) -> None:
     assert [finding.level for finding in router(endpoint)] == ["warning"]
 
 
@@ -350,14 +350,14 @@ def test_a_router_that_cannot_be(endpoint: str) -> None:
      ("unixsock-stream//run/x", True), ("tcp/0.0.0.0:7447", False), ("tcp/[::]:7447", False),
      ("tcp/192.168.1.2:7447", False), ("udp/robot.local:7447", False)],
 )
-def test_who_may_call(endpoint: str, local: bool) -> None:
+def test_warns_of_open_endpoints_without_command_users(endpoint: str, local: bool) -> None:
     for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
         found = [finding for finding in bus(config) if finding.subject == "bus"]
         assert (found == []) == local
-        assert all(finding.level == "warning" and "bus.command_users" in finding.mend for finding in found)
+        assert all(finding.level == "warning" and "bus.command_users" in finding.advice for finding in found)
 
 
-def test_who_may_command_is_told(tmp_path: Path) -> None:
+def test_names_the_users_that_may_command(tmp_path: Path) -> None:
     users = tmp_path / "users"
     users.write_text("anna:secret")
     config = BusConfig(listen=("tcp/0.0.0.0:7447",), users_file=str(users), command_users=("anna",))
@@ -365,32 +365,32 @@ def test_who_may_command_is_told(tmp_path: Path) -> None:
     assert found.level == "ok" and "from anna only" in found.found
 
 
-def test_a_bus_that_would_not_start() -> None:
-    (found,) = (finding for finding in bus(BusConfig(command_users=("anna",))) if finding.level == "wrong")
+def test_finds_wrong_bus_settings() -> None:
+    (found,) = (finding for finding in bus(BusConfig(command_users=("anna",))) if finding.level == "error")
     assert "bus.users_file" in found.found
 
 
-def test_the_command_checks_everything_and_says_so_by_its_code(
+def test_the_command_runs_all_checks_and_returns_an_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing = f"cameras.rig={tmp_path / 'rig.toml'}"
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
-    assert {line[:9].strip() for line in lines} <= {"ok", "warning", "wrong"}
+    assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
     for subject in ("camera lower", "camera upper", "rig", "motor", "groups", "real time", "memory", "clock", "disk",
                     "router", "programs"):
         assert any(line[9:].startswith(subject) for line in lines)
-    assert " wrong, " in last
+    assert " errors, " in last
 
 
-def test_a_configuration_that_is_wrong_is_no_finding(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_refuses_a_wrong_configuration(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("found", "line"),
-    [(["ok", "ok"], "all 2 checks are ok"), (["ok", "wrong", "warning"], "1 wrong, 1 to be looked at, 1 ok")],
+    [(["ok", "ok"], "all 2 checks are ok"), (["ok", "error", "warning"], "1 errors, 1 warnings, 1 ok")],
 )
-def test_the_last_line(found: list[str], line: str) -> None:
-    assert verdict([Finding(level, "", "") for level in found]) == line  # type: ignore[arg-type]
+def test_summarises_the_findings(found: list[str], line: str) -> None:
+    assert summary([Finding(level, "", "") for level in found]) == line  # type: ignore[arg-type]
