@@ -1,5 +1,5 @@
-"""The daemon's one error class for everything a user can put right."""
+"""The error class for everything that a user can correct."""
 
 
 class OmnidError(Exception):
-    """What was asked, what was found and what to do, in one line: the command line prints it and exits with 2."""
+    """An error that the user can correct: what failed, what was expected and what to do, in one line."""

@@ -1,4 +1,4 @@
-"""`omnid view`: path, map, images with their features, depth and plots, in rerun."""
+"""`omnid view`: show path, map, images with features, depth and plots in rerun."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.replay import replay_and_print
 
-if TYPE_CHECKING:  # whoever asks for another command loads none of this
+if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
     from omnid.viewer.targets import ViewerTarget
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `view` to the command line."""
-    parser = subparsers.add_parser("view", help="see a log or a robot: path, map, features, depth, plots (needs rerun)")
+    parser = subparsers.add_parser("view", help="show a log or a robot: path, map, depth, plots (needs rerun)")
     parser.add_argument("log", type=Path, nargs="?", metavar="LOG", help="a recording, which is shown as it stands, or "
                         "a log of images, which goes through the stages; without one, a robot is listened to")
-    where = parser.add_argument_group("where it is shown; default: a window")
+    where = parser.add_argument_group("output; default: a window")
     where.add_argument("-o", "--output", type=Path, metavar="FILE.rrd", help="a file that `rerun FILE.rrd` opens, here "
                        "or elsewhere; needs no display")
     where.add_argument("--web", action="store_true", help="a browser of this machine")
@@ -32,11 +32,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_log(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a log")
     group.add_argument("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several")
-    group.add_argument("--replay", action="store_true", help="compute anew from the images of a recording")
-    group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: the one attached to the log")
-    group.add_argument("--lower", metavar="TOPIC", help="the lower camera's images; default: by name")
-    group.add_argument("--upper", metavar="TOPIC", help="the upper camera's images; default: by name")
-    group.add_argument("--quiet", action="store_true", help="no progress")
+    group.add_argument("--replay", action="store_true", help="compute again from the images of a recording")
+    group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+    group.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
+    group.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
 
 def _add_robot(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +45,11 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
                        "the only one")
     group.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
                        "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
-    group.add_argument("--seconds", type=float, metavar="N", help="end after so long; default: with Ctrl-C")
+    group.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Shows it; 1 where there was no pose to show."""
+    """Show the log or the robot; return 1 if there was no pose to show."""
     from omnid.config import load_config
 
     _refuse_contradictions(args)
@@ -89,12 +89,12 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
               "--upper": args.upper}
     wrong = [name for name, value in (of_log if args.log is None else live).items() if value]
     if wrong:
-        instead = "name a LOG as well" if args.log is None else "leave out the LOG to listen to a robot"
+        instead = "name a LOG as well" if args.log is None else "leave out the LOG to show a robot"
         raise OmnidError(f"{wrong[0]} does not go with {'a robot' if args.log is None else args.log}: {instead}")
     if args.output is not None and args.web:
-        raise OmnidError("-o and --web: expected one place to show it in; leave one of them out")
+        raise OmnidError("-o and --web exclude each other: leave one of them out")
     if args.seconds is not None and not 0 < args.seconds < 1e9:
-        raise OmnidError(f"--seconds {args.seconds} is no time to look for; give seconds above 0, or leave it out")
+        raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
 
 
 def _require_rerun() -> None:
@@ -104,5 +104,5 @@ def _require_rerun() -> None:
     from omnid.errors import OmnidError
 
     if find_spec("rerun") is None:
-        raise OmnidError("omnid view draws with rerun, which is not installed here: pip install 'omnid[view]'")
-    os.environ.setdefault("RUST_LOG", "off")  # what rerun has to tell besides, we tell ourselves
+        raise OmnidError("omnid view draws with rerun, which is not installed: pip install 'omnid[view]'")
+    os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself

@@ -1,4 +1,4 @@
-"""What live runs and replays share: graph, statistics, geometry, bus, encoders, and signals that end the run."""
+"""The parts that live runs and replays share: graph, statistics, geometry, bus, encoders, and signals."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Where messages leave the flow: bus, recorder, files."""
+"""Ends of the flow: bus, recorder, files, collectors."""

@@ -1,4 +1,4 @@
-"""What a piece of work takes from memory, as Python and numpy ask for it."""
+"""Memory that a piece of work allocates, in Python and numpy."""
 
 from __future__ import annotations
 

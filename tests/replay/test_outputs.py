@@ -129,7 +129,7 @@ def test_uses_the_rig_that_is_attached_to_the_log(omnid: Command, tmp_path: Path
 
 
 def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Where the names of the topics do not tell which camera is which, options or the rig do."""
+    """Options or the rig tell which camera is which, if the names of the topics do not."""
     topics = {"lower": "/cam0", "upper": "/cam1"}
     entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
                for p in images(scene / "log.mcap")]

@@ -1,4 +1,4 @@
-"""A live run is recorded, and its recording is a log like any other: replayed, it gives the same trajectory again."""
+"""The recording of a live run is a log: its replay gives the same trajectory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from tests.replay.recorded import recorded_run
 
 POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
-SAID = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status", "/omnid/drive", *IMAGES}
+PUBLISHED = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status", "/omnid/drive",
+             *IMAGES}
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
@@ -38,13 +39,13 @@ class Message(NamedTuple):
 
 @pytest.fixture(scope="module")
 def recording(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `omnid run` wrote."""
+    """Return a recording of `omnid run`."""
     return recorded_run(scene, tmp_path_factory.mktemp("recording"), POSES)
 
 
 @pytest.fixture(scope="module")
 def messages(recording: Path) -> list[Message]:
-    """All of it, as another program reads it."""
+    """Return all messages, as another program reads them."""
     with AnyReader([recording]) as bag:
         return [Message(place.topic, at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data
                 in bag.messages()]
@@ -54,10 +55,10 @@ def of(messages: list[Message], topic: str) -> list[Message]:
     return [message for message in messages if message.topic == topic]
 
 
-def test_all_that_is_said_is_in_it_with_rig_and_settings(
+def test_a_recording_holds_all_messages_rig_and_settings(
     recording: Path, messages: list[Message], scene: Path
 ) -> None:
-    assert {message.topic for message in messages} >= {*SAID, "/omnid/cmd/heading"}
+    assert {message.topic for message in messages} >= {*PUBLISHED, "/omnid/cmd/heading"}
     reader = LogReader(recording)
     attached = reader.attachments()
     reader.close()
@@ -71,9 +72,9 @@ def test_all_that_is_said_is_in_it_with_rig_and_settings(
     assert parts >= {"omnid: odometry", "omnid: wheels", "omnid: lower camera", "omnid: stage stereo"}
 
 
-def test_its_stamps_agree(messages: list[Message]) -> None:
-    """What omnid says is logged at its own stamp; a pose has that of a image of the lower camera."""
-    assert all(message.log_ns == message.stamp_ns for message in messages if message.topic in SAID)
+def test_log_times_are_the_stamps(messages: list[Message]) -> None:
+    """A message is logged at its stamp; a pose has that of an image of the lower camera."""
+    assert all(message.log_ns == message.stamp_ns for message in messages if message.topic in PUBLISHED)
     lower = {message.stamp_ns for message in of(messages, IMAGES[0])}
     poses = [message.stamp_ns for message in of(messages, "/omnid/odom")]
     assert set(poses) <= lower and len(poses) > POSES // 2
@@ -81,10 +82,10 @@ def test_its_stamps_agree(messages: list[Message]) -> None:
         assert [message.stamp_ns for message in of(messages, topic)] == poses
 
 
-def test_every_pose_is_told_alike(messages: list[Message]) -> None:
-    """Odometry, PoseStamped and the transform say the same."""
-    told = zip(*(of(messages, topic) for topic in ("/omnid/odom", "/omnid/pose", "/tf")), strict=True)
-    for odom, pose, tf in (tuple(message.content for message in three) for three in told):
+def test_all_messages_of_a_pose_agree(messages: list[Message]) -> None:
+    """Odometry, PoseStamped and the transform hold the same pose."""
+    pose_messages = zip(*(of(messages, topic) for topic in ("/omnid/odom", "/omnid/pose", "/tf")), strict=True)
+    for odom, pose, tf in (tuple(message.content for message in three) for three in pose_messages):
         assert odom.pose.pose == pose.pose
         edge = next(edge for edge in tf.transforms if edge.child_frame_id == "base_link")
         position, moved = odom.pose.pose.position, edge.transform.translation
@@ -92,8 +93,8 @@ def test_every_pose_is_told_alike(messages: list[Message]) -> None:
         assert odom.pose.pose.orientation == edge.transform.rotation
 
 
-def test_a_replay_of_it_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
-    """Its own images, rig and attachments are all that the replay is given."""
+def test_a_replay_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
+    """The replay uses only the images, rig and attachments of the recording."""
     again = tmp_path / "again.mcap"
     assert omnid.replay(recording, "--record", again).code == 0
     code, out, err = omnid("diff", recording, again, *COMPARABLE)
@@ -103,7 +104,7 @@ def test_a_replay_of_it_gives_a_comparable_trajectory(omnid: Command, tmp_path: 
         assert "bit-identical" in out, "not a pair was dropped"
 
 
-def test_a_setting_that_matters_is_found(omnid: Command, tmp_path: Path, recording: Path) -> None:
+def test_diff_finds_a_setting_that_matters(omnid: Command, tmp_path: Path, recording: Path) -> None:
     other = tmp_path / "other.mcap"
     assert omnid.replay(recording, "--record", other, "--method", "paper").code == 0
     code, out, _ = omnid("diff", recording, other, "--tolerance-mm", 0.1)

@@ -1,4 +1,4 @@
-"""`omnid run` as a program: poses flow, wheels obey, and it ends as it should."""
+"""`omnid run` as a process: poses, commands to the wheels, faults and the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
 
-def test_poses_flow_wheels_obey_and_sigterm_ends_it(tmp_path: Path, scene: Path) -> None:
+def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, scene: Path) -> None:
     with robot(scene, tmp_path) as (daemon, operator, base):
         time.sleep(0.5)
         assert not base.line.moved_since(0.0), "nobody has asked"
@@ -47,7 +47,7 @@ def test_poses_flow_wheels_obey_and_sigterm_ends_it(tmp_path: Path, scene: Path)
     assert all(line.startswith("omnid: ") for line in err.splitlines())
 
 
-def test_every_part_speaks_for_itself(tmp_path: Path, scene: Path) -> None:
+def test_every_part_has_a_status(tmp_path: Path, scene: Path) -> None:
     settings = ("record.enabled=true", f'record.folder="{tmp_path / "log"}"', "live.check_s=0.1")
     words = (word for setting in settings for word in ("--set", setting))
     with robot(scene, tmp_path, *words) as (daemon, operator, _):
@@ -58,7 +58,7 @@ def test_every_part_speaks_for_itself(tmp_path: Path, scene: Path) -> None:
 
 
 def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
-    """The path of the log, forwards and backwards: never further from the start than its end."""
+    """On the path of the log, forwards and backwards, no pose is farther from the start than its end."""
     truth = read_tum(scene / "truth.txt")
     longest_m = max(float(np.linalg.norm(T[:3, 3] - truth.T[0][:3, 3])) for T in truth.T)
     with robot(scene, tmp_path) as (_, operator, _):
@@ -71,7 +71,7 @@ def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
         assert (steps_ns > 0).all()
 
 
-def test_one_camera_gone_and_back(tmp_path: Path, scene: Path) -> None:
+def test_a_camera_fails_and_recovers(tmp_path: Path, scene: Path) -> None:
     with robot(scene, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.drives, "motion")
@@ -87,7 +87,7 @@ def test_one_camera_gone_and_back(tmp_path: Path, scene: Path) -> None:
         assert daemon.end()[0] == 0
 
 
-def test_the_rig_of_the_log_itself_and_an_end_with_the_log() -> None:
+def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
     port = free_port()
     command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--once", "--pace", "5",
                "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
@@ -97,8 +97,8 @@ def test_the_rig_of_the_log_itself_and_an_end_with_the_log() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_signals_at_any_time_end_it_without_a_word(scene: Path, number: int) -> None:
-    """The sooner, the more of it is not yet there."""
+def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> None:
+    """Also while it starts."""
     port = free_port()
     command = [sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
                str(scene / "rig.toml"), "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
@@ -132,14 +132,14 @@ def test_wrong_options_give_one_line(omnid: Command, scene: Path, case: str) -> 
     assert expected in omnid.refused("run", *(word.format(**paths) for word in words), "--set", listen)
 
 
-def test_a_port_that_is_taken_gives_one_line(omnid: Command, scene: Path, taken_port: int) -> None:
+def test_a_taken_port_gives_one_line(omnid: Command, scene: Path, taken_port: int) -> None:
     line = omnid.refused("run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", "simulated",
                          "--set", f'bus.listen=["tcp/127.0.0.1:{taken_port}"]')
     assert "bus.listen" in line
 
 
 def test_nohup_is_respected(scene: Path) -> None:
-    """A daemon that was started to outlive its terminal does."""
+    """A daemon that ignores SIGHUP goes on after it."""
     port = free_port()
     command = ["nohup", sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
                str(scene / "rig.toml"), "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']

@@ -1,4 +1,4 @@
-"""What the stages' messages become on the bus."""
+"""Messages of the stages on the bus."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     assert frames == [("odom", "base_link"), ("base_link", "rig")]
 
 
-def test_panoramas_are_sent_as_often_as_wanted() -> None:
+def test_panoramas_are_published_at_the_configured_rate() -> None:
     endpoint, came = free_endpoint(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
         robot.on_message(lambda topic, payload, note: came.append((payload, note)))
@@ -75,12 +75,12 @@ def test_panoramas_are_sent_as_often_as_wanted() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"inliers":3,"rejected":[],"new":[]}',
                                   b'{"inliers":[[1]],"rejected":[],"new":[]}', bytes(1 << 18)])
-def test_features_are_some_or_are_refused(data: bytes) -> None:
+def test_refuses_bytes_that_are_no_features(data: bytes) -> None:
     with pytest.raises(OmnidError, match="attached to a panorama"):
         features_from_bytes(data)
 
 
-def test_features_are_bounded_and_somewhere() -> None:
+def test_features_are_limited_in_number_and_finite() -> None:
     many = np.zeros((3 * MOST, 2))
     assert len(features_from_bytes(features_to_bytes({"inliers": many, "rejected": many, "new": many}))["new"]) == MOST
     wild = b'{"inliers":[[NaN,1],[1e300,2],[3,4]],"rejected":[],"new":[]}'

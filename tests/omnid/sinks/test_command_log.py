@@ -1,4 +1,4 @@
-"""Commands from the network in a recording: as they came, and nothing that a reader would stumble over."""
+"""Commands from the network in a recording: unchanged, and only those that a reader can decode."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from omnid.transport.commands import LONGEST_PAYLOAD
 NOW_NS = 1_700_000_000 * 10**9
 
 
-def test_commands_are_recorded_as_they_came(tmp_path: Path) -> None:
+def test_commands_are_recorded_unchanged(tmp_path: Path) -> None:
     config = Config()
     config = replace(config, record=replace(config.record, folder=str(tmp_path / "log"), free_mb=0, file_mb=1))
     recorder = open_recorder(config, "", lambda *_: None)
     offset_ns = NOW_NS - time.monotonic_ns()
-    keep = command_recorder(recorder, offset_ns)
-    keep("cmd/heading", codec.heading_cdr(NOW_NS, 0.3, -1.2))
-    keep("cmd/twist", codec.twist_stamped_cdr(NOW_NS, "base_link", 0.4, 0.5))
-    keep("cmd/stop", b"whatever")
-    keep("cmd/heading", b"no heading")
+    record = command_recorder(recorder, offset_ns)
+    record("cmd/heading", codec.heading_cdr(NOW_NS, 0.3, -1.2))
+    record("cmd/twist", codec.twist_stamped_cdr(NOW_NS, "base_link", 0.4, 0.5))
+    record("cmd/stop", b"whatever")
+    record("cmd/heading", b"no heading")
     recorder.finish()
     (path,) = (tmp_path / "log").glob("*.mcap")
     with AnyReader([path]) as bag:
@@ -45,7 +45,7 @@ def test_other_keys_are_left_out(key: str) -> None:
     assert logged_command(key, codec.heading_cdr(NOW_NS, 0.3, -1.2)) is None
 
 
-def test_any_bytes_may_come() -> None:
+def test_any_bytes_are_accepted() -> None:
     numbers = np.random.default_rng(1)
     for key in ("cmd/heading", "cmd/twist", "cmd/stop"):
         for size in (0, 1, 3, 4, 5, 40, 64, 200, LONGEST_PAYLOAD):

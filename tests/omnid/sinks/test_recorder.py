@@ -1,4 +1,4 @@
-"""Recordings of live images and poses: what other programs read, what a kill costs, what a slow disk costs."""
+"""Recordings: readable by other programs, in Unix time, and without effect on the run when the disk is slow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.drivers.logs.mcap_logs import STORE, jpeg
 
 ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9
-OFFSET_NS = START_NS - 5 * 10**9  # the machine has been up for five seconds
+OFFSET_NS = START_NS - 5 * 10**9  # boot time of the machine: five seconds before
 WIDTH, HEIGHT = 6, 4
 LENGTHS = {"mono8": 1, "mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 
@@ -42,7 +42,7 @@ def frame(seq: int, camera: Camera, encoding: str = "jpeg") -> Frame:
         return Frame(seq, stamp_ns, camera, encoding, jpeg(seq))
     step = WIDTH * LENGTHS[encoding] + 4
     rows = HEIGHT * 3 // 2 if encoding == "nv12" else HEIGHT
-    data = np.random.default_rng(seq).bytes(step * rows + 100)  # and what a buffer of a driver has at its end
+    data = np.random.default_rng(seq).bytes(step * rows + 100)  # and the unused end of a driver's buffer
     return Frame(seq, stamp_ns, camera, encoding, data, WIDTH, HEIGHT, step)
 
 
@@ -56,7 +56,7 @@ def recorded(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
-def test_images_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, encoding: str) -> None:
+def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, encoding: str) -> None:
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
@@ -72,7 +72,7 @@ def test_images_come_back_as_they_were_and_are_found_by_name(tmp_path: Path, enc
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
-def test_image_messages_are_those_of_ros(encoding: str) -> None:
+def test_image_messages_have_the_layout_of_ros(encoding: str) -> None:
     each = frame(7, "upper", encoding)
     schema, payload = image_cdr(each, START_NS + 5)
     message: Any = STORE.deserialize_cdr(payload, schema)
@@ -88,7 +88,7 @@ def test_image_messages_are_those_of_ros(encoding: str) -> None:
     assert message.step == each.step and bytes(message.data) == bytes(each.data)[: each.step * rows]
 
 
-def test_packed_rows_get_their_step() -> None:
+def test_rows_without_padding_get_their_step() -> None:
     packed = Frame(0, 0, "lower", "bgr8", bytes(WIDTH * HEIGHT * 3), WIDTH, HEIGHT)
     message: Any = STORE.deserialize_cdr(image_cdr(packed, 0)[1], "sensor_msgs/msg/Image")
     assert message.step == WIDTH * 3 and image_topic(packed) == "lower/image_raw"
@@ -98,10 +98,10 @@ def test_packed_rows_get_their_step() -> None:
 
 def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
     return OdometryUpdate(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
-                    None)  # type: ignore[arg-type]  # nobody asks for the depth
+                    None)  # type: ignore[arg-type]  # the depth is not used
 
 
-def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None:
+def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     encode = Encoder(np.eye(4), MapEncoding(100), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode,
                              offset_ns=OFFSET_NS)
@@ -126,8 +126,8 @@ def test_all_that_the_robot_does_is_written_in_unix_time(tmp_path: Path) -> None
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
 
 
-def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -> None:
-    """A pose tells its state at the time of its images, when reports of later times have been made already."""
+def test_statuses_are_recorded_in_the_order_of_time(tmp_path: Path) -> None:
+    """The state of a pose has the time of its images, which may be before statuses that were made earlier."""
     encode = Encoder(np.eye(4), MapEncoding(9), OFFSET_NS)
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=encode, offset_ns=OFFSET_NS)
     report = status_report(START_NS + 2, [DiagnosticStatus("omnid: test", 0, "fine", {})])
@@ -135,7 +135,7 @@ def test_statuses_do_not_go_back_in_time_for_what_a_pose_tells(tmp_path: Path) -
     recorder.add(report, START_NS + 2)
     for n, state in enumerate(("tracking", "lost", "tracking", "lost")):
         recorder.process(odometry(n, state))
-    for n in range(300):  # of a clock that was set: held back, but none is forgotten
+    for n in range(300):  # the clock was set: they are held back, but none is lost
         recorder.add(report, START_NS * 2 + n)
         recorder.process(frame(n, "lower"))
     recorder.finish()
@@ -152,7 +152,7 @@ def attached(path: Path) -> list[str]:
         return [attachment.name for attachment in make_reader(file).iter_attachments()]
 
 
-def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
+def test_every_file_has_the_state_of_the_odometry(tmp_path: Path) -> None:
     config = settings(tmp_path / "log", file_s=1.0)
     recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
     for n in range(30):
@@ -165,7 +165,7 @@ def test_every_file_tells_the_state_of_the_odometry(tmp_path: Path) -> None:
             assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/status"])) == 1
 
 
-def test_no_message_ends_the_run(tmp_path: Path) -> None:
+def test_an_invalid_message_does_not_end_the_run(tmp_path: Path) -> None:
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
     for stamp_ns in (-1, 2**31 * 10**9, 2**70, START_NS):
         recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
@@ -175,7 +175,7 @@ def test_no_message_ends_the_run(tmp_path: Path) -> None:
 
 
 class Given:
-    """A source with images at hand."""
+    """A source of given frames."""
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = frames
@@ -185,7 +185,7 @@ class Given:
         """Nothing to close."""
 
 
-def test_a_disk_that_stands_still_stops_no_camera(tmp_path: Path) -> None:
+def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
     late = Late(recorder)
     graph, seen = Graph(policy=NEWEST, depth=3), Seen()
@@ -198,56 +198,56 @@ def test_a_disk_that_stands_still_stops_no_camera(tmp_path: Path) -> None:
     assert min(seen.times_s) < late.until_s  # the others went on meanwhile
 
 
-def test_how_it_goes_is_told(tmp_path: Path) -> None:
+def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
     assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
     recorder.process(frame(0, "lower"))
-    told = recorder.status()
-    assert told.message == "recording" and told.values["messages"] == "1" and Path(told.values["file"]).exists()
+    status = recorder.status()
+    assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
     recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
     recorder.process(frame(0, "lower"))
-    told = recorder.status()
-    assert told.level == ERROR and told.values["lost"] == "1" and "1000001 needed" in told.message
+    status = recorder.status()
+    assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
 
 
 class Late:
-    """A recorder whose disk stands still for half a second."""
+    """A recorder whose disk is blocked for half a second."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder, self.until_s = recorder, time.monotonic() + 0.5
         self.finish = recorder.finish
 
     def process(self, message: Frame) -> None:
-        """Records, some time."""
+        """Record the message after the disk is free."""
         time.sleep(max(0.0, self.until_s - time.monotonic()))
         self._recorder.process(message)
 
 
 class Seen:
-    """An end that notes when something comes."""
+    """A sink that keeps the times of its messages."""
 
     def __init__(self) -> None:
         self.times_s: list[float] = []
 
     def process(self, message: Frame) -> None:
-        """Notes it."""
+        """Keep the time."""
         self.times_s.append(time.monotonic())
 
 
-def test_record_takes_both_cameras_and_tells_what_became_of_it(tmp_path: Path) -> None:
-    heard: list[tuple[int, str]] = []
+def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
+    events: list[tuple[int, str]] = []
     now_ns = time.monotonic_ns()
     sources = {camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
                for camera in ("lower", "upper")}
     before = signal.getsignal(signal.SIGTERM)
     state = record(sources, settings(tmp_path / "log"), "version = 1",  # type: ignore[arg-type]
-                   lambda severity, text: heard.append((severity, text))).state
+                   lambda severity, text: events.append((severity, text))).state
     assert signal.getsignal(signal.SIGTERM) is before
     assert (state.messages, state.lost, state.status) == (20, 0, "closed")
-    assert "20 messages in 1 files" in heard[-1][1]
+    assert "20 messages in 1 files" in events[-1][1]
     (path,) = recorded(tmp_path / "log")
     reader = LogReader(path)
     frames = list(reader.frames())
