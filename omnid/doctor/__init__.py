@@ -1,1 +1,1 @@
-"""What `omnid doctor` looks at; every check takes plain values and gives findings."""
+"""Checks of `omnid doctor`; each takes plain values and returns findings."""

@@ -39,15 +39,15 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 class RealtimeSettings:
     """Requests to the kernel and to Python, so that deadlines hold."""
 
-    lock_memory: bool = knob(True, "nothing is swapped out; needs LimitMEMLOCK=infinity")
-    freeze_gc: bool = knob(True, "what exists at the start is never looked at again by the garbage collector")
-    switch_interval_ms: float = knob(1.0, "after so long a thread lets others into Python, ms; 0: Python's own 5 ms",
+    lock_memory: bool = knob(True, "lock all memory against swapping; needs LimitMEMLOCK=infinity")
+    freeze_gc: bool = knob(True, "exclude what exists at the start from garbage collection")
+    switch_interval_ms: float = knob(1.0, "time after which Python switches threads, ms; 0: Python's default, 5 ms",
                                      low=0, high=100)
-    motor_priority: int = knob(20, "SCHED_FIFO priority of the motor's tick, needs LimitRTPRIO; 0: none", low=0,
+    motor_priority: int = knob(20, "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none", low=0,
                                high=99)
-    capture_priority: int = knob(10, "SCHED_FIFO priority of the threads that take images; 0: none", low=0, high=99)
-    longest_run_ms: int = knob(500, "a SCHED_FIFO thread that runs for longer without a wait ends the daemon, ms; "
-                               "0: never", low=0, high=10_000)
+    capture_priority: int = knob(10, "SCHED_FIFO priority of the capture threads; 0: none", low=0, high=99)
+    longest_run_ms: int = knob(500, "longest run of a SCHED_FIFO thread without a wait, ms; beyond it the kernel "
+                               "ends the daemon; 0: no limit", low=0, high=10_000)
 
 
 def prepare(config: RealtimeSettings) -> list[str]:
