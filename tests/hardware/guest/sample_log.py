@@ -91,7 +91,7 @@ class GuestOperator:
         self.report: Diagnostics | None = None
         self.driving = False
         self._robot = Robot(timeout_s=60.0)
-        self._robot.each(self._take)
+        self._robot.on_message(self._take)
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._drive, daemon=True)
         self._thread.start()
