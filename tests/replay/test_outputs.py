@@ -21,6 +21,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.settings import parse
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.decode import decode_diagnostics, decode_map
+from omnid.transport.status_names import SUMMARY, stage_name
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
 from tests.replay.command import Command, rows
@@ -110,8 +111,8 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
                       "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 2}
-    assert last.value("omnid: summary", "poses") == last.value("omnid: stage odometry", "processed") == str(PAIRS)
-    assert float(last.value("omnid: stage stereo", "work_p50_ms")) > 0.1
+    assert last.value(SUMMARY, "poses") == last.value(stage_name("odometry"), "processed") == str(PAIRS)
+    assert float(last.value(stage_name("stereo"), "work_p50_ms")) > 0.1
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"

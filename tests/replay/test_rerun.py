@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from calib.rig_file import parse_rig, rig_toml
 from drivers.logs.mcap_reader import LogReader
 from omnid.recordings.run_series import read_run_series
+from omnid.transport.status_names import ODOMETRY, WHEELS, camera_name, stage_name
 from tests.replay.command import Command
 from tests.replay.recorded import recorded_run
 
@@ -69,7 +70,7 @@ def test_a_recording_holds_all_messages_rig_and_settings(
     assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
     assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
     parts = {status.name for message in of(messages, "/omnid/status") for status in message.content.status}
-    assert parts >= {"omnid: odometry", "omnid: wheels", "omnid: lower camera", "omnid: stage stereo"}
+    assert parts >= {ODOMETRY, WHEELS, camera_name("lower"), stage_name("stereo")}
 
 
 def test_log_times_are_the_stamps(messages: list[Message]) -> None:

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 from calib import se3
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
+from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
@@ -30,7 +31,7 @@ def states(path: Path) -> list[tuple[str, int]]:
         for schema, _, message in make_reader(file).iter_messages(["/omnid/status"]):
             status = STORE.deserialize_cdr(message.data, schema.name).status[0]
             values = {pair.key: pair.value for pair in status.values}
-            if status.name == "omnid: odometry":
+            if status.name == ODOMETRY:
                 found.append((values["state"], int(values["resets"])))
     return found
 

@@ -21,6 +21,7 @@ from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import Synchronise
+from omnid.transport.status_names import RIG
 from tests.simulation import build, write_log
 from tests.simulation.logs import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
@@ -75,7 +76,7 @@ def monitor_after(
 
 def test_a_correct_rig_is_good(true: tuple[RigMonitor, Collector]) -> None:
     status = true[0].status()
-    assert (status.name, status.level, status.message) == ("omnid: rig", 0, "good")
+    assert (status.name, status.level, status.message) == (RIG, 0, "good")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
     assert status.values["verdict"] == "good" and int(status.values["new_views"]) == len(true[1]) - VIEWS
     found, sought = int(status.values["matches"]), int(status.values["tried"])

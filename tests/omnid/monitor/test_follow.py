@@ -24,6 +24,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
 
@@ -47,7 +48,7 @@ def publish(bus: Bus, number: int) -> None:
     bus.publish("odom", odometry_at(number), PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("/tf", codec.transform_cdr(10**18, []))
     bus.publish(
-        "status", codec.diagnostics_cdr(10**18, [DiagnosticStatus("omnid: wheels", 1, "no command", {"sent": "4"})])
+        "status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 1, "no command", {"sent": "4"})])
     )
 
 
@@ -141,8 +142,8 @@ class Terminal(io.StringIO):
 def test_the_table_holds_no_control_characters_of_messages() -> None:
     state = received(1, 2)
     evil = [
-        DiagnosticStatus("omnid: wheels", 2, "\x1b[2J\nhello", {"sent": "4"}),
-        DiagnosticStatus("omnid: bus", 0, "", {}),
+        DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}),
+        DiagnosticStatus(BUS, 0, "", {}),
     ]
     state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
     terminal = Terminal()

@@ -28,6 +28,7 @@ from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.status_names import stage_name
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.omnid.viewer.rrd import need_rerun, positions, rows, verified
 from tests.omnid.viewer.test_view import START_NS, made
@@ -52,7 +53,7 @@ def publish(bus: Bus, number: int) -> None:
     bus.publish("odom", pose if number % 7 else b"nonsense",
                 PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
-    statuses = [DiagnosticStatus("omnid: stage odometry", 0, "", {"work_p50_ms": "30.5"})]
+    statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
     pixels = {"inliers": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}

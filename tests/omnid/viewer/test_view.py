@@ -16,6 +16,7 @@ from omnid.formats.tum import read_tum
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
+from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified
 from tests.replay.command import Command
@@ -101,7 +102,7 @@ def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
             stamp_ns, T = START_NS + number * 10**8, se3.transform(np.eye(3), [0.1 * number, 0.0, 0.0])
             writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA,
                          codec.odometry_cdr(stamp_ns, T, 1e-4 * np.eye(6), np.zeros(6), np.eye(6)), stamp_ns)
-            statuses = [DiagnosticStatus("omnid: odometry", 0, state, {"inliers": str(number), "tracked": "9"})]
+            statuses = [DiagnosticStatus(ODOMETRY, 0, state, {"inliers": str(number), "tracked": "9"})]
             payload = codec.diagnostics_cdr(stamp_ns, statuses)
             writer.write(f"/{robot}/status", codec.DIAGNOSTICS_SCHEMA, payload, stamp_ns)
         writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA, b"nonsense", START_NS + 10**9)
