@@ -46,10 +46,9 @@ def against_truth(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
             "coverage": m.coverage, "xy": np.round(trajectory.T[:, :2, 3], 5).tolist()}
 
 
-def draw(folder: Path, experiment: Experiment, path: Path) -> None:
-    """Draw the paths of plain KLT, of the paper and of omnid over the true one."""
-    trajectories = {name: estimate(folder, METHODS[name])[0] for name in SHOWN}
-    figures.paths({name: t.T[:, :2, 3].tolist() for name, t in trajectories.items()}, true_path(folder), path)
+def draw(values: dict[str, Any], folder: Path, path: Path) -> None:
+    """Draw the measured paths of plain KLT, of the paper and of omnid over the true one of a log."""
+    figures.paths({name: values[name]["xy"] for name in SHOWN}, true_path(folder), path)
 
 
 def true_path(folder: Path) -> list[list[float]]:

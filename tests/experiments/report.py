@@ -83,11 +83,19 @@ def draw(logs: Path, results: Path) -> None:
     if turns := measured(results, "turns", "turns", "povray"):
         rows = [row for values in turns.values() for row in values["turns"] if not row["moved"]]
         figures.turns(rows, results / "turns.png")
-    for scene, draw_scene in (("brick", wall_matching.draw), ("two_walls", path_following.draw),
-                              ("building", whole_building.draw)):
-        folders = sorted(path.parent for path in logs.glob(f"{scene}_s*/log.mcap"))
-        if folders and (folders[-1] / DESCRIPTION).exists():
-            draw_scene(folders[-1], Experiment.read(folders[-1]), results / f"{scene}.png")
+    for scene, draw_scene in (("brick", wall_matching.draw), ("building", whole_building.draw)):
+        if folder := _last_log(logs, scene):
+            draw_scene(folder, Experiment.read(folder), results / f"{scene}.png")
+    if folder := _last_log(logs, "two_walls"):
+        experiment = Experiment.read(folder)
+        values = measured(results, "paths", "two_walls", experiment.renderer)[experiment.seed]
+        path_following.draw(values, folder, results / "two_walls.png")
+
+
+def _last_log(logs: Path, scene: str) -> Path | None:
+    """Return the folder of the last seed of a scene whose log is there."""
+    folders = sorted(path.parent for path in logs.glob(f"{scene}_s*/log.mcap"))
+    return next((folder for folder in reversed(folders) if (folder / DESCRIPTION).exists()), None)
 
 
 def text(results: Path) -> str:

@@ -27,7 +27,7 @@ RENDERERS = ("povray", "ray_caster")
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """What the log of a folder was rendered from."""
+    """The origin of a rendered log: scene, seed, size, rig and renderer."""
 
     name: str
     seed: int
