@@ -74,8 +74,46 @@ each panorama and without a limit. SIFT's motion is estimated as in the paper: R
 eq. 9.
 """
 
-WALL_REMARKS = ""
-TURNS_REMARKS = ""
-PATHS_REMARKS = ""
-BUILDING_REMARKS = ""
-SPEED_REMARKS = ""
+WALL_REMARKS = """\
+- The paper's claim holds: on identical bricks 0.3 to 1.2 % of the matches of enhanced SAD are over 5 cm off, where
+  original SAD has 30 to 77 %, SIFT 11 to 75 % and Harris corners 23 to 84 %. The ratio test leaves SIFT and Harris
+  few matches and many of them wrong.
+- Brick wall 32 misleads omnid's default more than enhanced SAD: 3.3 % against 1.2 %.
+- Original SAD is helped by a check from the upper image, which the paper does not have.
+- A smooth wall is a weakness of SAD, as the paper says: it finds 87 to 133 matches a pair on 3 to 4 % of the wall.
+  They are right, because a pixel without an edge is not matched at all. SIFT and Harris corners do no better there.
+- Where the texture does not repeat, all variants of SAD are the same. SIFT and Harris corners are hardly ever
+  mismatched there by the ratio test; that 6 % and 29 % of them are over 5 cm off comes from their inexact location, 2
+  to 3 times that of SAD.
+"""
+TURNS_REMARKS = """\
+- Both searches keep nearly all features at 18 degrees, to the left and to the right: twice as many as plain KLT or
+  more, whose pyramid of four levels does better than the paper's. Beyond 70 degrees next to nothing of plain KLT is
+  left.
+- Half a step off, the search in steps of 18 degrees finds fewer features than on a step. Correlation is independent
+  of the angle and takes a few percent of the time of a far turn.
+"""
+PATHS_REMARKS = """\
+- Plain KLT loses the turn at the end: the heading is off by the whole turn. The improved KLT does not.
+- The Kalman filter changes hardly anything in either method: the covariance of a measured motion is small against
+  what the filter allows the motion to change between two pairs, so it follows each measurement.
+- Bearings in place of eq. 9 bring most of the gain. omnid's lengths come out 0.02 to 0.05 % too short; the cause has
+  not been found.
+"""
+BUILDING_REMARKS = """\
+- On the building of seed 47, which nothing was set on, the map is as good as on building 11: 18.5 mm RMS and 0.5 % of
+  its points over 5 cm off, against 19.0 mm and 0.4 %. So the rule of `mapping.min_frames` is not bound to building
+  11.
+- Without the Kalman filter omnid's path around building 47 is as exact as with it, or a little more: the prediction
+  decides only where the search starts. 1 to 3 mm between the two is the effect of other landmarks having been
+  tracked.
+"""
+SPEED_REMARKS = """\
+- omnid's time for depth and motion includes everything: prediction, tracking, RANSAC, Gauss-Newton, refinement by
+  patches and the upkeep of the keyframes. Tracking alone is about half of the motion's time.
+- Limiting SIFT to 500 features saves little, for it must build its scale space all the same. Nearly all of its time
+  is detection and description. SIFT's points are also fewer and less exact than those of stereo, see the walls above.
+- The machine was heavily loaded by other work during this measurement (load 20 and more on 2 cores), which inflates
+  processor times too, those of stereo most, for they depend on cache and memory. The ratios are therefore not exact.
+  On another, calm machine the depth alone took 40 ms with the semi-global prior and 65 ms with enhanced SAD.
+"""

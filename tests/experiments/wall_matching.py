@@ -119,8 +119,12 @@ def _errors(run: SimulatedRun, pairs: list[WallMatches], *, is_dense: bool) -> d
     error_m = np.concatenate([p.points[:, 0] for p in pairs]) - WALL_M
     right = np.abs(error_m) <= WRONG_M
     values = {"matches": len(error_m) / len(pairs), "right": float(right.sum()) / len(pairs),
-              "wrong": _share(~right), "mismatched": _share(np.abs(error_m) > MISMATCHED_M), "rms_m": _rms(error_m),
-              "rms_of_right_m": _rms(error_m[right]), "coverage": _coverage(run, pairs)}
+              "wrong": _share(~right), "mismatched": _share(np.abs(error_m) > MISMATCHED_M),
+              "coverage": _coverage(run, pairs)}
+    if len(error_m):
+        values["rms_m"] = _rms(error_m)
+    if right.any():
+        values["rms_of_right_m"] = _rms(error_m[right])
     edges = sum(p.edges for p in pairs)
     if is_dense and edges:
         values["completeness"] = float(right.sum() / edges)
@@ -132,7 +136,7 @@ def _share(flags: Flags) -> float:
 
 
 def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _coverage(run: SimulatedRun, pairs: list[WallMatches]) -> float:
