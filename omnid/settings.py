@@ -1,4 +1,4 @@
-"""Frozen dataclasses from strict TOML and back: a key that nobody reads is an error, not a surprise.
+"""Frozen dataclasses from strict TOML and back: an unknown key is an error that names its dotted path.
 
     @dataclass(frozen=True, slots=True)
     class Stereo:
@@ -32,7 +32,7 @@ from omnid.errors import OmnidError
 T = TypeVar("T")
 _Path: TypeAlias = tuple[str, ...]
 _MAX_BYTES: Final = 1 << 20
-_SHOWN: Final = 60  # characters of a foreign value in a message
+_SHOWN: Final = 60  # characters of a value in a message
 _MISFIT: Final = object()
 _KINDS: Final[dict[Any, tuple[str, str]]] = {
     bool: ("true or false", "booleans"),
@@ -44,7 +44,7 @@ _KINDS: Final[dict[Any, tuple[str, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """What a setting is and which values it takes; in a tuple, each element."""
+    """Description and range of a setting; for a tuple, of each element."""
 
     doc: str
     low: float | None  # inclusive, as is high
@@ -53,7 +53,7 @@ class Knob:
     finite: bool
 
     def allows(self, value: Any) -> bool:
-        """Whether a value of the right type is in range."""
+        """True if a value of the right type is in range."""
         if isinstance(value, float) and not math.isfinite(value):
             return not self.finite
         if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
@@ -64,7 +64,7 @@ class Knob:
 
     @property
     def bounds(self) -> str:
-        """The range in words, with a leading blank; empty where all values are taken."""
+        """The range in words, with a leading blank; empty where all values are allowed."""
         if self.choices:
             return ", one of " + ", ".join(repr(choice) for choice in self.choices)
         if self.low is None:
@@ -81,13 +81,13 @@ def knob(
     choices: Sequence[Any] = (),
     finite: bool = True,
 ) -> T:
-    """A dataclass field: its default, what it is with its unit, the values it takes (`finite=False`: also inf, nan)."""
+    """Declare a field: its default, a description with its unit, its range (`finite=False`: also inf, nan)."""
     return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
 
 
 @dataclass(frozen=True, slots=True)
 class _Keys:
-    """The keys that exist and those that existed once: words the errors for all others."""
+    """The keys that exist and those of earlier versions: makes the errors for all others."""
 
     known: tuple[_Path, ...]
     renamed: Mapping[str, str]
@@ -153,7 +153,7 @@ def parse(
 
 
 def dump(settings: object) -> str:
-    """Commented TOML with every knob, what it is, its range and its default; `load` gives the same object again."""
+    """Return commented TOML with the description, range and default of every knob; `load` reads the same object."""
     return "\n".join(_dumped(settings, type(settings)(), ())).strip("\n") + "\n"
 
 
@@ -188,7 +188,7 @@ def _table_of(data: bytes) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode())
     except UnicodeDecodeError as error:
-        raise OmnidError(f"expected TOML in UTF-8, found a foreign byte at offset {error.start}") from None
+        raise OmnidError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
     except (ValueError, RecursionError) as error:
         raise OmnidError(f"expected TOML, found: {' '.join(str(error).split())}") from None
 
@@ -263,7 +263,7 @@ def _checked(kind: Any, entry: Knob, value: object, path: _Path) -> object:
 
 
 def _fitted(kind: Any, entry: Knob, value: Any) -> object:
-    """The value as the knob's type, or _MISFIT. A bool is no int; an int will do for a float."""
+    """Return the value as the knob's type, or _MISFIT. A bool is no int; an int is allowed for a float."""
     if get_origin(kind) is tuple:
         return _fitted_tuple(get_args(kind), entry, value)
     if kind is float and type(value) is int and abs(value) < 1 << 1023:
@@ -296,7 +296,7 @@ def _first_leaf(value: object, path: _Path) -> _Path:
 
 
 def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:
-    """The paths of all knobs."""
+    """Yield the paths of all knobs."""
     for entry, kind in _entries(cls):
         here = (*path, entry.name)
         if is_dataclass(kind):
@@ -325,7 +325,7 @@ def _described(kind: Any, entry: Knob) -> str:
 
 
 def _shown(value: object) -> str:
-    """A foreign value on one short line."""
+    """Return a value from a file on one short line."""
     if isinstance(value, dict):
         return "a section"
     try:

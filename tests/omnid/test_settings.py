@@ -1,4 +1,4 @@
-"""Settings: every value is checked, every fault is named by its dotted path, a dump reads back as the same object."""
+"""Settings: every value is checked, every error names the dotted path, a dump reads back as the same object."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def refusal(text: str | bytes, *overrides: str) -> str:
     return str(caught.value)
 
 
-def test_without_a_file_the_defaults_hold() -> None:
+def test_returns_the_defaults_without_a_file() -> None:
     assert load(Config) == Config()
 
 
@@ -82,7 +82,7 @@ def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[st
     assert load(Config, written(tmp_path, dump(settings))) == settings
 
 
-def test_a_dump_tells_every_knob_its_range_and_its_default() -> None:
+def test_dumps_every_knob_with_its_range_and_its_default() -> None:
     text = dump(load(Config, None, ["stereo.window_px=5"]))
     lines = "# side of the matching window, px\n# an integer from 3 to 31; default 11\nwindow_px = 5\n"
     assert f"[stereo]\n{lines}" in text
@@ -96,7 +96,7 @@ def test_a_dump_tells_every_knob_its_range_and_its_default() -> None:
     ("override", "value"),
     [("robot=seven", "seven"), ("robot=7", "7"), ("robot='7'", "7"), ("robot=true", "true"), ("robot=a=b", "a=b")],
 )
-def test_a_string_may_come_bare_in_an_override(override: str, value: str) -> None:
+def test_takes_a_string_without_quotes_in_an_override(override: str, value: str) -> None:
     assert load(Config, None, [override]).robot == value
 
 
@@ -106,7 +106,7 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
         ("window_px = 5", "unknown key window_px: did you mean stereo.window_px?"),
@@ -140,18 +140,18 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path)
         (f"topics = {'[' * 20_000}", "expected TOML, found: "),
         ("stereo.window_px 5", "expected TOML, found: "),
         ("robot = 1\nrobot = 2", "expected TOML, found: "),
-        (b"robot = '\xff'", "expected TOML in UTF-8, found a foreign byte at offset 9"),
+        (b"robot = '\xff'", "expected TOML in UTF-8, found another byte at offset 9"),
         (bytes(range(256)), "omnid.toml: expected TOML"),
     ],
 )
-def test_what_is_not_as_declared_is_refused_by_name(text: str | bytes, said: str) -> None:
+def test_refuses_values_that_are_not_as_declared(text: str | bytes, expected: str) -> None:
     message = refusal(text)
     assert message.startswith("omnid.toml: ")
-    assert said in message
+    assert expected in message
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "expected"),
     [
         ("stereo.window_px", "expected section.key=value, found no '='"),
         ("stereo=5", "stereo is a section: name one of its keys, such as stereo.window_px"),
@@ -164,10 +164,10 @@ def test_what_is_not_as_declared_is_refused_by_name(text: str | bytes, said: str
         ("robot=a\udcff", "robot: expected a string, found 'a\\udcff'"),
     ],
 )
-def test_a_wrong_override_is_refused_by_name(override: str, said: str) -> None:
+def test_refuses_a_wrong_override(override: str, expected: str) -> None:
     message = refusal("", override)
     assert message.startswith("override ")
-    assert said in message
+    assert expected in message
 
 
 RENAMED = {
@@ -208,11 +208,11 @@ def test_refuses_an_empty_section_of_an_earlier_version() -> None:
         parse(Config, b"[wheels]", origin="omnid.toml", renamed=RENAMED)
 
 
-def test_an_override_below_a_value_of_the_file_is_refused() -> None:
+def test_refuses_an_override_below_a_value_of_the_file() -> None:
     assert "stereo: expected a section, found 5" in refusal("stereo = 5", "stereo.window_px=5")
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (1 << 20) + b"#")):
         with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):
             load(Config, path)
@@ -223,6 +223,6 @@ class Bare:
     speed_mps: float = 1.0
 
 
-def test_a_field_that_is_no_knob_is_a_mistake_of_the_programmer() -> None:
+def test_raises_a_type_error_for_a_field_that_is_no_knob() -> None:
     with pytest.raises(TypeError, match="speed_mps"):
         load(Bare)
