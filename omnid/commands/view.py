@@ -68,7 +68,8 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
 
     from omnid.viewer.view import Log, show_log
 
-    log = Log(args.log, args.robot, args.topic, args.replay, args.rig, (args.lower, args.upper), args.config)
+    log = Log(args.log, robot=args.robot, topic=args.topic, replay=args.replay, rig=args.rig,
+              topics=(args.lower, args.upper), settings=args.config)
     return show_log(log, config, place, partial(replay_and_print, quiet=args.quiet))
 
 

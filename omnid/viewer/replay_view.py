@@ -61,7 +61,8 @@ class ReplayView:
 
 def pose_of(odometry: OdometryUpdate, geometry: Geometry) -> Pose:
     """Return the pose of the base, as subscribers of the bus receive it."""
-    attachment = PoseAttachment(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks)
+    attachment = PoseAttachment(odometry.seq, odometry.state, resets=odometry.reset_counter, inliers=odometry.inliers,
+                                tracked=odometry.tracks)
     return Pose(odometry.stamp_ns, *of_base(odometry, geometry.rig.T_base_rig), attachment, odometry.stamp_ns)
 
 
