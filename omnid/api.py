@@ -6,6 +6,7 @@ import operator
 import signal
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -19,7 +20,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from omnid.config import Config, load_config
+from omnid.config import Config, load_config, unused_settings
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -50,7 +51,7 @@ def replay(
     log: an MCAP file, or the folder of `ros2 bag record -s mcap`. rig: a rig.toml or a Rig; None: the one attached to
     the log. config: a TOML file or a Config; None: the defaults. overrides: settings such as "stereo.min_range_m=0.5"
     over those of the file. method: odometry.method. lower, upper: topics of the images; None: those of the rig, else
-    by their names.
+    by their names. A motor.port of the configuration is driven as by `omnid replay`.
 
     All poses and the map stay in memory (see PoseCollector: about 50 MB an hour at 30 Hz). Ctrl-C ends the run and
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
@@ -58,18 +59,21 @@ def replay(
     """
     settings = [*overrides, *([f"odometry.method={method}"] if method else [])]
     with _user_errors():
+        loaded = _config(config, settings)
+        ignored = unused_settings(loaded, "replay", settings)
         options = ReplayOptions(rig=rig if rig is None or isinstance(rig, Rig) else Path(rig), topics=(lower, upper),
                                 collect=True)
-        result = run_log(Path(log), _config(config, settings), options)
+        result = run_log(Path(log), loaded, options)
     if result.signal:
         signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
-    return result
+    return replace(result, warnings=(*ignored, *result.warnings))
 
 
 class Odometry:
     """Odometry of image pairs at hand, one call a pair, in the caller's thread.
 
-    The poses are the same, to the last bit, as those of a replay of the same images.
+    The poses are the same, to the last bit, as those of a replay of the same images. The settings of the stages apply;
+    those of threads, bus, motor and recording do not.
     """
 
     def __init__(

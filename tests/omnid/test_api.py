@@ -191,6 +191,14 @@ def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path) 
     assert not (tmp_path / "a").exists()
 
 
+def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "omnid.toml").write_text("[live]\nstatus_s = 2.0\n")
+    found = omnid.replay(scene / "log.mcap", scene / "rig.toml", config=tmp_path / "omnid.toml")
+    assert len(found.warnings) == 1 and "live.status_s" in found.warnings[0]
+    with pytest.raises(OmnidError, match=r"live\.status_s"):
+        omnid.replay(scene / "log.mcap", scene / "rig.toml", overrides=["live.status_s=2.0"])
+
+
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, result: omnid.RunResult) -> None:
     for save in (result.save_tum, result.save_ply):
         with pytest.raises(OmnidError, match="absent"):
