@@ -16,18 +16,17 @@ from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.mcap_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.input_warnings import input_warnings
-from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
-from omnid.diagnostics.status import stage_status, summary_status
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.realtime import RealtimeSettings
-from omnid.engine.telemetry import SummaryRow, Telemetry
+from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate
 from omnid.runs.log_rig import attached_rig
-from omnid.runs.pipeline import Sinks, WiredStages, wire
+from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import Session
 from omnid.settings import dump
@@ -39,11 +38,8 @@ from omnid.sinks.pose_collector import PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.codec import DiagnosticStatus
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
-READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
-BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 
 
@@ -116,7 +112,7 @@ class _Replay:
             pairing = Synchronise(geometry.rig, self._config.pair)
             pairs = graph.stage("pair", pairing, self._frames(graph, reader))
             stages = wire(graph, pairs, geometry, self._config, sinks)
-            result = _Results(session, reader, pairing, stages)
+            result = RunReport(session, reader, pairing, stages)
             if isinstance(sinks.recorder, Recorder):
                 sinks.recorder.final_status = result.final_status
             self._add_progress(session, reader)
@@ -211,7 +207,7 @@ class _Replay:
         if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread
             raise KeyboardInterrupt
 
-    def _result(self, session: Session, results: _Results) -> RunResult:
+    def _result(self, session: Session, results: RunReport) -> RunResult:
         counters = results.counters(session.statistics)
         if self._drive is not None:
             counters = replace(counters, motor=self._drive.counts())
@@ -227,44 +223,6 @@ class _Replay:
             None if newest is None else newest.points,
             session.signal,
         )
-
-
-class _Results:
-    """Counters, timings and warnings of a wired run, from its parts."""
-
-    def __init__(self, session: Session, reader: LogReader, pairing: Synchronise, stages: WiredStages) -> None:
-        self._session, self._reader, self._pairing, self._stages = session, reader, pairing, stages
-
-    def counters(self, statistics: RunStatistics) -> RunCounters:
-        """Return the counters of the run with the given statistics."""
-        counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
-        mapping = self._stages.mapping
-        return counters if mapping is None else replace(counters, map=mapping.counts)
-
-    def timings(self) -> dict[str, SummaryRow]:
-        """Return the times of the stages."""
-        rows = self._session.graph.telemetry.summary()
-        return {row.stage: row for row in rows if row.stage not in BOOKKEEPING}
-
-    def warnings(self) -> Iterator[str]:
-        """Return warnings about the log and the images."""
-        yield from self._reader.warnings
-        statistics = self._session.statistics
-        if statistics.poses or not self._session.signal:
-            yield from input_warnings(self._pairing, self._stages.stereo, statistics, self._session.config.pair)
-
-    def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
-        """Return the counters of the run and of its stages, for the log."""
-        stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        return [summary_status(self.counters(statistics)), *map(stage_status, stages)]
-
-    def _drops(self) -> dict[str, int]:
-        """Return all that was lost, by reason; zeros too."""
-        drops = {name: self._reader.counts[name] for name in READER_DROPS}
-        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith("unpaired")}
-        drops["broken"] += self._pairing.counts["broken"]
-        drops["queue"] = self._session.dropped_messages()
-        return drops
 
 
 @contextmanager

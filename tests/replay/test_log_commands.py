@@ -161,8 +161,8 @@ def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:
         path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
         out.unlink(missing_ok=True)
         for words in (("info", path), ("recover", path, "-o", out)):
-            code, said, err = omnid("log", *words)
+            code, stdout, err = omnid("log", *words)
             assert code in (0, 1, 2) and err.count("\n") == (code == 2)
-            assert all(line.isprintable() for line in (said + err).splitlines())
+            assert all(line.isprintable() for line in (stdout + err).splitlines())
             codes.add((words[0], code))
     assert codes >= {("info", 0), ("info", 1), ("recover", 0), ("recover", 2)}

@@ -1,4 +1,4 @@
-"""Replays as processes: stopped by signals, received over the bus, driving a motor on a pty."""
+"""Replays as processes: stopped by signals, poses over the bus, driving a motor on a pty."""
 
 from __future__ import annotations
 
@@ -72,20 +72,20 @@ def test_signals_leave_whole_results(tmp_path: Path, scene: Path, manner: list[s
 
 def test_another_process_receives_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
     endpoint = f"tcp/127.0.0.1:{unused_tcp_port}"
-    heard: list[OdometryRecord] = []
+    poses: list[OdometryRecord] = []
     config = zenoh.Config()
     for key, value in (("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false")):
         config.insert_json5(key, value)
     tum = tmp_path / "est.txt"
     with zenoh.open(config) as session:
-        session.declare_subscriber("rover/odom", lambda sample: heard.append(odometry_from_cdr(bytes(sample.payload))))
+        session.declare_subscriber("rover/odom", lambda sample: poses.append(odometry_from_cdr(bytes(sample.payload))))
         settings = ("--set", "bus.robot=rover", "--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
         with started(replaying(scene, "--publish", "--realtime", "--quiet", "--tum", tum, *settings)) as process:
             _, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, err
-        wait_until(lambda: len(heard) >= PAIRS // 2)
+        wait_until(lambda: len(poses) >= PAIRS // 2)
     truth = {int(stamp): T for stamp, T in zip(read_tum(tum).stamps_ns, read_tum(tum).T, strict=True)}
-    for record in heard:
+    for record in poses:
         np.testing.assert_allclose(record.T_odom_base, truth[record.stamp_ns], atol=1e-8)
 
 

@@ -23,7 +23,7 @@ SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, scene: Path) -> None:
     with robot(scene, tmp_path) as (daemon, operator, base):
         time.sleep(0.5)
-        assert not base.line.moved_since(0.0), "nobody has asked"
+        assert not base.line.moved_since(0.0), "no command yet"
         operator.drive(0.3)
         wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
         operator.stop_sending()
@@ -31,7 +31,7 @@ def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, s
         stopped_s = time.monotonic()
         count = len(operator.poses)
         wait_until(lambda: len(operator.poses) > count + 5, "more poses")
-        assert not base.line.moved_since(stopped_s), "nobody has asked again"
+        assert not base.line.moved_since(stopped_s), "no new command"
         wait_until(lambda: operator.message("wheels") == "no command", "the word that no command comes")
         operator.drive(0.3)
         wait_until(lambda: base.drives, "motion again")

@@ -1,0 +1,58 @@
+"""The counters, timings and warnings of a run over a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+from drivers.logs.mcap_reader import LogReader
+from omnid.diagnostics.input_warnings import input_warnings
+from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
+from omnid.diagnostics.status import stage_status, summary_status
+from omnid.engine.telemetry import SummaryRow
+from omnid.runs.pipeline import WiredStages
+from omnid.runs.session import Session
+from omnid.stages.synchronise import Synchronise
+from omnid.transport.codec import DiagnosticStatus
+
+READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
+BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
+
+
+class RunReport:
+    """Counters, timings, warnings and final status of a run over a log, read from its parts."""
+
+    def __init__(self, session: Session, reader: LogReader, pairing: Synchronise, stages: WiredStages) -> None:
+        self._session, self._reader, self._pairing, self._stages = session, reader, pairing, stages
+
+    def counters(self, statistics: RunStatistics) -> RunCounters:
+        """Return the counters of the run with the given statistics."""
+        counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
+        mapping = self._stages.mapping
+        return counters if mapping is None else replace(counters, map=mapping.counts)
+
+    def timings(self) -> dict[str, SummaryRow]:
+        """Return the times of the stages."""
+        rows = self._session.graph.telemetry.summary()
+        return {row.stage: row for row in rows if row.stage not in BOOKKEEPING}
+
+    def warnings(self) -> Iterator[str]:
+        """Return warnings about the log and the images."""
+        yield from self._reader.warnings
+        statistics = self._session.statistics
+        if statistics.poses or not self._session.signal:
+            yield from input_warnings(self._pairing, self._stages.stereo, statistics, self._session.config.pair)
+
+    def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
+        """Return the counters of the run and of its stages, for the log."""
+        stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
+        return [summary_status(self.counters(statistics)), *map(stage_status, stages)]
+
+    def _drops(self) -> dict[str, int]:
+        """Return all that was lost, by reason; zeros too."""
+        drops = {name: self._reader.counts[name] for name in READER_DROPS}
+        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith("unpaired")}
+        drops["broken"] += self._pairing.counts["broken"]
+        drops["queue"] = self._session.dropped_messages()
+        return drops
