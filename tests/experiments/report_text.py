@@ -6,10 +6,11 @@ HEAD = """# The paper's experiments and their results
 Dang, Ly, Nguyen 2012, section V: the scenes of this folder with parabolic mirrors under orthographic cameras, noise,
 blur and JPEG, 768 px. Each number is the median of all seeds, with the smallest and the largest in brackets.
 ```
-for name in brick control smooth turns; do
+for name in brick control smooth; do
     python -m tests.experiments render $name --seed 31 32 33 --out LOGS
 done
-python -m tests.experiments render two_walls --renderer ray_caster --seed 31 32 33 --out LOGS
+python -m tests.experiments render turns --seed 31 32 --out LOGS
+python -m tests.experiments render two_walls --renderer ray_caster --seed 31 32 --out LOGS
 python -m tests.experiments render building --renderer ray_caster --seed 47 --out LOGS
 OPENBLAS_NUM_THREADS=1 python -m tests.experiments report LOGS
 ```
@@ -104,16 +105,15 @@ BUILDING_REMARKS = """\
 - On the building of seed 47, which nothing was set on, the map is as good as on building 11: 18.5 mm RMS and 0.5 % of
   its points over 5 cm off, against 19.0 mm and 0.4 %. So the rule of `mapping.min_frames` is not bound to building
   11.
-- Without the Kalman filter omnid's path around building 47 is as exact as with it, or a little more: the prediction
-  decides only where the search starts. 1 to 3 mm between the two is the effect of other landmarks having been
-  tracked.
+- Without the Kalman filter omnid's path around building 47 is as exact as with it, or a little more; the paper's is the
+  same to 0.1 mm. In omnid's method the prediction decides only where the search starts.
 """
 SPEED_REMARKS = """\
 - omnid's time for depth and motion includes everything: prediction, tracking, RANSAC, Gauss-Newton, refinement by
   patches and the upkeep of the keyframes. Tracking alone is about half of the motion's time.
 - Limiting SIFT to 500 features saves little, for it must build its scale space all the same. Nearly all of its time
   is detection and description. SIFT's points are also fewer and less exact than those of stereo, see the walls above.
-- The machine was heavily loaded by other work during this measurement (load 20 and more on 2 cores), which inflates
+- The machine was heavily loaded by other work during this measurement (load 10 to 20 on 2 cores), which inflates
   processor times too, those of stereo most, for they depend on cache and memory. The ratios are therefore not exact.
   On another, calm machine the depth alone took 40 ms with the semi-global prior and 65 ms with enhanced SAD.
 """
