@@ -111,9 +111,11 @@ BUILDING_REMARKS = """\
 SPEED_REMARKS = """\
 - omnid's time for depth and motion includes everything: prediction, tracking, RANSAC, Gauss-Newton, refinement by
   patches and the upkeep of the keyframes. Tracking alone is about half of the motion's time.
-- Limiting SIFT to 500 features saves little, for it must build its scale space all the same. Nearly all of its time
-  is detection and description. SIFT's points are also fewer and less exact than those of stereo, see the walls above.
-- The machine was heavily loaded by other work during this measurement (load 10 to 20 on 2 cores), which inflates
-  processor times too, those of stereo most, for they depend on cache and memory. The ratios are therefore not exact.
-  On another, calm machine the depth alone took 40 ms with the semi-global prior and 65 ms with enhanced SAD.
+- SIFT takes 1.6 to 2.4 times as long with 500 features, and 1.7 to 5 times without a limit, depending on how many
+  features it finds (two runs on both logs). Limiting it saves little of the detection and description, for it must
+  build its scale space all the same. SIFT's points are also fewer and less exact than those of stereo, see the walls
+  above.
+- The machine was loaded by other work during this measurement (load 5 to 10 on 2 cores), which inflates processor
+  times too, those of stereo most, for they depend on cache and memory. On another, calm machine the depth alone took
+  40 ms with the semi-global prior and 65 ms with enhanced SAD.
 """
