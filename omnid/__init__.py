@@ -14,6 +14,8 @@ The geometry (camera models, rigs, panoramas) is the package `calib`, a client o
 
 from typing import TYPE_CHECKING
 
+from omnid.version import __version__
+
 if TYPE_CHECKING:
     from omnid.api import Odometry, replay
     from omnid.config import Config, load_config
@@ -24,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Config", "Odometry", "OdometryUpdate", "OmnidError", "RunResult", "TrackingState", "__version__",
            "load_config", "replay"]
-__version__ = "0.1.0"
-
 _MODULES = {"Config": "config", "Odometry": "api", "OdometryUpdate": "messages", "OmnidError": "errors",
             "RunResult": "runs.run_result", "TrackingState": "tracking_state", "load_config": "config", "replay": "api"}
 

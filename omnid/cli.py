@@ -11,7 +11,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
-from omnid import __version__
+from omnid.version import __version__
 
 COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "report", "log",
             "diff", "doctor", "config")

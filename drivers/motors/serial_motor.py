@@ -15,9 +15,9 @@ import serial  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import MotorProtocol, T, Transaction
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
+from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
 
 CONNECT_TRY_S: Final = 0.2
 STOPS_AT_CLOSE: Final = 3  # tries

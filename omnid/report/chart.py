@@ -110,10 +110,10 @@ def chart(
               for style, drawn in styled for piece in pieces(drawn.points)]
     keys = "".join(key(style, drawn.name) for style, drawn in styled if drawn.name)
     caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''} {keys}"
-    remark = f"<small>{escape(note)}</small>" if note else ""
+    footnote = f"<small>{escape(note)}</small>" if note else ""
     image = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *curves])
     return (f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
-            f"aria-label='{escape(title)}'>{image}</svg>{remark}</figure>")
+            f"aria-label='{escape(title)}'>{image}</svg>{footnote}</figure>")
 
 
 def _grid(x: Axis, y: Axis) -> Iterator[str]:

@@ -65,8 +65,8 @@ def _stage_table(statuses: StatusHistory) -> str:
              *(rounded(values.get(time_key(WORK, statistic), "")) for statistic in ("p50", "p99", "max")))
             for name, values in statuses.stages()]
     head = ("stage", "messages", "per second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
-    remark = "<small>At the last report. The work of a camera's stage is its wait for the next image.</small>"
-    return f"<div class='scroll'>{table(head, rows)}</div>{remark}" if rows else ""
+    footnote = "<small>At the last report. The work of a camera's stage is its wait for the next image.</small>"
+    return f"<div class='scroll'>{table(head, rows)}</div>{footnote}" if rows else ""
 
 
 def _lost(values: Mapping[str, str]) -> str:

@@ -69,8 +69,8 @@ def plan_figure(plan: Plan, clock: Clock) -> str:
              *(_cross(*sheet.px(*position)) for position in plan.lost), *_ends(sheet, plan.corners)]
     box = f"0 0 {coord(width + _MARGIN[0] + _MARGIN[2])} {coord(height + _MARGIN[1] + _MARGIN[3])}"
     return (f"<figure class='plan'><figcaption><b>Path and map</b> {_keys(plan)}</figcaption><svg viewBox='{box}' "
-            f"role='img' aria-label='Path and map'>{''.join(parts)}</svg><small>{_remark(plan, len(points_xy))}</small>"
-            "</figure>")
+            f"role='img' aria-label='Path and map'>{''.join(parts)}</svg>"
+            f"<small>{_footnote(plan, len(points_xy))}</small></figure>")
 
 
 def _keys(plan: Plan) -> str:
@@ -82,7 +82,7 @@ def _keys(plan: Plan) -> str:
     return "".join([*shown, *([key("class='pt'", "the true path")] if plan.truth else [])])
 
 
-def _remark(plan: Plan, drawn: int) -> str:
+def _footnote(plan: Plan, drawn: int) -> str:
     if not len(plan.points):
         return "The log holds no map that can be drawn."
     low, high = Z_M

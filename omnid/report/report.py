@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 
 from drivers.logs.mcap_info import LogState
-from omnid import __version__
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory
 from omnid.report import chart, health, plan, sections, setup, svg
@@ -22,6 +21,7 @@ from omnid.report.poses import MAX_KEPT
 from omnid.report.report_data import ReportData
 from omnid.report.timeline import timeline
 from omnid.report.truth_comparison import TruthComparison, compare_with_truth
+from omnid.version import __version__
 
 _MOST_CROSSES: Final = 40
 _MAX_BEFORE_S: Final = 30.0  # time before the first pose that is shown, where there are events in it

@@ -147,8 +147,8 @@ def truth(comparison: TruthComparison, clock: Clock) -> list[str]:
     position = [(t, 1e3 * error_m) for t, error_m in comparison.position_m.points()]
     figures = [chart("Error of the position", [ChartLine("", position)], clock, unit="mm", zero=True),
                chart("Error of the heading, to the left", [ChartLine("", heading)], clock, unit="deg", zero=True)]
-    remark = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
-    return ["<h2>Against the truth</h2>", facts(rows), remark, grid(figures)]
+    footnote = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
+    return ["<h2>Against the truth</h2>", facts(rows), footnote, grid(figures)]
 
 
 def _mm(metres: float) -> str:

@@ -12,6 +12,7 @@ from omnid.config import OdometryConfig
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.relocalisation import Relocaliser
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.geometry import Geometry
 
@@ -77,7 +78,7 @@ def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, 
 def _method(geometry: Geometry, config: OdometryConfig) -> OdometryMethod:
     model = geometry.model(config.noise_px)
     if config.method == "default":
-        return VisualOdometry(model, config.klt, config.limits)
+        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model))
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

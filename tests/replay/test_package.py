@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from drivers.logs.mcap_reader import LogReader
-from omnid import __version__
+from omnid.version import __version__
 from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[2]

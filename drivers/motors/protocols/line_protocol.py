@@ -39,8 +39,8 @@ from dataclasses import dataclass, replace
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Transaction, request, require_watchdog
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import MotorProtocol
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
+from drivers.motors.protocols.motor_protocol import MotorProtocol
 from drivers.motors.protocols.odrive_ascii import ODriveAscii
 from drivers.motors.protocols.roboteq import MIXED, POWER, Roboteq
 from drivers.motors.protocols.ros_arduino_bridge import RosArduinoBridge

@@ -21,8 +21,8 @@ from collections.abc import Sequence
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
 RPM, POWER, MIXED = "rpm", "power", "mixed"
 FULL = 1000  # full scale of "!G"

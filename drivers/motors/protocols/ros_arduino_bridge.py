@@ -17,8 +17,8 @@ import re
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer, Transaction
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction
 
 AUTO_STOP_MS = 2000  # ROSArduinoBridge.ino: AUTO_STOP_INTERVAL
 LOOP_S = 0.033  # ROSArduinoBridge.ino: PID_RATE 30 Hz, PID_INTERVAL = 1000 / 30 ms in whole ms

@@ -19,8 +19,8 @@ import json
 import math
 
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer, Transaction, request
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request
 
 SPEED, FEEDBACK, STREAM, HEARTBEAT, INTERVAL, ECHO, BASE_INFO = 1, 130, 131, 136, 142, 143, 1001  # json_cmd.h
 MAX_WHEEL_MPS = 2.0  # movtion_module.h

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.roboteq import MIXED, POWER
 from drivers.motors.simulated.simulated_arduino import SimulatedArduino
 from drivers.motors.simulated.simulated_line import SimulatedLine

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
 _AUTO_STOP_MS, _LOOP_S = 2000, 0.033

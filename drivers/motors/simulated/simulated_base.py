@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Framer
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import Framer
 
 STEP_S = 0.005  # of the integration
 LONGEST_ADVANCE_S = 60.0

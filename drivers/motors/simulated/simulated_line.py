@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
     LineFramer,

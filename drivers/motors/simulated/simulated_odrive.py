@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.simulated.simulated_base import SIDES, SimulatedBase, reply_to
 
 _FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"

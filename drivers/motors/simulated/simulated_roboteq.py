@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.protocols.roboteq import FULL, MIXED, RPM, S_PER_MIN
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import S_PER_MIN, PacketFramer
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 

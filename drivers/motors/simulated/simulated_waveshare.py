@@ -6,8 +6,8 @@ import json
 import math
 from typing import Any
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import TextFramer
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.protocols.waveshare_json import (
     BASE_INFO,
     ECHO,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,6 @@ from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
 from omnid.core.odometry.yaw_search import correlation_peaks, steps
-from omnid.core.places.relocalisation import Relocaliser
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -41,17 +41,31 @@ TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a fra
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
+class KeyframeLocaliser(Protocol):
+    """A bounded store of keyframes that gives the pose of a frame among them; see core/places."""
+
+    def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
+        """Keep a keyframe and its frame."""
+
+    def clear(self) -> None:
+        """Drop all keyframes."""
+
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
+        """Return the pose of a frame among the keyframes; None if it fits none."""
+
+
 class VisualOdometry:
     """Estimate the pose of the rectified frame; odom is the rectified frame of the first pair."""
 
-    def __init__(self, model: StereoModel, klt: KltSettings, limits: OdometryLimits) -> None:
+    def __init__(self, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
+                 relocaliser: KeyframeLocaliser) -> None:
         self._limits = limits
         self._stereo_klt = replace(klt, levels=1)
         self._map = LocalMap(model, klt, limits.keyframes)
         self._frame_to_map = FrameToMap(self._map, model, klt)
         self._filter = MotionFilter()
         self._static_mask = StaticMask()
-        self._relocaliser = Relocaliser(model)
+        self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()

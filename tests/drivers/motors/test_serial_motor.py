@@ -15,8 +15,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import T, Transaction
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
     LineProtocol,
     StatusMessage,
@@ -26,6 +25,7 @@ from drivers.motors.protocols.line_protocol import (
     decode,
     encode,
 )
+from drivers.motors.protocols.motor_protocol import T, Transaction
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.motors.motor_protocol import T, Transaction
+from drivers.motors.protocols.motor_protocol import T, Transaction
 
 
 class UnfinishedError(Exception):

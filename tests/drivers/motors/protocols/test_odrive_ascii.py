@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand, stop_command
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.odrive_ascii import ODriveAscii, with_checksum
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.ros_arduino_bridge import RosArduinoBridge
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from drivers.motor import VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.waveshare_json import WaveshareJson
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 

@@ -12,8 +12,10 @@ from calib import se3
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
+from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.places.relocalisation import Relocaliser
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor
@@ -41,9 +43,14 @@ def run(odometry: VisualOdometry, frames: list[StereoFrame], first: bool = True)
     return [odometry.process(frame, 0.0 if first and k == 0 else PERIOD_S) for k, frame in enumerate(frames)]
 
 
+def visual_odometry(model: StereoModel, limits: OdometryLimits) -> VisualOdometry:
+    """Return the odometry as the stage builds it."""
+    return VisualOdometry(model, KltSettings(), limits, Relocaliser(model))
+
+
 @pytest.fixture
 def odometry(cameras: RenderedCameras) -> VisualOdometry:
-    return VisualOdometry(cameras.model, KltSettings(), OdometryLimits())
+    return visual_odometry(cameras.model, OdometryLimits())
 
 
 def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
@@ -59,7 +66,7 @@ def test_with_one_keyframe_every_frame_is_measured_against_the_previous_one(
 ) -> None:
     traces = {}
     for keyframes in (1, 8):
-        estimates = run(VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=keyframes)), frames)
+        estimates = run(visual_odometry(cameras.model, OdometryLimits(keyframes=keyframes)), frames)
         assert motion_errors(estimates[-1].T_odom_rect, truth(len(frames) - 1))[0] < 6e-3
         assert min(estimate.inliers for estimate in estimates) >= 50
         traces[keyframes] = np.array([np.trace(estimate.covariance[:3, :3]) for estimate in estimates])
@@ -84,7 +91,7 @@ def test_the_velocity_is_in_the_rig_frame(odometry: VisualOdometry, frames: list
 
 def test_landmarks_are_observed_in_several_keyframes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     """Each observation agrees with the projection of the landmark into that keyframe."""
-    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(refresh=1.0))
+    odometry = visual_odometry(cameras.model, OdometryLimits(refresh=1.0))
     run(odometry, frames[:5])
     store = odometry._map.store
     rows = np.searchsorted(store.table.id, store.observations.landmark)
@@ -144,7 +151,7 @@ def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
 
 def test_relocalises_at_a_keyframe_that_has_left_the_local_map(cameras: RenderedCameras) -> None:
     path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
-    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(keyframes=2))
+    odometry = visual_odometry(cameras.model, OdometryLimits(keyframes=2))
     run(odometry, [cameras.frame(k, T) for k, T in enumerate(path)])
     run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
     (T_world_rig,) = planar_poses(np.array([[0.1, -0.1]]), np.array([2.0]))
@@ -176,7 +183,7 @@ def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
 
 def test_refuses_an_impossible_speed(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     """The stamps are so close that the robot would have had to be faster than its limit."""
-    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(max_speed_mps=0.5))
+    odometry = visual_odometry(cameras.model, OdometryLimits(max_speed_mps=0.5))
     run(odometry, frames[:2])
     estimate = odometry.process(frames[4], 0.05)  # 0.15 m in 0.05 s
     assert estimate.state != TrackingState.TRACKING and estimate.inliers == 0
@@ -195,7 +202,7 @@ def test_dark_from_the_start_is_lost_until_there_is_light(
 
 def test_the_same_frames_give_the_same_bytes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     first, second = (
-        run(VisualOdometry(cameras.model, KltSettings(), OdometryLimits()), frames)[-1] for _ in range(2)
+        run(visual_odometry(cameras.model, OdometryLimits()), frames)[-1] for _ in range(2)
     )
     assert first.T_odom_rect.tobytes() == second.T_odom_rect.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 
 
 def command(velocity_mps: float, yaw_rate_radps: float) -> VelocityCommand:

@@ -1,1 +1,0 @@
-"""The ends of the flow: files, log, bus, motor, and what a person at a terminal sees."""
