@@ -37,7 +37,7 @@ class RigCheckResult:
     @property
     def good(self) -> bool:
         """True if columns and rims are within their tolerances."""
-        return self.finding.verdict == "good" and all(rim is None or rim.fits for rim in self.rims)
+        return self.finding.condition == "good" and all(rim is None or rim.fits for rim in self.rims)
 
 
 def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:

@@ -63,15 +63,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _require_matches(finding: RigFinding, pairs: int) -> None:
-    if finding.verdict == "unknown":
+    if finding.condition == "unknown":
         raise OmnidError(f"calibrate check: expected at least {MIN_MATCHES} points in both panoramas, found "
                          f"{finding.matches} of {finding.tried} in {pairs} pairs; use a log with more texture")
 
 
 def report(found: RigCheckResult, pairs: int) -> str:
-    """Return the result as lines of text, the verdict first."""
+    """Return the result as lines of text, the condition first."""
     finding = found.finding
-    lines = [f"{_verdict(found)}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
+    lines = [f"{_condition(found)}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
              f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
              "the left of forward:"]
     lines.append("  " + "  ".join(f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth
@@ -83,8 +83,8 @@ def report(found: RigCheckResult, pairs: int) -> str:
     return "\n".join(lines)
 
 
-def _verdict(found: RigCheckResult) -> str:
-    return "drifted" if found.finding.verdict == "good" and not found.good else found.finding.verdict
+def _condition(found: RigCheckResult) -> str:
+    return "drifted" if found.finding.condition == "good" and not found.good else found.finding.condition
 
 
 def _drift(finding: RigFinding) -> list[str]:
@@ -130,7 +130,7 @@ def _refine(rig: Rig, pairs: list[FramePair], found: RigCheckResult, path: Path)
             break
     write_rig(path, rig)
     print(f"{path}: {found.finding.summary}\n{NOT_OBSERVABLE}")
-    if recalibrate or found.finding.verdict != "good":
+    if recalibrate or found.finding.condition != "good":
         print(RECALIBRATE)
 
 

@@ -38,7 +38,7 @@ class Controller:
 
     @property
     def due_ns(self) -> int:
-        """When the next tick is due (CLOCK_MONOTONIC); 0: at once."""
+        """Time at which the next tick is due (CLOCK_MONOTONIC); 0: at once."""
         return self._due_ns
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
-from drivers.motors.differential_drive import DifferentialDrive
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from omnid.settings import knob
 

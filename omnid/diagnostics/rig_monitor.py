@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.rig.rig_check import Matches, RigFinding, Verdict, judge, match, together
+from omnid.core.rig.rig_check import Matches, RigCondition, RigFinding, judge, match, together
 from omnid.messages import Panoramas
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import RIG
@@ -26,8 +26,8 @@ VIEWS = 16  # views that are kept, and new views after which the rig is checked 
 MIN_PLACES = 6  # fewer different views are not enough for a check
 MIN_CORRELATION = 0.8  # of the thumbnails of two views of one place: some 15 cm of a corridor
 THUMBNAIL = (128, 24)  # columns, rows
-LEVELS: dict[Verdict, int] = {"good": OK, "unknown": OK, "drifted": WARN, "broken": ERROR}
-ADVICE: dict[Verdict, str] = {
+LEVELS: dict[RigCondition, int] = {"good": OK, "unknown": OK, "drifted": WARN, "broken": ERROR}
+ADVICE: dict[RigCondition, str] = {
     "good": "good", "unknown": "unknown: too few points are matched in both panoramas",
     "drifted": "drifted: run omnid calibrate check on a recording; --refine corrects the upper camera's rotation",
     "broken": "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
@@ -91,11 +91,11 @@ class RigMonitor:
         if self._found is None:
             return DiagnosticStatus(RIG, OK, "not checked yet: the robot must drive past different places", values)
         finding, stamp_ns = self._found
-        values |= {"verdict": finding.verdict, "turn_deg": f"{finding.turn_deg:.3f}",
+        values |= {"condition": finding.condition, "turn_deg": f"{finding.turn_deg:.3f}",
                    "offset_px": f"{finding.offset_px:+.2f}", "left_px": f"{finding.left_px:.2f}",
                    "matches": str(finding.matches), "tried": str(finding.tried),
                    "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
-        return DiagnosticStatus(RIG, LEVELS[finding.verdict], ADVICE[finding.verdict], values)
+        return DiagnosticStatus(RIG, LEVELS[finding.condition], ADVICE[finding.condition], values)
 
 
 def _thumbnail(panoramas: Panoramas) -> Array:

@@ -86,18 +86,18 @@ def main(arguments: list[str]) -> int:
     sums = {name: Counter[str]() for name in DETECTORS}
     for number in range(args.first, args.first + args.count):
         rendered = render_hard_board(args.seed, number)
-        verdicts = {name: count([rendered], detect, empty=name == "omnid") for name, detect in DETECTORS.items()}
-        for name, verdict in verdicts.items():
-            sums[name] += verdict
-        outcomes = ", ".join(f"{name} {_outcomes(verdict)}" for name, verdict in verdicts.items())
+        outcomes_of = {name: count([rendered], detect, empty=name == "omnid") for name, detect in DETECTORS.items()}
+        for name, found in outcomes_of.items():
+            sums[name] += found
+        outcomes = ", ".join(f"{name} {_outcomes(found)}" for name, found in outcomes_of.items())
         print(f"{rendered.name}: {outcomes}", flush=True)
     for name, all_of in sums.items():
         print(f"{name}: " + ", ".join(f"{all_of[kind]} {kind}" for kind in ("found", "wrong", "missed")))
     return 0 if meets_requirement(sums, args.count) else 1
 
 
-def _outcomes(verdict: Counter[str]) -> str:
-    return "/".join(kind for kind in ("found", "missed", "wrong") if verdict[kind])
+def _outcomes(found: Counter[str]) -> str:
+    return "/".join(kind for kind in ("found", "missed", "wrong") if found[kind])
 
 
 def meets_requirement(sums: dict[str, Counter[str]], images: int) -> bool:

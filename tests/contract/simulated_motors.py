@@ -6,8 +6,8 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Framer, T, Transaction
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import Framer, T, Transaction
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS

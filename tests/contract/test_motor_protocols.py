@@ -13,8 +13,8 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motors.differential_drive import DifferentialDrive
-from drivers.motors.motor_protocol import Framer, MotorProtocol
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import Framer, MotorProtocol
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_motor import SimulatedController

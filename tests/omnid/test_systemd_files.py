@@ -1,4 +1,4 @@
-"""What is installed beside the program: systemd and udev take it without a word, and the unit is well locked up."""
+"""Files installed beside the program: systemd and udev accept them without a message, and the unit is sandboxed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def installed(tmp_path: Path) -> Path:
 
 
 def analyze(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    """What systemd-analyze finds."""
+    """Run systemd-analyze."""
     return subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, timeout=60)
 
 
@@ -57,7 +57,7 @@ def test_the_unit_is_taken_without_a_word(installed: Path) -> None:
 
 @with_systemd
 @pytest.mark.parametrize("file", ["omnid.service", "omnid.service.d/lan.conf"])
-def test_a_mistake_in_the_unit_would_be_told(installed: Path, file: str) -> None:
+def test_reports_a_mistake_in_the_unit(installed: Path, file: str) -> None:
     changed = installed.parent / file
     changed.write_text(changed.read_text().replace("IPAddressAllow=", "IPAddressAllowed="))
     assert "IPAddressAllowed" in verify(installed)[1]

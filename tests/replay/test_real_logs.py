@@ -34,7 +34,7 @@ def test_two_walls(omnid: Command, tmp_path: Path) -> None:
     assert math.degrees(found.heading_max_rad) <= 0.05
 
 
-def test_two_walls_crooked(omnid: Command, tmp_path: Path) -> None:
+def test_two_walls_misaligned(omnid: Command, tmp_path: Path) -> None:
     found = measured(omnid, tmp_path, "two_walls_crooked")
     assert found.coverage >= 0.99 and found.ate_rmse_m <= 0.004
     assert math.degrees(found.heading_max_rad) <= 0.1

@@ -34,7 +34,7 @@ class ReplaySetpoint:
 
 @dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """When the wheels must stop, and how fast the base may be driven; in `omnid run` and in replays alike."""
+    """Deadlines, limits and heading control of the base, the same in `omnid run` and in replays."""
 
     deadlines: Deadlines = field(default_factory=Deadlines)
     limits: VelocityLimits = field(default_factory=VelocityLimits)

@@ -19,7 +19,7 @@ from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
-Verdict = Literal["good", "drifted", "broken", "unknown"]
+RigCondition = Literal["good", "drifted", "broken", "unknown"]
 
 POINTS = 160  # corners per pair
 COARSE = 4  # the coarse search uses images reduced by this factor
@@ -31,15 +31,15 @@ MAX_STEP_PX = 2 * COARSE  # from the coarse match to the tracked point
 MIN_DISPARITY_PX = 0.5
 KLT = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 MAX_PAIRS = 64
-MIN_MATCHES = 120  # for a verdict
+MIN_MATCHES = 120  # for a condition
 DRIFTED_DEG = 0.2  # rotation of the upper camera; rendered and real rigs as calibrated stay below
 BROKEN_DEG = 2.0
 SHIFT_WEIGHT = 0.2  # of the shift's angle against the rotation's: a shifted viewpoint affects near points only
-SIGMAS = 4.0  # standard deviations subtracted from rotation and shift before the verdict
+SIGMAS = 4.0  # standard deviations subtracted from rotation and shift before the condition
 # With a rig that is wrong by many degrees, points match by chance only. Corners in noise match nowhere either, so only
 # points with contrast are counted.
 MIN_MATCHED_PART = 0.08  # of the points with contrast: fewer matches mean a broken rig
-MIN_CONTRAST_POINTS = 400  # for this verdict
+MIN_CONTRAST_POINTS = 400  # for this condition
 CONTRAST_GREY = 6.0  # standard deviation of a coarse patch with contrast, grey levels
 SECTORS = 12  # of azimuth
 MIN_IN_SECTOR = 20  # matches
@@ -65,7 +65,7 @@ class Matches:
 class RigFinding:
     """Result of the check."""
 
-    verdict: Verdict
+    condition: RigCondition
     matches: int
     tried: int
     offset_px: float  # median of upper minus lower columns
@@ -76,17 +76,17 @@ class RigFinding:
 
     @property
     def turn_deg(self) -> float:
-        """Rotation of the upper camera against the rig's file, degrees; NaN without a verdict."""
+        """Rotation of the upper camera against the rig's file, degrees; NaN without a condition."""
         return float(np.rad2deg(np.linalg.norm(self.drift.turn))) if self.drift else float("nan")
 
     @property
     def summary(self) -> str:
         """Summary in one line."""
         if self.drift is None:
-            return f"{self.verdict}: {self.matches} of {self.tried} points found in both panoramas"
+            return f"{self.condition}: {self.matches} of {self.tried} points found in both panoramas"
         x, y, z = np.rad2deg(self.drift.turn)
-        return (f"{self.verdict}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper camera "
-                f"turned by {self.turn_deg:.3f} deg ({x:+.3f} {y:+.3f} {z:+.3f}) by {self.matches} points")
+        return (f"{self.condition}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper "
+                f"camera turned by {self.turn_deg:.3f} deg ({x:+.3f} {y:+.3f} {z:+.3f}) by {self.matches} points")
 
 
 class RigCheck:
@@ -162,11 +162,11 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     residuals = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
     offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    return RigFinding(_verdict(drift, left_px, (len(aside), found.clear)), len(aside), found.tried, offset, spread,
+    return RigFinding(_condition(drift, left_px, (len(aside), found.clear)), len(aside), found.tried, offset, spread,
                       _by_azimuth(found.lower, aside, cylinder), left_px, drift)
 
 
-def _verdict(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> Verdict:
+def _condition(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> RigCondition:
     matches, clear = counts
     if clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
         return "broken"

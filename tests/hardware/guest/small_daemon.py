@@ -128,12 +128,12 @@ def main() -> None:
     """Runs until SIGTERM."""
     print_stacks_when_killed()
     configure_logging()
-    config, tally, bus = RealtimeSettings(), RunStatistics(), Bus(BusConfig())
+    config, statistics, bus = RealtimeSettings(), RunStatistics(), Bus(BusConfig())
     graph = Graph(policy=NEWEST, on_thread=ThreadStart({"motor": config.motor_priority, **priorities(config, "lower")}))
     graph.sink("bus", Speaker(bus), graph.stage("image", Image(), graph.source("lower", numbers)))
     graph.ticker("motor", 0.05, lambda: None)
     graph.ticker("report", 0.1, Reporter())
-    service = Service(graph.telemetry, StatusLine(tally, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
+    service = Service(graph.telemetry, StatusLine(statistics, graph.telemetry, ("motor", "report", "watchdog")), 5.0)
     graph.ticker("watchdog", service.period_s, service)
     signal.signal(signal.SIGTERM, lambda *_: graph.stop())
     for line in prepare(config):

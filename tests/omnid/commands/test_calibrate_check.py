@@ -33,14 +33,14 @@ def check_rotated(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigChe
 
 def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
     found = check_rotated(scene, pairs, (0, 0, 0))
-    assert found.good and found.finding.verdict == "good" and found.finding.turn_deg < 0.05
+    assert found.good and found.finding.condition == "good" and found.finding.turn_deg < 0.05
     assert abs(found.finding.offset_px) < 0.03 and found.finding.left_px < 0.15 and None not in found.rims
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0, 0, -0.5)])
 def test_measures_half_a_degree_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
     found = check_rotated(scene, pairs, turn_deg).finding
-    assert found.verdict == "drifted" and found.drift is not None
+    assert found.condition == "drifted" and found.drift is not None
     assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05)
 
 
@@ -53,11 +53,11 @@ def test_rotation_about_the_vertical_is_constant_and_a_tilt_a_wave(scene: Path, 
 
 def test_measures_many_degrees(scene: Path, pairs: list[FramePair]) -> None:
     found = check_rotated(scene, pairs, (0.0, 0.0, 11.0)).finding
-    assert found.verdict == "broken" and found.turn_deg == pytest.approx(11.0, abs=0.1)
+    assert found.condition == "broken" and found.turn_deg == pytest.approx(11.0, abs=0.1)
 
 
 def test_reports_large_errors_as_broken(scene: Path, pairs: list[FramePair]) -> None:
-    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.verdict == "broken"
+    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.condition == "broken"
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
     assert not check_rotated(scene, exchanged, (0, 0, 0)).good
 
@@ -130,4 +130,4 @@ def test_images_of_another_size_are_a_one_line_error(scene: Path, tmp_path: Path
 def test_dark_log_is_unknown(scene: Path, pairs: list[FramePair]) -> None:
     dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
     found = check_rotated(scene, dark, (0, 0, 0))
-    assert found.finding.verdict == "unknown" and found.rims == (None, None)
+    assert found.finding.condition == "unknown" and found.rims == (None, None)

@@ -78,7 +78,7 @@ def test_a_correct_rig_is_good(true: tuple[RigMonitor, Collector]) -> None:
     status = true[0].status()
     assert (status.name, status.level, status.message) == (RIG, 0, "good")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
-    assert status.values["verdict"] == "good" and int(status.values["new_views"]) == len(true[1]) - VIEWS
+    assert status.values["condition"] == "good" and int(status.values["new_views"]) == len(true[1]) - VIEWS
     found, sought = int(status.values["matches"]), int(status.values["tried"])
     assert 500 < found < sought and status.values["age_s"] == "1"
 
@@ -107,7 +107,7 @@ def test_few_places_give_no_finding_however_often(true: tuple[RigMonitor, Collec
     places = true[1][::3]
     assert monitor_after(true, places[:MIN_PLACES - 1] * 8).finding is None
     found = monitor_after(true, places[:MIN_PLACES] * 6).finding
-    assert found is not None and found.verdict == "good" and found.tried <= MIN_PLACES * POINTS
+    assert found is not None and found.condition == "good" and found.tried <= MIN_PLACES * POINTS
 
 
 def test_uses_no_more_views_than_its_period_allows(true: tuple[RigMonitor, Collector]) -> None:

@@ -75,7 +75,7 @@ def test_notifies_an_abstract_socket(monkeypatch: pytest.MonkeyPatch) -> None:
     manager.close()
 
 
-@pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify", "@nobody", "/" + "x" * 200, "vsock:2:1"])
+@pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify", "@nosuch", "/" + "x" * 200, "vsock:2:1"])
 def test_a_missing_manager_is_no_error(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     assert not notify("READY=1")

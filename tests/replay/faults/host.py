@@ -43,7 +43,7 @@ def killed(setting: Setting) -> Outcome:
 
 
 @trial("controller process killed")
-def steering_killed(setting: Setting) -> Outcome:
+def controller_killed(setting: Setting) -> Outcome:
     """The daemon cannot go on without it: systemd starts both again."""
     with robot(setting.scene, setting.folder) as (daemon, operator, base):
         operator.drive()
