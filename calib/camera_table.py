@@ -20,6 +20,8 @@ from calib.validation import ValidatedTable, read_bytes
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
+# Optional tangential terms of an ocam camera [1/px]; files without them are read as 0.
+TANGENTIAL_KEYS = ("p1", "p2")
 
 
 def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
@@ -45,12 +47,13 @@ def _omni(table: ValidatedTable) -> UnifiedCamera:
 
 def _ocam(table: ValidatedTable) -> OcamCamera:
     values = table.table("intrinsics")
-    values.allow_only(OCAM_KEYS)
+    values.allow_only((*OCAM_KEYS, *TANGENTIAL_KEYS))
     row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
+    p1, p2 = (values.number(key) if values.has(key) else 0.0 for key in TANGENTIAL_KEYS)
     view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
     polynomial, size = values.numbers("polynomial"), table.size("size")
     try:
-        return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
+        return OcamCamera(polynomial, (row, column), (c, d, e), size, view, (p1, p2))
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
@@ -118,6 +121,9 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
         numbers = (*camera.center_row_column, *camera.affine)
         named = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
         named += [f"{key} = {number_text(value)}" for key, value in zip(OCAM_KEYS[1:], numbers, strict=True)]
+        if any(camera.tangential):
+            named += [f"{key} = {number_text(value)}"
+                      for key, value in zip(TANGENTIAL_KEYS, camera.tangential, strict=True)]
     else:
         raise CalibError(f"rig file: {name}: expected an omni or ocam camera, found {type(camera).__name__}")
     return "\n".join(["", f"[{name}.intrinsics]", *named]) + "\n"

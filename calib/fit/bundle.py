@@ -91,12 +91,15 @@ def residuals(camera: Projection, T_cam_board: Array, observed: Observations) ->
     return np.where(lost, LOST_PX, observed.pixels - cast)
 
 
-def adjust_bundle(camera_of: CameraFactory, parameters: Array, T_cam_board: Array, observed: Observations
-                  ) -> BundleResult:
-    """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values."""
+def adjust_bundle(camera_of: CameraFactory, parameters: Array, T_cam_board: Array, observed: Observations, *,
+                  kernel_rounds: int = KERNEL_ROUNDS) -> BundleResult:
+    """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
+
+    kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
+    """
     state = _State(camera_of, observed, np.asarray(parameters, float), np.asarray(T_cam_board, float))
     sigma = np.inf
-    for _ in range(KERNEL_ROUNDS):
+    for _ in range(kernel_rounds):
         sigma = min(sigma, _robust_sigma(state.residuals))
         state = _levenberg_marquardt(state, HUBER_WIDTH * sigma)
     return _bundle_result(state, HUBER_WIDTH * sigma)
@@ -184,7 +187,7 @@ def _normal_equations(state: _State, kernel_px: float) -> _NormalEquations:
     J_in, J_pose = _jacobians(state)
     K = len(residual)
     root = np.sqrt(weight)[..., None, None]
-    J_in, J_pose = ((root * J).reshape(K, -1, J.shape[-1]) for J in (J_in, J_pose))
+    J_in, J_pose = ((root * J).reshape(K, 2 * residual.shape[1], J.shape[-1]) for J in (J_in, J_pose))
     r = (root[..., 0] * residual).reshape(K, -1)
     return _NormalEquations(
         A=np.einsum("kri,krj->ij", J_in, J_in), B=J_in.swapaxes(1, 2) @ J_pose, C=J_pose.swapaxes(1, 2) @ J_pose,
@@ -206,11 +209,11 @@ def _jacobians(state: _State) -> tuple[Array, Array]:
     for step in DIFFERENCE_STEP * np.eye(len(state.parameters)):
         ahead, behind = (state.camera_of(state.parameters + sign * step).project(flat) for sign in (1, -1))
         columns.append((ahead - behind) / (2 * DIFFERENCE_STEP))
-    by_parameter = np.nan_to_num(np.stack(columns, axis=-1))
+    by_parameter = np.nan_to_num(np.stack(columns, axis=-1)) if columns else np.zeros((len(flat), 2, 0))
     by_point = _by_point(state.camera_of(state.parameters), flat)
     by_pose = np.concatenate([by_point, -by_point @ se3.hat(flat)], axis=-1)
     shape = points.shape[:2]
-    return by_parameter.reshape(*shape, 2, -1), by_pose.reshape(*shape, 2, 6)
+    return by_parameter.reshape(*shape, 2, len(columns)), by_pose.reshape(*shape, 2, 6)
 
 
 def _by_point(camera: Projection, points: Array) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,24 +12,18 @@ from calib.boards.board import Board, BoardView
 from calib.boards.corner_refinement import refine_with_camera
 from calib.errors import CalibError
 from calib.fit.bundle import BundleResult, Observations
-from calib.fit.ocam_fit import DEGREE, fit_ocam, ocam_factory, ocam_parameters, raise_degree
+from calib.fit.camera_models import FittedModel, Model, fit_model
+from calib.fit.ocam_fit import DEGREE
 from calib.fit.ocam_linear import solve_linear
-from calib.fit.unified_fit import DISTORTION_TERMS, fit_unified, unified_factory, unified_parameters
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import OcamCamera, View
+from calib.models.ocam import View
 
-Model = Literal["ocam", "omni"]
-MODELS: tuple[Model, Model] = ("ocam", "omni")
 MIN_VIEWS = 4
 # A view is an outlier if its median error exceeds this ratio of the views' median, and this error in pixels.
 BAD_RATIO, BAD_PX = 3.0, 0.25
 # The same for the mean ray error of the linear solution.
 BAD_LINEAR_RATIO, BAD_LINEAR_RAD = 5.0, 0.01
 MAX_REJECTIONS = 10
-# A further model term is used if it reduces the error by this part. A smaller gain may come from a mirror that is not
-# quite central, and then bends rays by tenths of a degree.
-MIN_IMPROVEMENT = 0.1
-HIGHER_DEGREES = (5, 6)
 # Limits for warnings: directions with corners, relative sigma of the scale, sigma of the centre, mean error.
 SECTORS, MIN_SECTORS = 12, 9
 MAX_SCALE_SIGMA, MAX_CENTER_SIGMA_PX = 0.005, 1.0
@@ -65,27 +58,25 @@ class CameraCalibration:
         return np.asarray(np.nanmean(self.fit.errors_px, axis=1))
 
 
-@dataclass(frozen=True, slots=True)
-class _FittedModel:
-    camera: OmniCamera
-    fit: BundleResult
-    parameters: tuple[tuple[str, float, float], ...]
-
-
 def calibrate_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int], model: Model = "ocam",
                      view: View = "mirror") -> CameraCalibration:
     """Fit a camera to board views; outlier views are rejected.
 
     size (width, height) [px]. Raises CalibError if fewer than MIN_VIEWS remain.
     """
-    _require(len(views), "views of the board")
-    good, rejected = _consistent_views(list(views), board, size, view)
+    good, rejected = consistent_views(views, board, size, view)
+    return calibrate_consistent(good, rejected, board, size, model, view)
 
-    def solve(observed: Observations) -> _FittedModel:
-        ocam = _fit_ocam(observed, size, view)
-        return ocam if model == "ocam" else _fit_omni(observed, ocam)
 
-    solved = solve(_observed(good, board))
+def calibrate_consistent(views: Sequence[BoardView], rejected: Sequence[RejectedView], board: Board,
+                         size: tuple[int, int], model: Model, view: View, ocam: FittedModel | None = None
+                         ) -> CameraCalibration:
+    """Fit a camera to views of which the inconsistent ones have been rejected; see calibrate_camera.
+
+    ocam: the ocam camera fitted to the same views, if it is known, as the start of the other models.
+    """
+    good, rejected = list(views), list(rejected)
+    solved = fit_model(model, observations(good, board), size, view, ocam)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(solved.fit)
         if not bad.any():
@@ -93,8 +84,8 @@ def calibrate_camera(views: Sequence[BoardView], board: Board, size: tuple[int, 
         rejected += [_rejected_view(seen, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
         good = [seen for k, seen in enumerate(good) if not bad[k]]
         _require(len(good), "consistent views", rejected)
-        solved = solve(_observed(good, board))
-    warnings = _warnings(solved, _observed(good, board))
+        solved = fit_model(model, observations(good, board), size, view)
+    warnings = _warnings(solved, observations(good, board))
     return CameraCalibration(solved.camera, board, tuple(good), solved.fit, solved.parameters, tuple(rejected),
                              warnings)
 
@@ -108,7 +99,8 @@ def refine_camera_calibration(found: CameraCalibration, images: Mapping[str, NDA
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def _observed(views: Sequence[BoardView], board: Board) -> Observations:
+def observations(views: Sequence[BoardView], board: Board) -> Observations:
+    """Return the observed corners of views of a board."""
     return Observations(np.array([view.pixels for view in views]), board.points)
 
 
@@ -119,13 +111,14 @@ def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> No
                          "with the board all around the camera, near, and tilted")
 
 
-def _consistent_views(views: list[BoardView], board: Board, size: tuple[int, int],
-                      view: View) -> tuple[list[BoardView], list[RejectedView]]:
+def consistent_views(views: Sequence[BoardView], board: Board, size: tuple[int, int],
+                     view: View) -> tuple[list[BoardView], list[RejectedView]]:
     """Reject views with large errors in the linear solution, the worst first, because it affects the others."""
+    _require(len(views), "views of the board")
     good, rejected = list(views), list[RejectedView]()
     while True:
         _require(len(good), "consistent views", rejected)
-        errors = solve_linear(_observed(good, board), size, DEGREE, view).errors_rad
+        errors = solve_linear(observations(good, board), size, DEGREE, view).errors_rad
         worst, usual = int(np.argmax(errors)), float(np.median(errors))
         if errors[worst] <= max(BAD_LINEAR_RATIO * min(usual, BAD_LINEAR_RAD), BAD_LINEAR_RAD):
             return good, rejected
@@ -147,40 +140,7 @@ def _rejected_view(view: BoardView, fit: BundleResult, k: int) -> RejectedView:
     return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 
-def _fit_ocam(observed: Observations, size: tuple[int, int], view: View) -> _FittedModel:
-    """Fit ocam cameras, and return the one of the lowest degree that no higher one improves significantly."""
-    best = trial = _fitted_ocam(fit_ocam(observed, size, view), DEGREE, (size, view))
-    for degree in HIGHER_DEGREES:
-        assert isinstance(trial.camera, OcamCamera)
-        trial = _fitted_ocam(raise_degree(trial.fit, observed, trial.camera), degree, (size, view))
-        best = trial if _is_significantly_better(best.fit, trial.fit) else best
-    return best
-
-
-def _fitted_ocam(fit: BundleResult, degree: int, seen: tuple[tuple[int, int], View]) -> _FittedModel:
-    size, view = seen
-    camera = ocam_factory(size, view, degree)(fit.parameters)
-    return _FittedModel(camera, fit, tuple(ocam_parameters(fit, size, degree)))
-
-
-def _fit_omni(observed: Observations, ocam: _FittedModel) -> _FittedModel:
-    """Fit omni cameras, and return the one with the fewest distortion terms that more do not improve significantly."""
-    assert isinstance(ocam.camera, OcamCamera)
-    best, terms = fit_unified(observed, ocam.camera, ocam.fit.T_cam_board, 0), 0
-    for more in DISTORTION_TERMS[1:]:
-        trial = fit_unified(observed, ocam.camera, ocam.fit.T_cam_board, more)
-        if _is_significantly_better(best, trial):
-            best, terms = trial, more
-    size = ocam.camera.size
-    camera = unified_factory(size, terms)(best.parameters)
-    return _FittedModel(camera, best, tuple(unified_parameters(best, size, terms)))
-
-
-def _is_significantly_better(best: BundleResult, trial: BundleResult) -> bool:
-    return trial.mean_px < (1 - MIN_IMPROVEMENT) * best.mean_px
-
-
-def _warnings(solved: _FittedModel, observed: Observations) -> tuple[str, ...]:
+def _warnings(solved: FittedModel, observed: Observations) -> tuple[str, ...]:
     """Return one line for every property that limits the calibration."""
     warnings = []
     sectors = _covered_sectors(observed.pixels, solved.camera.center)

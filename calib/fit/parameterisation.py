@@ -12,6 +12,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 
 OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
+OCAM_TANGENTIAL_NAMES = ("p1", "p2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +48,14 @@ def parameterise(camera: OmniCamera) -> CameraParameterisation:
     if not isinstance(camera, OcamCamera):
         raise CalibError(f"calibrate: expected an omni or ocam camera, found {type(camera).__name__}")
     powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
-    start = np.array([*(camera.polynomial[power] for power in powers), *camera.center_row_column, *camera.affine[:2]])
-    units = np.array([*(scale ** -float(power) for power in powers), 1.0, 1.0, 1 / scale, 1 / scale])
-    names = (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d")
+    # p1 and p2 are correlated, so both are adjusted or neither.
+    tangential = camera.tangential if any(camera.tangential) else ()
+    start = np.array([*(camera.polynomial[power] for power in powers), *camera.center_row_column, *camera.affine[:2],
+                      *tangential])
+    units = np.array([*(scale ** -float(power) for power in powers), 1.0, 1.0, 1 / scale, 1 / scale,
+                      *[1 / scale**2 for _ in tangential]])
+    names = (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d",
+             *OCAM_TANGENTIAL_NAMES[:len(tangential)])
     return CameraParameterisation(camera, names, start, units)
 
 
@@ -64,5 +70,6 @@ def _ocam_camera(base: OmniCamera, values: dict[str, float]) -> OcamCamera:
     assert isinstance(base, OcamCamera)
     polynomial = tuple(values.get(f"a{power}", 0.0) for power in range(len(base.polynomial)))
     affine = (values["c"], values["d"], base.affine[2] + values["d"] - base.affine[1])
+    p1, p2 = (values.get(name, 0.0) for name in OCAM_TANGENTIAL_NAMES)
     return replace(base, polynomial=polynomial, center_row_column=(values["center_row"], values["center_column"]),
-                   affine=affine)
+                   affine=affine, tangential=(p1, p2))

@@ -15,6 +15,7 @@ from calib.errors import CalibError
 from calib.fit.bundle import BundleResult, Observations, adjust_bundle
 from calib.fit.camera_fit import RejectedView, outlier_views
 from calib.fit.parameterisation import CameraParameterisation, parameterise
+from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.fit.rig_initialisation import RelativePoseInitialisation, ViewPair, initialise_relative_pose
 from calib.models.camera import Array, OmniCamera
 
@@ -66,6 +67,16 @@ class RigCalibration:
         errors = np.split(self.fit.errors_px, 2, axis=1)[side]
         known = np.isfinite(errors)
         return np.where(known.any(axis=1), np.nansum(errors, axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+
+
+    def structure(self, side: int) -> ResidualStructure:
+        """Return the structure of the lower (0) or upper (1) camera's residuals."""
+        views = [view.seen[side] for view in self.views]
+        seen = [k for k, view in enumerate(views) if view is not None]
+        pixels = np.array([view.pixels for view in views if view is not None])
+        camera = (self.lower, self.upper)[side]
+        residuals = np.split(self.fit.residuals, 2, axis=1)[side][seen]
+        return residual_structure(pixels, residuals, self.board.points, camera.center)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,11 @@
 x = row - row centre and y = column - column centre, after the inverse of the affine [c d; e 1]; rho = |(x, y)|.
 Seen directly the ray is (x, y, f(rho)) with x down, y right, z towards the viewer. Seen in a mirror the image is
 reflected and the right-handed ray is (x, y, -f(rho)). A flat board cannot distinguish the two, so `view` selects one.
+
+Two optional tangential (decentring) terms p1, p2 [1/px] describe a camera off the axis of the mirror (Brown 1966).
+They act between the ideal point (x, y) and the affine:
+
+    x' = x + 2 p1 x y + p2 (rho^2 + 2 x^2),    y' = y + p1 (rho^2 + 2 y^2) + 2 p2 x y
 """
 
 from __future__ import annotations
@@ -22,6 +27,8 @@ VIEWS: tuple[View, View] = ("mirror", "direct")
 TABLE_SIZE = 1025
 # Newton steps on one table interval: 3 reach the last bit, the others are for the model's end, where the slope is 0.
 SOLVE_STEPS = 8
+# Newton steps that invert the tangential terms; pixels without convergence have no ray.
+TANGENTIAL_STEPS, TANGENTIAL_TOLERANCE_PX = 8, 1e-8
 # Least determinant of the affine.
 MIN_DETERMINANT = 1e-6
 # A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal.
@@ -37,6 +44,7 @@ class OcamCamera:
     affine: tuple[float, float, float]
     size: tuple[int, int]
     view: View = "mirror"
+    tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2 [1/px]
     _radii: Array = field(init=False, repr=False, compare=False)
     _angles: Array = field(init=False, repr=False, compare=False)
 
@@ -48,7 +56,7 @@ class OcamCamera:
         object.__setattr__(self, "_angles", np.maximum.accumulate(angles))
 
     def _check(self) -> None:
-        values = (*self.polynomial, *self.center_row_column, *self.affine)
+        values = (*self.polynomial, *self.center_row_column, *self.affine, *self.tangential)
         if not self.polynomial or not np.isfinite(values).all():
             raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
         c, d, e = self.affine
@@ -88,6 +96,8 @@ class OcamCamera:
         c, d, e = self.affine
         row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
         x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
+        if any(self.tangential):
+            x, y = self._without_tangential(x, y)
         rho = np.hypot(x, y)
         z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
         rays = np.column_stack([x, y, self._sign * z])
@@ -103,9 +113,35 @@ class OcamCamera:
         rho = self._radius(r, self._sign * points[:, 2])
         scale = rho / np.where(r > 0, r, 1.0)
         x, y = points[:, 0] * scale, points[:, 1] * scale
+        if any(self.tangential):
+            x, y = self._with_tangential(x, y)
         c, d, e = self.affine
         row, column = self.center_row_column
         return np.column_stack([e * x + y + column, c * x + d * y + row])
+
+    def _with_tangential(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Apply the tangential terms to ideal points x, y (N,) [px]."""
+        p1, p2 = self.tangential
+        rho2 = x * x + y * y
+        return (x + 2 * p1 * x * y + p2 * (rho2 + 2 * x * x), y + p1 * (rho2 + 2 * y * y) + 2 * p2 * x * y)
+
+    def _without_tangential(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Invert the tangential terms by Newton steps; NaN for points without convergence."""
+        p1, p2 = self.tangential
+        ideal_x, ideal_y = x.copy(), y.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(TANGENTIAL_STEPS):
+                distorted_x, distorted_y = self._with_tangential(ideal_x, ideal_y)
+                error_x, error_y = distorted_x - x, distorted_y - y
+                xx = 1 + 2 * p1 * ideal_y + 6 * p2 * ideal_x
+                xy = 2 * p1 * ideal_x + 2 * p2 * ideal_y
+                yy = 1 + 6 * p1 * ideal_y + 2 * p2 * ideal_x
+                determinant = xx * yy - xy * xy
+                ideal_x = ideal_x - (yy * error_x - xy * error_y) / determinant
+                ideal_y = ideal_y - (xx * error_y - xy * error_x) / determinant
+            distorted_x, distorted_y = self._with_tangential(ideal_x, ideal_y)
+            converged = np.hypot(distorted_x - x, distorted_y - y) < TANGENTIAL_TOLERANCE_PX
+        return np.where(converged, ideal_x, np.nan), np.where(converged, ideal_y, np.nan)
 
     @property
     def _sign(self) -> float:

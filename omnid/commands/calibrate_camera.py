@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,15 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, Quality, camera_toml
-from calib.fit.camera_fit import MODELS, CameraCalibration, Model, calibrate_camera, refine_camera_calibration
+from calib.fit.camera_fit import CameraCalibration
+from calib.fit.model_selection import (
+    MODEL_CHOICES,
+    SelectedCalibration,
+    camera_structure,
+    refine_selection,
+    select_calibration,
+)
+from calib.fit.residual_structure import ResidualStructure
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.ocam import VIEWS
@@ -28,6 +37,11 @@ from omnid.sinks.files import check_outputs
 MAX_LOG_VIEWS = 40
 
 
+MODEL_HELP = ("auto (default): fit all models and select by cross-validation; omni: unified model; ocam: polynomial; "
+              "ocam_tangential: polynomial with tangential terms")
+MISFIT = "the camera model does not describe this camera: {}; do not use it where accuracy matters"
+
+
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `camera` to `omnid calibrate`."""
     parser = actions.add_parser("camera", help="a camera.toml from images of a checkerboard")
@@ -36,7 +50,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
                         "four squares meet) along both sides of the board")
     parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
     parser.add_argument("--topic", help="the camera's topic in a log")
-    parser.add_argument("--model", choices=MODELS, default="ocam", help="polynomial (default) or unified model")
+    parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in a mirror (default) or "
                         "directly through a lens: images of a flat board do not distinguish the two")
     parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage")
@@ -64,15 +78,17 @@ def run(args: argparse.Namespace) -> int:
     many = any(source.endswith(".mcap") for source in args.images)
     views = find_boards(images, board, thorough=not many, show_progress=not args.quiet)
     views = select_diverse_views(views, MAX_LOG_VIEWS) if many else views
-    found = _fitted(views, images, board, args)
+    selected = _fitted(views, images, board, args)
+    found = selected.calibration
     mask = find_mask(list(images.values()), found.camera.center) if args.mask else None
     _write(found, mask, args)
     if args.report:
         missing = sorted(set(images) - {view.name for view in views})
         write_file(args.report, camera_report_html(found, images, missing, mask).encode())
-    for line in (*found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
+    misfit = misfit_warnings({"camera": camera_structure(found)})
+    for line in (*misfit, *found.warnings, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
-    print(f"{args.output}: {describe(found)}")
+    print(f"{args.output}: {'MISFIT: ' if misfit else ''}model {selected.model}, {describe(found)}")
     return 0
 
 
@@ -84,11 +100,24 @@ def _check_outputs(args: argparse.Namespace) -> None:
         raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}")
 
 
-def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> CameraCalibration:
+def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> SelectedCalibration:
     height, width = images[views[0].name].shape
-    model: Model = args.model
-    found = calibrate_camera(views, board, (width, height), model, args.view)
-    return refine_camera_calibration(found, images, model, args.view)
+    selected = select_calibration(views, board, (width, height), args.model, args.view)
+    print_scores(selected, "camera", args.quiet)
+    return refine_selection(selected, images, args.view)
+
+
+def print_scores(selected: SelectedCalibration, name: str, quiet: bool) -> None:
+    """Print the scores of all fitted models to stderr, unless quiet."""
+    if not quiet:
+        for score in selected.scores:
+            mark = "selected" if score.model == selected.model else "compared"
+            print(f"{name}: {mark} {score}", file=sys.stderr)
+
+
+def misfit_warnings(structures: Mapping[str, ResidualStructure]) -> list[str]:
+    """Return one warning for every camera, by name, whose residuals are not explained by noise."""
+    return [f"{name}: {MISFIT.format(structure)}" for name, structure in structures.items() if structure.is_misfit]
 
 
 def _write(found: CameraCalibration, mask: Mask | None, args: argparse.Namespace) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.camera_file import CameraFile, read_camera
-from calib.fit.camera_fit import MODELS, Model, RejectedView, calibrate_camera, refine_camera_calibration
+from calib.fit.camera_fit import RejectedView
+from calib.fit.model_selection import MODEL_CHOICES, refine_selection, select_calibration
 from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, refine_rig_calibration
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
@@ -26,7 +27,7 @@ from omnid.calibration.board_search import find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
 from omnid.calibration.images import Images
 from omnid.calibration.rig_report import rig_report_html
-from omnid.commands.calibrate_camera import corners
+from omnid.commands.calibrate_camera import MODEL_HELP, corners, misfit_warnings, print_scores
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -53,7 +54,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
     parser.add_argument("--lower", metavar="TOPIC", help="a log's topic of the lower camera")
     parser.add_argument("--upper", metavar="TOPIC", help="a log's topic of the upper camera")
-    parser.add_argument("--model", choices=MODELS, default="ocam", help="polynomial (default) or unified model")
+    parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in mirrors (default) or "
                         "directly through lenses: images of a flat board do not distinguish the two")
     parser.add_argument("--mask", action="store_true", help="also find hub and struts, and write the masks to PNGs in "
@@ -78,9 +79,10 @@ def run(args: argparse.Namespace) -> int:
     write_rig(args.output, rig)
     if args.report:
         write_file(args.report, rig_report_html(found, images, rig).encode())
-    for line in (*warnings, *unmasked, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
+    misfit = misfit_warnings({f"{name} camera": found.structure(side) for side, name in enumerate(SIDES)})
+    for line in (*misfit, *warnings, *unmasked, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
-    print(f"{args.output}: {describe(found)}")
+    print(f"{args.output}: {'MISFIT: ' if misfit else ''}{describe(found)}")
     return 0
 
 
@@ -171,13 +173,13 @@ def _found(images: Images, board: Board, name: str, *, is_log: bool, show_progre
 def _calibrated_cameras(views: list[PairView], images: PairedImages, board: Board, args: argparse.Namespace
                         ) -> tuple[Sides, list[PairView], list[RejectedView]]:
     """Calibrate each camera by all its images; returns the cameras, the accepted views and the rejected ones."""
-    model: Model = args.model
     cameras, rejected = [], list[RejectedView]()
     for side, name in enumerate(SIDES):
         side_views = [seen for view in views if (seen := view.seen[side]) is not None]
         height, width = images.sides[side][side_views[0].name].shape if side_views else (0, 0)
-        found = calibrate_camera(side_views, board, (width, height), model, args.view)
-        found = refine_camera_calibration(found, images.sides[side], model, args.view)
+        selected = select_calibration(side_views, board, (width, height), args.model, args.view)
+        print_scores(selected, f"{name} camera", args.quiet)
+        found = refine_selection(selected, images.sides[side], args.view).calibration
         cameras.append(found.camera)
         rejected += [RejectedView(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
         views = _without(views, side, {bad.name for bad in found.rejected})

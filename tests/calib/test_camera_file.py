@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,8 +20,14 @@ OCAM = OcamCamera((-131.64, 0.0, 1.88e-3, 9.4e-8, -6.1e-10), (382.4, 514.6), (0.
 QUALITY = Quality(0.25, 10, [("a0", -131.64, 0.2), ("d = e", 2.2e-4, 1e-5)])
 
 
-@pytest.mark.parametrize("camera", [OMNI, OCAM, OcamCamera(OCAM.polynomial, (382.4, 514.6), OCAM.affine, (1024, 768),
-                                                           "direct")])
+TANGENTIAL = replace(OCAM, tangential=(2e-6, -3e-6))
+
+
+def test_tangential_terms_are_written_only_if_there_are_any() -> None:
+    assert "p1" not in camera_toml(CameraFile(OCAM)) and "p2 = -3e-06" in camera_toml(CameraFile(TANGENTIAL))
+
+
+@pytest.mark.parametrize("camera", [OMNI, OCAM, TANGENTIAL, replace(OCAM, view="direct")])
 def test_camera_round_trip(camera: OmniCamera, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(camera_toml(CameraFile(camera), QUALITY))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,13 @@ def test_exported_inverse_polynomial_projects_like_the_model(ocam_rig: Rig) -> N
     row, column = camera.center_row_column
     found: Any = np.column_stack([x * e + y + column, x * c + y * d + row])
     np.testing.assert_allclose(found, pixels, atol=0.02)
+
+
+def test_refuses_to_export_tangential_terms(ocam_rig: Rig) -> None:
+    camera = ocam_rig.lower.camera
+    assert isinstance(camera, OcamCamera)
+    with pytest.raises(CalibError, match="cannot hold the tangential terms p1, p2"):
+        export_ocam(replace(camera, tangential=(1e-6, 0.0)))
 
 
 def test_refuses_to_export_an_omni_camera(omni_rig: Rig) -> None:

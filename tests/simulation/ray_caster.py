@@ -1,7 +1,8 @@
 """Ray caster: images of a mirror camera, by casting the rays that its model lifts from the pixels.
 
-No mirror is modelled: the camera's lift() defines the rays. Rays are cast in square tiles, and a rectangle is
-intersected only with the tiles whose cone of directions overlaps its own.
+The camera's lift() defines the rays of a central camera. A MirrorCamera has a ray of its own, with its own origin on
+the mirror, for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the tiles whose
+cone of directions overlaps its own (all tiles of a MirrorCamera).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array
 from calib.rig import MountedCamera
+from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.surfaces import Rectangle, Scene
 
 Floats = NDArray[np.float32]
@@ -47,6 +49,7 @@ class RayTable:
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
     axes: Array  # (M, 3) unit
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
+    origins: Floats | None = None  # (3, N) [m] camera frame; None: all rays start at the camera's origin
 
 
 def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
@@ -61,18 +64,34 @@ def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
     _, starts = np.unique(tile[index], return_index=True)
     starts = np.append(starts, len(index))
     axes, angles = _cones(rays[index], starts)
+    origins = _origins(mounted, supersample, index)
     return RayTable((height, width), supersample, np.ascontiguousarray(rays[index].T), spacing[index], index,
-                    starts, axes, angles)
+                    starts, axes, angles, origins)
+
+
+def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats | None:
+    """Return the origins (3, N) of the samples' rays of a non-central camera; None for a central one."""
+    if not isinstance(mounted.camera, MirrorCamera):
+        return None
+    origins = [mounted.camera.rays(pixels)[0] for pixels in _sample_pixels(mounted, supersample)]
+    return np.ascontiguousarray(np.concatenate(origins)[index].T, np.float32)
+
+
+def _sample_pixels(mounted: MountedCamera, supersample: int) -> list[Array]:
+    """Return the pixels (N, 2) of all samples, row by row, in chunks of about RAY_CHUNK."""
+    width, height = mounted.camera.size
+    u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
+    v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
+    pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
+    return np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))
 
 
 def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
     """Return rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
     width, height = mounted.camera.size
-    u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
-    v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
-    pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
-    rays = np.concatenate([mounted.camera.lift(p) for p in np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))])
-    grid = rays.reshape(len(v), len(u), 3)
+    chunks = _sample_pixels(mounted, supersample)
+    pixels, rays = np.concatenate(chunks), np.concatenate([mounted.camera.lift(chunk) for chunk in chunks])
+    grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
     rays[~mounted.visible.contains(pixels)] = np.nan
     return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
@@ -137,11 +156,12 @@ def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tup
     """Intersect the rays of all tiles that may see the rectangle, and keep hits nearer than the earlier ones."""
     hits, number = target
     axes = np.column_stack([rectangle.edge_u, rectangle.edge_v, rectangle.normal])
-    # In the rectangle's own coordinates (u, v, height) the camera is at q and a ray has the direction M @ ray.
-    q = np.linalg.solve(axes, T_world_cam[:3, 3] - rectangle.origin).astype(np.float32)
+    # In the rectangle's own coordinates (u, v, height) a ray starts at q and has the direction M @ ray.
+    viewpoint = np.linalg.solve(axes, T_world_cam[:3, 3] - rectangle.origin).astype(np.float32)
     M = np.linalg.solve(axes, T_world_cam[:3, :3]).astype(np.float32)
     for start, stop in _runs(table, _tiles_that_see(table, rectangle, T_world_cam)):
         du, dv, dn = M @ table.rays[:, start:stop]
+        q = viewpoint if table.origins is None else viewpoint[:, None] + M @ table.origins[:, start:stop]
         s = -q[2] / dn
         u, v = q[0] + s * du, q[1] + s * dv
         nearer = (s > 0) & (s < hits.distance[start:stop]) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
@@ -156,7 +176,7 @@ def _tiles_that_see(table: RayTable, rectangle: Rectangle, T_world_cam: Array) -
     rays = corners / np.maximum(np.linalg.norm(corners, axis=1, keepdims=True), MIN_DISTANCE_M)
     axis = rays.sum(axis=0) / max(float(np.linalg.norm(rays.sum(axis=0))), MIN_DISTANCE_M)
     angle = np.arccos(np.clip(rays @ axis, -1, 1)).max()
-    if angle > MAX_CONE_RAD:
+    if angle > MAX_CONE_RAD or table.origins is not None:
         return np.ones(len(table.angles), bool)
     return np.asarray(np.arccos(np.clip(table.axes @ axis, -1, 1)) <= angle + table.angles)
 

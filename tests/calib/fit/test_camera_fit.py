@@ -11,7 +11,8 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.errors import CalibError
 from calib.fit.bundle import Observations
-from calib.fit.camera_fit import MODELS, CameraCalibration, calibrate_camera, refine_camera_calibration
+from calib.fit.camera_fit import CameraCalibration, calibrate_camera, refine_camera_calibration
+from calib.fit.camera_models import Model
 from calib.fit.ocam_linear import solve_linear
 from calib.fit.unified_fit import unified_from_ocam
 from calib.models.camera import Array, Mask, OmniCamera
@@ -20,6 +21,7 @@ from calib.models.unified import UnifiedCamera
 from tests.simulation.boards import BoardRenderer, board_poses_around_camera
 from tests.simulation.sensor import Sensor
 
+BOTH: tuple[Model, Model] = ("ocam", "omni")
 BOARD = Board(7, 6, 0.03)
 MASK = Mask((394.2, 380.9), 60.0, 372.0)
 SIZE = (780, 768)
@@ -164,7 +166,7 @@ def rendered() -> tuple[CameraCalibration, CameraCalibration]:
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 8
     both = []
-    for model in MODELS:
+    for model in BOTH:
         first = calibrate_camera([view for view in views if view], BOARD, SIZE, model)
         both.append(refine_camera_calibration(first, images, model, "mirror"))
     return both[0], both[1]

@@ -22,6 +22,8 @@ CAMERAS: dict[str, OmniCamera] = {
     "ocam mirror": OcamCamera((-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768)),
     "ocam direct": OcamCamera((-300.0, 0, 1.4e-3, -1.6e-6, 4e-9), (470.0, 650.0), (1.001, 1e-3, 2e-3), (1280, 960),
                               "direct"),
+    "ocam tangential": OcamCamera((-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768),
+                                  "mirror", (3e-6, -5e-6)),
     "ocam turning": OcamCamera((-100.0, 0, 1e-3, 0, -1e-8), (300.0, 310.0), (1.0, 0.0, 0.0), (600, 600)),
 }
 
@@ -94,6 +96,15 @@ def test_ocam_projection_equals_the_equations(view: str, sign: float) -> None:
     assert camera.center == (320.0, 240.0)
 
 
+def test_ocam_tangential_projection_equals_the_equations() -> None:
+    camera = OcamCamera((-100.0, 0.0, 0.002), (240.0, 320.0), (1.01, 0.02, -0.03), (640, 480), "mirror", (1e-5, -2e-5))
+    x, y, rho2 = 60.0, -80.0, 1e4
+    bent_x = x + 2e-5 * x * y - 2e-5 * (rho2 + 2 * x * x)
+    bent_y = y + 1e-5 * (rho2 + 2 * y * y) - 4e-5 * x * y
+    expected = [-0.03 * bent_x + bent_y + 320, 1.01 * bent_x + 0.02 * bent_y + 240]
+    np.testing.assert_allclose(camera.project(np.array([[x, y, 80.0]])), [expected], rtol=0, atol=1e-9)
+
+
 def test_ocam_ends_at_the_radius_where_rays_repeat() -> None:
     camera = OcamCamera((-100.0, 0.0, 1e-3, 0.0, -1e-8), (300.0, 300.0), (1.0, 0.0, 0.0), (600, 600))
     low, high = 0.0, 600.0
@@ -122,7 +133,7 @@ def test_ocam_reproduces_the_toolbox_reprojection_errors(shared_data: Path) -> N
 
 @pytest.mark.parametrize("change", [
     {"polynomial": ()}, {"polynomial": (1.0, 0.0)}, {"polynomial": (math.nan,)}, {"affine": (0.0, 0.0, 1.0)},
-    {"size": (0, 4)}, {"view": "window"}])
+    {"size": (0, 4)}, {"view": "window"}, {"tangential": (math.inf, 0.0)}])
 def test_ocam_refuses_invalid_parameters(change: dict[str, object]) -> None:
     values = {"polynomial": (-100.0,), "center_row_column": (1.0, 1.0), "affine": (1.0, 0.0, 0.0), "size": (4, 4)}
     with pytest.raises(CalibError):

@@ -13,7 +13,6 @@ from rosbags.typesys import Stores, get_typestore
 from calib.boards.board import Board
 from calib.camera_file import read_camera
 from calib.models.camera import Mask
-from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
@@ -44,8 +43,9 @@ def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path,
     assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
     line = capsys.readouterr().out
     assert line.count("\n") == 1 and "of 8 views" in line and "mean reprojection error 0.0" in line
+    assert "model omni" in line and "MISFIT" not in line
     read = read_camera(out)
-    assert isinstance(read.camera, OcamCamera) and read.camera.view == "mirror"
+    assert isinstance(read.camera, UnifiedCamera)
     assert read.camera.center == pytest.approx(CAMERA.center, abs=0.3)
     assert read.mask is not None and read.mask.outer_px == pytest.approx(MASK.outer_px, abs=3)
     assert read.mask.inner_px == pytest.approx(MASK.inner_px, abs=4)

@@ -1,0 +1,44 @@
+"""Cross-validation of a fitted camera on held-out views."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.fit.bundle import Observations, Projection, adjust_bundle
+from calib.fit.parameterisation import parameterise
+from calib.models.camera import Array, OmniCamera
+
+# Number of folds, and the least number of views with which a fold is fitted.
+FOLDS = 4
+MIN_TRAINING_VIEWS = 3
+NO_PARAMETERS = np.zeros(0)
+
+
+def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observations) -> float:
+    """Return the mean error [px] of views that were left out of the fit; infinite if no fold can be fitted.
+
+    Every fold refits the camera's parameters, starting from the fit to all views with poses T_cam_board (K, 4, 4), and
+    then only the poses of the views left out.
+    """
+    parameters, numbers = parameterise(camera), np.arange(len(observed.pixels))
+    errors: list[Array] = []
+    for fold in range(FOLDS):
+        held_out = numbers % FOLDS == fold
+        if (~held_out).sum() < MIN_TRAINING_VIEWS or not held_out.any():
+            continue
+        start = np.zeros(len(parameters.names))
+        try:
+            trained = adjust_bundle(parameters.camera_at, start, T_cam_board[~held_out], observed.select(~held_out),
+                                    kernel_rounds=1)
+            fitted = parameters.camera_at(trained.parameters)
+        except (CalibError, np.linalg.LinAlgError):
+            return float("inf")
+        errors.append(_pose_errors_px(fitted, T_cam_board[held_out], observed.select(held_out)))
+    return float(np.nanmean(np.concatenate(errors))) if errors else float("inf")
+
+
+def _pose_errors_px(camera: Projection, T_cam_board: Array, observed: Observations) -> Array:
+    """Return the errors (N,) of a fixed camera after the poses have been adjusted."""
+    found = adjust_bundle(lambda _: camera, NO_PARAMETERS, T_cam_board, observed, kernel_rounds=1)
+    return found.errors_px.ravel()

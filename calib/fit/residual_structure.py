@@ -1,0 +1,100 @@
+"""Systematic part of residuals: their mean by radius and azimuth, compared with the noise of single corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.boards.board_shape import quadratic_terms
+from calib.models.camera import Array
+
+# Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
+RINGS, SECTORS = 6, 12
+# Least number of corners in a bin that is used.
+MIN_CORNERS = 4
+# A misfit is reported if the systematic part exceeds this part of the noise, and this error: smaller ones do not change
+# the motion estimate by a measurable amount.
+MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
+# Residuals longer than this many times their median length are outliers.
+OUTLIER_RATIO = 5.0
+MIN_BOARD_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualStructure:
+    """Systematic part and noise of residuals [px], per coordinate (rms).
+
+    systematic_px: the mean residual as a function of the image position, common to all views. noise_px: the part that
+    differs between neighbouring corners of a view.
+    """
+
+    systematic_px: float
+    noise_px: float
+
+    @property
+    def is_misfit(self) -> bool:
+        """True if the model leaves more than the noise explains."""
+        return self.systematic_px > max(MAX_SYSTEMATIC_PART * self.noise_px, MAX_SYSTEMATIC_PX)
+
+    def __str__(self) -> str:
+        return f"systematic residuals of {self.systematic_px:.3f} px, noise of {self.noise_px:.3f} px"
+
+
+def residual_structure(pixels: Array, residuals: Array, points: Array, center: tuple[float, float]
+                       ) -> ResidualStructure:
+    """Return the structure of residuals (K, N, 2) at pixels (K, N, 2) of K views of board points (N, 3).
+
+    The noise is measured within each view, without a quadratic function of the board's x and y: a misfit of the model
+    is smooth over a board, and would otherwise count as noise where it depends on the board's pose. The systematic part
+    is a one-way analysis of variance with the bins as groups. Unknown (NaN) residuals are left out.
+    """
+    noise_px = _noise_px(residuals, points)
+    return ResidualStructure(_systematic_px(pixels.reshape(-1, 2), residuals.reshape(-1, 2), center), noise_px)
+
+
+def _noise_px(residuals: Array, points: Array) -> float:
+    """Return the rms of residuals (K, N, 2) after a quadratic function of the board is removed from every view."""
+    scale = max(float(np.abs(points[:, :2]).max()), MIN_BOARD_M)
+    terms = quadratic_terms(points[:, 0] / scale, points[:, 1] / scale)
+    squares, freedom = 0.0, 0
+    for view in residuals:
+        length = np.linalg.norm(view, axis=1)
+        known = length < OUTLIER_RATIO * np.nanmedian(length) if np.isfinite(length).any() else np.zeros(0, bool)
+        if known.sum() > terms.shape[1]:
+            coefficients = np.linalg.lstsq(terms[known], view[known], rcond=None)[0]
+            squares += float(((view[known] - terms[known] @ coefficients) ** 2).sum())
+            freedom += 2 * (int(known.sum()) - terms.shape[1])
+    return float(np.sqrt(squares / freedom)) if freedom else float("inf")
+
+
+def _systematic_px(pixels: Array, residuals: Array, center: tuple[float, float]) -> float:
+    """Return the rms of the bins' mean residuals (N, 2), without the share of the variance within the bins."""
+    length = np.linalg.norm(residuals, axis=1)
+    known = length < OUTLIER_RATIO * np.nanmedian(length)
+    offset, residuals = pixels[known] - center, residuals[known]
+    bins = _bins(offset)
+    # Radial and tangential components, so that an error that depends on the radius alone is the same in all sectors.
+    radial = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1.0)
+    tangential = np.column_stack([-radial[:, 1], radial[:, 0]])
+    components = np.column_stack([(residuals * radial).sum(axis=1), (residuals * tangential).sum(axis=1)])
+    between, within, groups, used = 0.0, 0.0, 0, 0
+    for number in np.unique(bins):
+        group = components[bins == number]
+        if len(group) >= MIN_CORNERS:
+            mean = group.mean(axis=0)
+            between += len(group) * float((mean**2).sum())
+            within += float(((group - mean) ** 2).sum())
+            groups, used = groups + 1, used + len(group)
+    if used <= groups:
+        return 0.0
+    share = groups * within / (used - groups)
+    return float(np.sqrt(max(0.0, between - share) / (2 * used)))
+
+
+def _bins(offset: Array) -> Array:
+    """Return the bin number (N,) of offsets (N, 2) from the centre."""
+    radius, azimuth = np.linalg.norm(offset, axis=1), np.arctan2(offset[:, 1], offset[:, 0])
+    edges = np.quantile(radius, np.linspace(0, 1, RINGS + 1)[1:-1]) if len(radius) else np.zeros(RINGS - 1)
+    sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).clip(0, SECTORS - 1)
+    return np.asarray(np.searchsorted(edges, radius) * SECTORS + sector, float)

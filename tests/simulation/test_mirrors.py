@@ -1,0 +1,38 @@
+"""Ray-traced mirror cameras: the paraboloid equals the unified model; other cameras are not central."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.unified import UnifiedCamera
+from tests.simulation.mirrors import MirrorCamera
+
+CENTER, SIZE = (384.2, 381.1), (768, 768)
+NOMINAL = MirrorCamera(207.0, CENTER, SIZE)
+TILTED = MirrorCamera(207.0, CENTER, SIZE, tilt_rad=(0.008, -0.006), conic=0.01, ellipticity=0.01)
+PIXELS = np.random.default_rng(0).uniform(60, 700, (300, 2))
+
+
+def test_paraboloid_below_an_orthographic_camera_equals_the_unified_model() -> None:
+    origins, rays = NOMINAL.rays(PIXELS)
+    np.testing.assert_allclose(rays, UnifiedCamera(1.0, (-207.0, 207.0), CENTER, SIZE).lift(PIXELS), atol=1e-12)
+    np.testing.assert_allclose(np.cross(origins, rays), 0, atol=1e-12)
+
+
+def test_origins_lie_on_the_mirror() -> None:
+    origins, rays = TILTED.rays(PIXELS)
+    w = TILTED.parameter_m / 2 - origins[:, 2]
+    left = (1.01 * origins[:, 0]) ** 2 + origins[:, 1] ** 2
+    np.testing.assert_allclose(left, 2 * TILTED.parameter_m * w - 0.01 * w * w, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-12)
+
+
+def test_project_inverts_the_rays_at_any_distance() -> None:
+    origins, rays = TILTED.rays(PIXELS)
+    distance = np.random.default_rng(1).uniform(0.2, 5, (len(PIXELS), 1))
+    np.testing.assert_allclose(TILTED.project(origins + distance * rays), PIXELS, atol=1e-7)
+
+
+def test_a_tilted_camera_is_not_central() -> None:
+    origins, rays = TILTED.rays(PIXELS)
+    assert 5e-4 < np.linalg.norm(np.cross(origins, rays), axis=1).max() < 5e-3
