@@ -9,10 +9,12 @@ import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import omnid
 from calib.kalibr import import_kalibr
-from calib.rig_file import read_rig
+from calib.rig import Rig
+from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
@@ -22,14 +24,23 @@ HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\
 
 def row(folder: Path, overrides: Sequence[str]) -> str:
     """Return one row of the table: the errors of one log, and the shares of its states."""
-    camchain = folder / "camchain.yaml"
-    rig = import_kalibr(camchain) if camchain.exists() else read_rig(folder / "rig.toml")
-    result = omnid.replay(folder / "log.mcap", rig, overrides=overrides)
+    result = omnid.replay(folder / "log.mcap", _rig(folder), overrides=overrides)
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
     cells = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
              f"{1e3 * m.end_error_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
              f"{1e3 * m.rpe_translation_rmse_m:.2f} mm", summary_entries(result.counters)["states"]]
     return f"| {' | '.join(cells)} |"
+
+
+def _rig(folder: Path) -> Rig:
+    """Return the rig of a log; Kalibr's by way of a rig.toml, whose rounding moves the last digits of the errors."""
+    camchain = folder / "camchain.yaml"
+    if not camchain.exists():
+        return read_rig(folder / "rig.toml")
+    with TemporaryDirectory() as work:
+        path = Path(work) / "rig.toml"
+        write_rig(path, import_kalibr(camchain))
+        return read_rig(path)
 
 
 def main() -> None:
