@@ -58,6 +58,6 @@ def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: st
 
 def _quality_text(quality: Quality) -> str:
     lines = ["", "[quality]", f"mean_error_px = {round(quality.mean_error_px, 6)}", f"views = {quality.views}", "",
-             "[quality.deviations]"]
+             "[quality.standard_deviations]"]
     lines += [f"{string_text(name)} = {sigma:.6g}" for name, _, sigma in quality.parameters]
     return "\n".join(lines) + "\n"

@@ -83,10 +83,10 @@ def orient_corners(image: Grey, corners: Array, board: Board) -> Array:
 
     If several orders satisfy that, or none does, the first corner is the one nearest the image's upper left.
     """
-    turned = [np.rot90(corners, turns, axes=(0, 1)) for turns in range(4)]
-    fitting = [way for way in turned if way.shape[:2] == (board.rows, board.columns)]
-    dark = [way for way in fitting if _first_square_is_dark(image, way)] or fitting
-    return min(dark, key=lambda way: float(np.nansum(way[0, 0])) if np.isfinite(way[0, 0, 0]) else np.inf)
+    rotated = [np.rot90(corners, turns, axes=(0, 1)) for turns in range(4)]
+    fitting = [order for order in rotated if order.shape[:2] == (board.rows, board.columns)]
+    dark = [order for order in fitting if _first_square_is_dark(image, order)] or fitting
+    return min(dark, key=lambda order: float(np.nansum(order[0, 0])) if np.isfinite(order[0, 0, 0]) else np.inf)
 
 
 def _first_square_is_dark(image: Grey, corners: Array) -> bool:

@@ -122,7 +122,7 @@ def test_selects_two_of_three_cameras_by_name() -> None:
     assert parse_kalibr(unused, lower="cam1", upper="cam2").topics == (NAMED[1], "")
 
 
-@pytest.mark.parametrize(("old", "new", "says"), [
+@pytest.mark.parametrize(("old", "new", "message"), [
     ("camera_model: omni", "camera_model: pinhole", "cam0.camera_model: expected omni.*found 'pinhole'"),
     ("camera_model: omni", "camera_model: eucm", "found 'eucm'"),
     ("camera_model: omni", "camera_model: ds", "found 'ds'"),
@@ -138,10 +138,10 @@ def test_selects_two_of_three_cameras_by_name() -> None:
     ("cam0:", "- cam0:", "not a YAML file"),
     ("cam0:", "cam0: &a [*a]\ncam2:", "cam0: expected a table"),
 ])
-def test_errors_name_the_key(old: str, new: str, says: str) -> None:
+def test_errors_name_the_key(old: str, new: str, message: str) -> None:
     text = chain(BOTH, T_UPPER_LOWER, NAMED)
     assert old in text
-    with pytest.raises(CalibError, match=says) as caught:
+    with pytest.raises(CalibError, match=message) as caught:
         parse_kalibr(text.replace(old, new, 1), "c.yaml")
     assert str(caught.value).startswith("c.yaml: ") and "\n" not in str(caught.value)
 
@@ -154,7 +154,7 @@ def test_refuses_contradicting_transforms(wrong: Array) -> None:
     parse_kalibr(chain(BOTH, T_UPPER_LOWER @ se3.exp([0.0005, 0, 0, 0, 0.001, 0]), NAMED))
 
 
-@pytest.mark.parametrize(("text", "arguments", "says"), [
+@pytest.mark.parametrize(("text", "arguments", "message"), [
     (chain((None, None), None, NAMED), {}, "no transform between cam0 and cam1"),
     (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
     (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
@@ -164,8 +164,8 @@ def test_refuses_contradicting_transforms(wrong: Array) -> None:
     (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),
     ("", {}, "expected a YAML mapping"), ("[" * 3000, {}, "not a YAML file"), ("!!python/none x", {}, "YAML"),
 ])
-def test_refuses_files_with_missing_information(text: str, arguments: dict[str, str], says: str) -> None:
-    with pytest.raises(CalibError, match=says):
+def test_refuses_files_with_missing_information(text: str, arguments: dict[str, str], message: str) -> None:
+    with pytest.raises(CalibError, match=message):
         parse_kalibr(text, **arguments)
 
 

@@ -78,7 +78,7 @@ def test_refuses_to_export_an_omni_camera(omni_rig: Rig) -> None:
         export_ocam(omni_rig.lower.camera)
 
 
-@pytest.mark.parametrize(("old", "new", "says"), [
+@pytest.mark.parametrize(("old", "new", "message"), [
     ("5 -2.315000e+02", "6 -2.315000e+02", "line 3: expected 7 finite numbers"),
     ("5 -2.315000e+02", "x -2.315000e+02", "line 3: expected a count"),
     ("5 -2.315000e+02", "65 -2.315000e+02", "line 3: expected a count of 1 to 64"),
@@ -92,9 +92,9 @@ def test_refuses_to_export_an_omni_camera(omni_rig: Rig) -> None:
     ("480 640", "", "expected 5 lines of numbers.*found 4"),
     ("480 640", "480 640\n1", "found 6"),
 ])
-def test_errors_name_the_line(old: str, new: str, says: str) -> None:
+def test_errors_name_the_line(old: str, new: str, message: str) -> None:
     assert old in TEXT
-    with pytest.raises(CalibError, match=says) as caught:
+    with pytest.raises(CalibError, match=message) as caught:
         parse_ocam(TEXT.replace(old, new, 1), name="c.txt")
     assert str(caught.value).startswith("c.txt") and "\n" not in str(caught.value)
 
@@ -149,13 +149,13 @@ def test_reads_a_transform_in_every_format(tmp_path: Path, name: str, text: str)
     np.testing.assert_allclose(read_transform(tmp_path / name), T_LOWER_UPPER, atol=1e-15)
 
 
-@pytest.mark.parametrize(("name", "text", "says"), [
+@pytest.mark.parametrize(("name", "text", "message"), [
     ("t.toml", "T_x = 3", "T_x: unknown key"), ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
     ("t.toml", "[", "not a TOML file"), ("t.yml", "T_lower_upper: 3", "4 rows of 4 numbers"), ("t.yml", "[", "YAML"),
     ("t.txt", "1 0 0 0", "4 rows"), ("t.txt", "one", "expected 16 numbers"),
     ("t.txt", "1 " * 16, "expected a rotation"), ("t.txt", "nan " * 16, "finite"),
 ])
-def test_refuses_invalid_transform_files(tmp_path: Path, name: str, text: str, says: str) -> None:
+def test_refuses_invalid_transform_files(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(CalibError, match=says):
+    with pytest.raises(CalibError, match=message):
         read_transform(tmp_path / name)

@@ -73,7 +73,7 @@ def test_makes_a_rounded_rotation_orthonormal(omni_rig: Rig) -> None:
     assert rig_toml(found) == rig_toml(parse_rig(rig_toml(found)))
 
 
-@pytest.mark.parametrize(("old", "new", "says"), [
+@pytest.mark.parametrize(("old", "new", "message"), [
     ("schema = 1", "schema = 2", "schema: expected version 1, found 2"),
     ("schema = 1", "schema = true", "schema"),
     ("schema = 1\n", "", "schema: expected version 1, found nothing"),
@@ -101,13 +101,13 @@ def test_makes_a_rounded_rotation_orthonormal(omni_rig: Rig) -> None:
     ("inner_px = 0.0", "image = 'data:image/png;base64,?'", "lower.mask.image: expected base64"),
     ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected an image"),
 ])
-def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, says: str) -> None:
+def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) -> None:
     text = rig_toml(with_masks(omni_rig))
     assert old in text
     with pytest.raises(CalibError) as caught:
         parse_rig(text.replace(old, new, 1), name="my.toml")
     assert str(caught.value).startswith("my.toml: ") and str(caught.value).count("my.toml") == 1
-    assert says in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_refuses_a_reflection(ocam_rig: Rig) -> None:

@@ -36,10 +36,11 @@ def mild_rig(seed: int, size: int) -> Rig:
     """Return a rig with mirror scale, baseline and a small misalignment that depend on the seed."""
     rng = np.random.default_rng([seed, 7])
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
-    turned, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
+    rotation_deg, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
     x, y = rng.uniform(-4, 4, 2)
     return make_rig(size=size, scale=float(scale), baseline_m=float(baseline), offset_mm=(x, y),
-                    misaligned_deg=(turned[0], turned[1], turned[2]), lower_misaligned_deg=(lower[0], lower[1], 0.0))
+                    misaligned_deg=(rotation_deg[0], rotation_deg[1], rotation_deg[2]),
+                    lower_misaligned_deg=(lower[0], lower[1], 0.0))
 
 
 def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
+from calib.rig import MountedCamera
 from tests.simulation.mirrors import MirrorCamera
+from tests.simulation.ray_caster import render
+from tests.simulation.surfaces import Rectangle, Scene
 
 CENTER, SIZE = (384.2, 381.1), (768, 768)
 NOMINAL = MirrorCamera(207.0, CENTER, SIZE)
@@ -36,3 +40,17 @@ def test_project_inverts_the_rays_at_any_distance() -> None:
 def test_a_tilted_camera_is_not_central() -> None:
     origins, rays = TILTED.rays(PIXELS)
     assert 5e-4 < np.linalg.norm(np.cross(origins, rays), axis=1).max() < 5e-3
+
+
+def test_a_rendered_spot_near_a_tilted_camera_equals_the_projection() -> None:
+    """At 0.25 m the ray's origin on the mirror moves the image by about a pixel."""
+    camera = MirrorCamera(52.0, (95.5, 95.5), (192, 192), tilt_rad=(0.05, -0.03), conic=0.05)
+    middle = np.array([0.2, 0.1, 0.1])
+    edge_u, edge_v = np.array([0.012, -0.024, 0.0]), np.array([0.01, 0.005, -0.025])
+    spot = Rectangle(middle - (edge_u + edge_v) / 2, edge_u, edge_v, np.full((8, 8), 255, np.uint8))
+    mounted = MountedCamera(camera, np.eye(4), Mask(camera.center, 0.0, 92.0))
+    image = render(Scene((spot,)), mounted, np.eye(4), 8).astype(float)
+    rows, columns = np.indices(image.shape)
+    centroid = np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum()
+    grid = spot.points(np.stack(np.meshgrid(*2 * [np.linspace(0.05, 0.95, 10)]), axis=-1).reshape(-1, 2))
+    np.testing.assert_allclose(centroid, camera.project(grid).mean(axis=0), atol=0.1)

@@ -186,5 +186,5 @@ def test_recovers_scale_and_centre_from_rendered_boards() -> None:
         axis = camera.lift(np.array([camera.center]))[0]
         angles.append(np.arccos(camera.lift(pixels) @ axis))
     assert np.abs(angles[0] / angles[1] - 1).max() < 1e-3
-    turned = omni.camera.lift(pixels) - ocam.camera.lift(pixels) @ unified_from_ocam(ocam.camera)[:3, :3].T
-    assert np.linalg.norm(turned, axis=1).max() < 1e-3
+    difference = omni.camera.lift(pixels) - ocam.camera.lift(pixels) @ unified_from_ocam(ocam.camera)[:3, :3].T
+    assert np.linalg.norm(difference, axis=1).max() < 1e-3

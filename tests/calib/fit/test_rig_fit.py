@@ -36,7 +36,7 @@ def pairs(board: Board, count: int = 10, noise_px: float = 0.0, seed: int = 0) -
     return made
 
 
-def turned(view: PairView, order: Array) -> PairView:
+def with_upper_order(view: PairView, order: Array) -> PairView:
     lower, upper = view.seen
     assert upper
     return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
@@ -52,7 +52,7 @@ def off(found: RigCalibration) -> tuple[float, float]:
 def test_recovers_the_transform_for_every_orientation_of_the_boards(board: Board) -> None:
     orders = ambiguous_orders(board)
     assert len(orders) == {ODD: 1, EVEN: 2, SQUARE: 4}[board]
-    views = [turned(view, orders[k % len(orders)]) for k, view in enumerate(pairs(board))]
+    views = [with_upper_order(view, orders[k % len(orders)]) for k, view in enumerate(pairs(board))]
     start = replace(LOWER, focal=(-209.0, 211.0), center=(395.5, 379.8))
     found = calibrate_rig(views, board, (start, UPPER))
     assert max(off(found)) < 1e-3 and found.pairs == 10 and found.rejected == ()

@@ -75,7 +75,7 @@ def test_invalid_requests_fail_before_files_are_written(omni_rig: Rig, ocam_rig:
         (("export", tmp_path / "omni.toml", "--format", "ocam", "-o", tmp_path / "o"), "use --format kalibr"),
         (("export", tmp_path / "ocam.toml", "--format", "kalibr", "-o", tmp_path / "k"), "use --format ocam"),
     ]
-    for words, says in cases:
-        with pytest.raises((CalibError, OmnidError), match=says):
+    for words, message in cases:
+        with pytest.raises((CalibError, OmnidError), match=message):
             omnid(*words)
         assert sorted(tmp_path.iterdir()) == before

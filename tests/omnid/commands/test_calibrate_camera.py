@@ -105,18 +105,18 @@ def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
     return kinds[kind]
 
 
-@pytest.mark.parametrize(("kind", "says"), [
+@pytest.mark.parametrize(("kind", "message"), [
     ("blank", "no board of 6x5 inner corners in any of 1 images; count the inner corners"),
     ("three", "expected at least 4 views of the board, found 3; take more images"),
     ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
     ("text", "notes.png: expected an image"),
     ("empty", "no image"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
 ])
-def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, message: str,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*bad_folder(tmp_path, folder, kind), "-o", tmp_path / "camera.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
+    assert message in line
     assert not (tmp_path / "camera.toml").exists()
 
 

@@ -107,16 +107,16 @@ def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pyte
     assert output.startswith("drifted: ") and "lower rim: centre moved by -9.0" in output and "upper rim" in output
 
 
-@pytest.mark.parametrize(("words", "says"), [
+@pytest.mark.parametrize(("words", "message"), [
     ([], "no rig.toml is attached to the log"), (["--rig", "none.toml"], "none.toml: cannot be read"),
     (["--refine"], "--refine and -o go together"), (["-o", "rig.toml"], "--refine and -o go together"),
     (["--lower", "/x"], "no topic '/x'"),
 ])
-def test_invalid_input_is_one_line(scene: Path, words: list[str], says: str,
+def test_invalid_input_is_one_line(scene: Path, words: list[str], message: str,
                                    capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scene / "log.mcap", *words) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
+    assert message in line
 
 
 def test_images_of_another_size_are_a_one_line_error(scene: Path, tmp_path: Path,

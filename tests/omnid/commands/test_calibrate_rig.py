@@ -207,7 +207,7 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
     return [made]
 
 
-@pytest.mark.parametrize(("kind", "says"), [
+@pytest.mark.parametrize(("kind", "message"), [
     ("three", "expected at least 4 views of the board, found 3"),
     ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
     ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected an image"),
@@ -216,26 +216,26 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
     ("size of camera", "--lower-camera: expected a camera of 480x480 px like the lower images, found 640x480 px"),
     ("topic", "only a log has topics"),
 ])
-def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, says: str,
+def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, message: str,
                                                capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*bad(folder, tmp_path, kind), "-o", tmp_path / "rig.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert says in line and not (tmp_path / "rig.toml").exists()
+    assert message in line and not (tmp_path / "rig.toml").exists()
 
 
-@pytest.mark.parametrize(("square_mm", "words", "says"), [
+@pytest.mark.parametrize(("square_mm", "words", "message"), [
     (25, ["--expected-baseline-mm", "180"], "squares of 29.97 mm would explain it"),
     (0.3, [], "expected a baseline of 10 to 3000 mm, found 1.802 mm"),
     (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
     (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),
 ])
 def test_detects_a_wrong_square_by_the_baseline(folder: Path, four: Path, tmp_path: Path, square_mm: float,
-                                                words: list[str], says: str,
+                                                words: list[str], message: str,
                                                 capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rig.toml"
     assert run(four, "-o", out, *given(folder), *words, square_mm=square_mm) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert says in line and not out.exists()
+    assert message in line and not out.exists()
 
 
 def test_suggests_the_right_number_of_corners(folder: Path, four: Path, tmp_path: Path,
