@@ -16,7 +16,7 @@ from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
-from omnid.commands import calibrate_camera, calibrate_check, calibrate_rig
+from omnid.commands import calibrate_camera, calibrate_check, calibrate_drive, calibrate_rig
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -28,6 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     calibrate_camera.add_parser(actions)
     calibrate_rig.add_parser(actions)
     calibrate_check.add_parser(actions)
+    calibrate_drive.add_parser(actions)
     importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, or from two OCamCalib files")
     exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
     _add_import(importing)

@@ -51,7 +51,7 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
     return np.asarray(np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None])
 
 
-def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel) -> Array:
+def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoModel, *, upper: bool = False) -> Array:
     """Return matrices (N, 2, 2): pixels moved in the current panorama per pixel moved in the keyframe's.
 
     views (N, 3) and slopes (N, 2) in the keyframes, T_curr_ref (N, 4, 4) from them. The identity replaces a warp that
@@ -62,7 +62,7 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     moved[..., 2] += slopes @ steps.T
     points = triangulate(moved.reshape(-1, 3), model.cylinder, model.baseline_m).reshape(-1, 4, 3)
     seen = view(se3.apply(T_curr_ref, points).reshape(-1, 3), model.cylinder, model.baseline_m)
-    ends = seen[:, :2].reshape(-1, 4, 2)
+    ends = seen[:, [0, 2] if upper else [0, 1]].reshape(-1, 4, 2)
     difference = ends[:, 0::2] - ends[:, 1::2]
     difference[..., 0] = model.cylinder.wrap(difference[..., 0])
     warps = np.swapaxes(difference, 1, 2) / (2 * HALF_BASE_PX)

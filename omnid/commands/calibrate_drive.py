@@ -1,0 +1,82 @@
+"""`omnid calibrate drive`: a better rig.toml from ordinary drives, without a board."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.rig_file import read_rig, write_rig
+from omnid.errors import OmnidError
+from omnid.sinks.files import check_outputs
+
+if TYPE_CHECKING:
+    from omnid.calibration.drive import DriveCalibration
+
+SMALL_GAIN = 0.95  # the error of the landmarks with the new rig, as share of that with the old one
+
+
+def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `drive` to `omnid calibrate`."""
+    parser = actions.add_parser("drive", help="a better rig.toml from ordinary drives with turns, without a board")
+    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs")
+    parser.add_argument("--rig", type=Path, required=True, metavar="FILE", help="the rig.toml to start from; a nominal "
+                        "one will do: mirror data sheet, centre of the images, baseline by ruler")
+    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
+    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
+    parser.add_argument("--distance-m", type=float, metavar="M", help="straight distance from the first to the last "
+                        "image of a single log: sets the baseline's length, which is kept otherwise")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Return 0 where the rig was written, 1 where the drive did not make it better."""
+    from omnid.calibration.drive import calibrate_drive, distance_m, rescaled
+
+    _check(args)
+    found = calibrate_drive(args.logs, read_rig(args.rig), (args.lower, args.upper),
+                            lambda line: print(line, file=sys.stderr))
+    print("\n".join(describe(found)))
+    if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px:
+        print(f"{args.rig} fits these drives as well as any rig: nothing was written")
+        return 1
+    rig = found.rig
+    if args.distance_m:
+        ratio = args.distance_m / distance_m(found)
+        rig = rescaled(rig, ratio)
+        print(f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance")
+    write_rig(args.output, rig)
+    print(f"{args.output}: written")
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    inputs = [("the log that is read", log) for log in args.logs]
+    check_outputs([("--output", args.output)], [*inputs, ("the rig that is read", args.rig)])
+    if args.distance_m is not None and not (math.isfinite(args.distance_m) and args.distance_m > 0):
+        raise OmnidError(f"--distance-m {args.distance_m}: expected a distance above 0 m")
+    if args.distance_m is not None and len(args.logs) > 1:
+        raise OmnidError(f"--distance-m is the length of one drive; found {len(args.logs)} logs")
+
+
+def describe(found: DriveCalibration) -> list[str]:
+    """Return the result as lines of text: errors before and after, scale, and each parameter with its sigma."""
+    adjustment, parameters = found.adjustment, found.adjustment.parameters
+    lines = [f"{found.keyframes} keyframes, {len(adjustment.state.points)} landmarks, {len(adjustment.observations)} "
+             f"observations; error {found.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after",
+             f"lengths change by {100 * found.scale_change:+.3f} %, uncertain by {100 * found.scale_sigma:.3f} %",
+             f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}"]
+    after = parameters.values + adjustment.state.steps * parameters.units
+    sigmas = adjustment.sigmas * parameters.units
+    rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
+    for name, old, new, sigma, seen in rows:
+        unseen = "" if seen else "  the drive tells nothing of it"
+        lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
+    if not np.all(adjustment.seen):
+        lines.append("parameters of which the drive tells nothing stay near their start")
+    return lines

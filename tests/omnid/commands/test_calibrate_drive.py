@@ -1,0 +1,83 @@
+"""`omnid calibrate drive`: refusals in one line, and a disturbed rig put right from a drive through a rendered room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.models.unified import UnifiedCamera
+from calib.rig import MountedCamera, Rig
+from calib.rig_file import read_rig, write_rig
+from omnid import replay
+from omnid.cli import main
+from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import evaluate
+from tests.simulation import build, write_log
+
+
+def calibrate(*words: object) -> int:
+    return main(["calibrate", "drive", *map(str, words)])
+
+
+def test_a_short_drive_is_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
+    assert code == 2 and "take a longer drive" in capsys.readouterr().err
+    assert not (tmp_path / "rig.toml").exists()
+
+
+@pytest.mark.parametrize(("distance", "logs", "words"), [
+    ("0", 1, "expected a distance above 0 m"), ("nan", 1, "expected a distance above 0 m"),
+    ("3", 2, "is the length of one drive"),
+])
+def test_a_distance_that_cannot_be_is_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                              distance: str, logs: int, words: str) -> None:
+    code = calibrate(*[scene / "log.mcap"] * logs, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml",
+                     "--distance-m", distance)
+    assert code == 2 and words in capsys.readouterr().err
+
+
+def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = read_rig(scene / "rig.toml")
+    lower, upper = rig.topics
+    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--lower", upper,
+                     "--upper", lower)
+    assert code == 2 and len(capsys.readouterr().err.splitlines()) < 6
+    assert not (tmp_path / "rig.toml").exists()
+
+
+def disturbed(mounted: MountedCamera, sign: float) -> MountedCamera:
+    """Return the camera with its focal length 0.1 %, its centre 0.3 px and xi 0.5 % off; the horizon stays."""
+    camera = mounted.camera
+    assert isinstance(camera, UnifiedCamera)
+    xi = camera.xi * (1 + sign * 0.005)
+    focal = tuple(f * (1 + sign * 0.001) * xi / camera.xi for f in camera.focal)
+    centre = (camera.center[0] + 0.3, camera.center[1] - sign * 0.3)
+    return replace(mounted, camera=replace(camera, xi=xi, focal=(focal[0], focal[1]), center=centre))
+
+
+def errors(folder: Path, rig: Rig | Path) -> tuple[float, float]:
+    """Return the relative error of length and the ATE [m] of a replay with a rig."""
+    result = replay(folder / "log.mcap", rig=rig)
+    result.save_tum(folder / "estimate.txt")
+    found = evaluate(read_tum(folder / "estimate.txt"), read_tum(folder / "truth.txt"))
+    return found.length_error_ratio, found.ate_rmse_m
+
+
+@pytest.mark.slow
+def test_a_disturbed_rig_is_put_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Calibrate on a round through a room, drive between two walls: another log of the same rig."""
+    for name in ("rooms", "two_walls"):
+        run = build(name, 6)
+        write_log(tmp_path / name, run.rig, run.poses, run.scene, sensor=run.sensor, seed=6)
+    truth = read_rig(tmp_path / "rooms" / "rig.toml")
+    wrong = replace(truth, lower=disturbed(truth.lower, 1.0), upper=disturbed(truth.upper, -1.0))
+    write_rig(tmp_path / "wrong.toml", wrong)
+    code = calibrate(tmp_path / "rooms" / "log.mcap", "--rig", tmp_path / "wrong.toml", "-o", tmp_path / "better.toml")
+    assert code == 0 and "lengths change by" in capsys.readouterr().out
+    before, after = (errors(tmp_path / "two_walls", tmp_path / name) for name in ("wrong.toml", "better.toml"))
+    assert before[1] > 4e-3
+    assert abs(after[0]) < 8e-4 and after[1] < 2e-3
+    assert np.isclose(read_rig(tmp_path / "better.toml").baseline_m, truth.baseline_m)
