@@ -50,7 +50,7 @@ DRIFT_ROUNDS = 3
 NOISE_PX = 0.1
 GRADIENT_STEP = 0.01
 # What is believed of a rig before the drive, as far as its file does not say it better: a nominal rig.
-XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, RADIAL_SIGMA = 0.02, 0.02, 3.0, 0.003
+XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, DISTORTION_SIGMA_PX = 0.02, 0.02, 3.0, 1.0
 TURN_SIGMA_RAD, DIRECTION_SIGMA_RAD = np.deg2rad(1.5), np.deg2rad(2.0)
 
 
@@ -259,25 +259,21 @@ def _require_motion(T_rig_odom: Array, drives: int) -> None:
 
 
 def _prior(parameters: RigParameters) -> Array:
-    """Return the sigmas (P,) of the steps of a nominal rig."""
-    sigmas = [_prior_of(name, value) for name, value in zip(parameters.names, parameters.values, strict=True)]
-    return np.asarray(np.array(sigmas) / parameters.units)
+    """Return the sigmas (P,) of the steps of a nominal rig; a step moves the image by about a pixel."""
+    rows = zip(parameters.names, parameters.values, parameters.units, strict=True)
+    return np.array([_prior_of(name.split()[-1], value, unit) for name, value, unit in rows])
 
 
-def _prior_of(name: str, value: float) -> float:
-    """Return the sigma of a parameter in its own unit."""
-    word = name.split()[-1]
-    if word in ("r_x", "r_y", "r_z"):
-        return float(TURN_SIGMA_RAD)
-    if word in ("e_x", "e_y"):
-        return float(DIRECTION_SIGMA_RAD)
-    if word in ("fu", "fv"):
-        return float(FOCAL_SIGMA * abs(value))
-    if word in ("pu", "pv", "center_row", "center_column"):
-        return CENTRE_SIGMA_PX
-    if word == "xi":
-        return XI_SIGMA
-    if word in ("k1", "k2", "p1", "p2", "c", "d"):
-        return RADIAL_SIGMA
-    return float(FOCAL_SIGMA * abs(value))  # coefficients of a polynomial
-
+def _prior_of(name: str, value: float, unit: float) -> float:
+    """Return the sigma of a parameter in steps."""
+    if name in ("r_x", "r_y", "r_z"):
+        return float(TURN_SIGMA_RAD / unit)
+    if name in ("e_x", "e_y"):
+        return float(DIRECTION_SIGMA_RAD / unit)
+    if name in ("pu", "pv", "center_row", "center_column"):
+        return CENTRE_SIGMA_PX / unit
+    if name == "xi":
+        return XI_SIGMA / unit
+    if name in ("k1", "k2", "p1", "p2", "c", "d"):
+        return DISTORTION_SIGMA_PX
+    return FOCAL_SIGMA * abs(value) / unit  # focal lengths and coefficients of a polynomial
