@@ -54,8 +54,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.errors omnid.messages omnid.runs omnid.settings omnid.stages",
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig calib.se3 "
-        "drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig omnid.errors omnid.messages "
-        "omnid.report omnid.stages",
+        "drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig omnid.core.stereo "
+        "omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state",
     "omnid.cli": "calib.errors drivers.errors omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
@@ -76,7 +76,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places": "calib.se3 omnid.core.odometry omnid.core.stereo",
-    "omnid.core.rig": "calib.fit calib.panorama omnid.core.odometry",
+    "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":
         "calib.panorama drivers.cameras drivers.frame omnid.config omnid.controller omnid.core.control "
