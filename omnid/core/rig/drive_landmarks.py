@@ -81,7 +81,7 @@ class DriveLandmarks:
         self._start_landmarks(view)
 
     def observations(self) -> PanoramaObservations:
-        """Return all observations of the landmarks that MIN_KEYFRAMES have seen, numbered anew."""
+        """Return all observations of the landmarks that MIN_KEYFRAMES have seen, numbered from 0."""
         keyframe, landmark, camera = (np.concatenate([part[i] for part in self._found]) for i in range(3))
         count = np.bincount(landmark[camera == 0], minlength=len(self._points))
         kept = count[landmark] >= MIN_KEYFRAMES
