@@ -17,6 +17,12 @@ from calib.models.ocam import VIEWS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.validation import ValidatedTable, read_bytes
 
+# Signature, length and name of the first chunk, then width and height (PNG 1.2, 3.1 and 4.1.1).
+PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+PNG_FIRST_CHUNK = 8
+# Length, name and CRC.
+PNG_CHUNK_BYTES = 12
+MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
@@ -66,16 +72,49 @@ def _mask(table: ValidatedTable, folder: Path | None) -> Mask:
     outer = values.number("outer_px") if values.has("outer_px") else float("inf")
     if not 0 <= inner < outer:
         values.fail("inner_px", "0 <= inner_px < outer_px")
-    image = _mask_image(values, folder) if values.has("image") else None
-    if image is not None and image.shape[::-1] != table.size("size"):
-        raise CalibError(f"{table.file}: {values.path}.image: expected {table.size('size')} pixels (width, height) "
-                         f"like the camera's images, found {image.shape[::-1]}")
+    image = _mask_image(values, folder, table.size("size")) if values.has("image") else None
     return Mask((u, v), inner, outer, image)
 
 
-def _mask_image(values: ValidatedTable, folder: Path | None) -> NDArray[np.uint8]:
+def _mask_image(values: ValidatedTable, folder: Path | None, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the image of a mask (H, W), whose size is that of the camera's images.
+
+    The header's size is checked first, since few bytes of a PNG can describe an image that fills the memory. An
+    embedded image may come with a log of unknown origin: it must be a PNG. A file may have any format of OpenCV.
+    """
     source = values.text("image")
-    data = _embedded(values, source) if source.startswith(EMBEDDED) else _beside(values, source, folder)
+    embedded = source.startswith(EMBEDDED)
+    data = _embedded(values, source) if embedded else _beside(values, source, folder)
+    if data.startswith(PNG_HEAD):
+        _require_size(values, size, (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")))
+        if _is_animated(data):
+            values.fail("image", "a PNG without animation")
+    elif embedded:
+        values.fail("image", "a PNG")
+    image = _decoded(values, data)
+    _require_size(values, size, image.shape[::-1])
+    return image
+
+
+def _require_size(values: ValidatedTable, size: tuple[int, int], found: tuple[int, ...]) -> None:
+    if found != size:
+        raise CalibError(f"{values.file}: {values.path}.image: expected {size} pixels (width, height) like the "
+                         f"camera's images, found {found}")
+
+
+def _is_animated(data: bytes) -> bool:
+    """True if a PNG has a chunk acTL before its pixels, or no pixels; OpenCV takes 10 bytes a pixel for an animation.
+    """
+    offset = PNG_FIRST_CHUNK
+    for _ in range(MAX_PNG_CHUNKS):
+        name = data[offset + 4:offset + 8]
+        if name in (b"IDAT", b"acTL", b""):
+            return name != b"IDAT"
+        offset += int.from_bytes(data[offset:offset + 4], "big") + PNG_CHUNK_BYTES
+    return True
+
+
+def _decoded(values: ValidatedTable, data: bytes) -> NDArray[np.uint8]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:

@@ -12,10 +12,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from calib import se3
+from calib.bounded_yaml import MAX_BYTES, parse_yaml
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
@@ -33,7 +33,7 @@ LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 
 def import_kalibr(path: Path, lower: str = "", upper: str = "") -> Rig:
     """Read the rig of a Kalibr file; lower and upper: names of cameras (cam0), instead of topic or height."""
-    return parse_kalibr(read_bytes(path), str(path), lower, upper)
+    return parse_kalibr(read_bytes(path, MAX_BYTES), str(path), lower, upper)
 
 
 def parse_kalibr(text: str | bytes, name: str = "camchain.yaml", lower: str = "", upper: str = "") -> Rig:
@@ -54,7 +54,7 @@ def parse_kalibr(text: str | bytes, name: str = "camchain.yaml", lower: str = ""
 def load_yaml(text: str | bytes, name: str) -> Mapping[object, object]:
     """Parse a YAML text (plain data only) and return its mapping."""
     try:
-        values = YAML(typ="safe", pure=True).load(decode(text, name))
+        values = parse_yaml(decode(text, name))
     except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError) as error:
         raise CalibError(f"{name}: not a YAML file: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(values, Mapping):

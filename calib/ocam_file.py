@@ -10,14 +10,13 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import OcamCamera, View
+from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.rig import Rig
 from calib.rig_frame import rig_between
-from calib.validation import decode, read_bytes, shown
+from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, read_bytes, shown
 
-# The limit of the toolbox's own C reader.
-MAX_COEFFICIENTS = 64
-MAX_SIDE_PX = 32767
+# A file of the toolbox has about 2 kB.
+MAX_BYTES = 1 << 16
 # The degree of the inverse polynomial is raised until it reaches this error: the toolbox's own goal and bound.
 INVERSE_GOAL_PX = 0.01
 INVERSE_DEGREES = range(4, 26)
@@ -54,12 +53,14 @@ class _Line:
 
 def import_ocam(lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror") -> Rig:
     """Read the rig of two calib_results.txt; its frame is the lower viewpoint's, see rig_between."""
-    lower, upper = (parse_ocam(read_bytes(path), view, str(path)) for path in (lower_path, upper_path))
+    lower, upper = (parse_ocam(read_bytes(path, MAX_BYTES), view, str(path)) for path in (lower_path, upper_path))
     return rig_between(lower, upper, T_lower_upper)
 
 
 def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
     """Parse the camera of a calib_results.txt's text; the inverse polynomial is checked and not used."""
+    if len(text) > MAX_BYTES:
+        raise CalibError(f"{name}: expected at most {MAX_BYTES} bytes, found {len(text)}")
     lines = [_Line(number, line.split(), name) for number, line in enumerate(decode(text, name).splitlines(), 1)
              if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) != 5:
@@ -77,8 +78,8 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
 
 def _size(line: _Line) -> tuple[int, int]:
     height, width = line.numbers("height and width of the image", 2)
-    if not all(1 <= side <= MAX_SIDE_PX and side == int(side) for side in (height, width)):
-        line.fail(f"the image's height and width in whole pixels, 1 to {MAX_SIDE_PX}")
+    if not is_image_size(width, height) or (height, width) != (int(height), int(width)):
+        line.fail(f"the image's height and width in whole pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all")
     return int(width), int(height)
 
 

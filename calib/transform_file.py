@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
+from calib.bounded_yaml import MAX_BYTES
 from calib.errors import CalibError
 from calib.kalibr import load_yaml
 from calib.models.camera import Array
@@ -19,7 +20,7 @@ INVERSE_KEY = "T_upper_lower"
 
 def read_transform(path: Path) -> Array:
     """Read T_lower_upper (4, 4): TOML or YAML with that key (or T_upper_lower), or a text of its 16 numbers."""
-    text = decode(read_bytes(path), str(path))
+    text = decode(read_bytes(path, MAX_BYTES), str(path))
     if path.suffix == ".toml":
         return _named(toml_table(text, str(path)))
     if path.suffix in (".yaml", ".yml"):

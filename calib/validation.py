@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from calib import se3
+from calib.bounded_toml import parse_toml
 from calib.errors import CalibError
 from calib.models.camera import Array
 
@@ -18,21 +18,22 @@ from calib.models.camera import Array
 MAX_FILE_BYTES = 16_000_000
 SHOWN_CHARACTERS = 80
 MAX_SIDE_PX = 32767
+MAX_PIXELS = 64 * 2**20
 # Larger numbers would overflow in products.
 MAX_NUMBER = 1e300
 # A rotation typed with few digits is made orthonormal; one that a program wrote is not changed.
 ORTHONORMAL_TOLERANCE = 1e-9
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a calibration file of at most MAX_FILE_BYTES."""
+def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """Read a calibration file of at most limit bytes."""
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(limit + 1)
     except OSError as error:
         raise CalibError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise CalibError(f"{path}: expected a calibration file, found more than {MAX_FILE_BYTES} bytes")
+    if len(data) > limit:
+        raise CalibError(f"{path}: expected a calibration file, found more than {limit} bytes")
     return data
 
 
@@ -107,9 +108,9 @@ class ValidatedTable:
         """Return the image size (width, height) [px] under a key."""
         value = self.values.get(key)
         whole = isinstance(value, list) and [type(item) for item in value] == [int, int]
-        if not whole or not all(1 <= item <= MAX_SIDE_PX for item in value or ()):
-            self.fail(key, f"[width, height] in pixels, 1 to {MAX_SIDE_PX}")
-        width, height = value or (0, 0)
+        width, height = value if whole and value else (0, 0)
+        if not is_image_size(width, height):
+            self.fail(key, f"[width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all")
         return width, height
 
     def transform(self, key: str) -> Array:
@@ -136,6 +137,11 @@ def rigid(T: Array) -> Array:
     return se3.transform(left @ right, T[:3, 3])
 
 
+def is_image_size(width: float, height: float) -> bool:
+    """True if images of this size [px] are supported."""
+    return min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX and width * height <= MAX_PIXELS
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
 
@@ -143,8 +149,8 @@ def _is_number(value: object) -> bool:
 def toml_table(text: str | bytes, name: str) -> ValidatedTable:
     """Parse a TOML text and return its top table; name is used in error messages."""
     try:
-        return ValidatedTable(tomllib.loads(decode(text, name)), name)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        return ValidatedTable(parse_toml(decode(text, name)), name)
+    except (RecursionError, ValueError) as error:
         raise CalibError(f"{name}: not a TOML file: {error}") from error
 
 

@@ -15,16 +15,25 @@ from drivers.errors import FrameDecodeError
 Camera = Literal["lower", "upper"]
 
 MAX_PIXELS = 64 * 2**20
+# Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
+MAX_SAMPLES = 64 * 2**20
 _MAX_JPEG_SEGMENTS = 1000
 _TAIL_BLOCK_BYTES = 4096  # the padding is searched backwards in blocks of this size
 _TAIL_BYTES = 16  # before the padding; longer than any end marker
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _END_MARKER = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
-_PNG_SIZE = slice(16, 24)  # width and height in the IHDR chunk (PNG 1.2, 4.1.1)
+_PNG_HEADER = slice(12, 26)  # chunk IHDR: name, width, height, bit depth, colour type (PNG 1.2, 4.1.1)
+_PNG_FIRST_CHUNK = 8
+_PNG_CHUNK_BYTES = 12  # length, name and CRC
+_MAX_PNG_CHUNKS = 1000
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _JPEG_FIRST_FRAME, _JPEG_LAST_FRAME = 0xC0, 0xCF  # markers SOF0 to SOF15 (ITU T.81, table B.1)
 _JPEG_NO_FRAME = (0xC4, 0xC8, 0xCC)  # among them: DHT, JPG, DAC
 _JPEG_FILL = 0xFF
-_JPEG_FRAME_BYTES = 9  # marker, length, precision, height, width
+_JPEG_NO_LENGTH = (0x00, 0x01, *range(0xD0, 0xDA))  # stuffed byte, TEM, RST0 to RST7, SOI, EOI: not in a header
+_JPEG_LENGTH_BYTES = 2  # the length counts itself
+_JPEG_SCAN = 0xDA  # SOS: the header ends here
+_JPEG_FRAME_BYTES = 10  # marker, length, precision, height, width, number of components
 _CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
 _MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
@@ -89,8 +98,10 @@ def _decompress(frame: Frame) -> NDArray[np.uint8]:
     # libjpeg fills the missing part of a truncated image with grey and reports success, so the end is checked first
     if not _unpadded_tail(data).endswith(_END_MARKER[frame.encoding]):
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
-    width, height = _png_size(data) if frame.encoding == "png" else _jpeg_size(data)
+    width, height, channels = _png_size(data) if frame.encoding == "png" else _jpeg_size(data)
     _require_size(frame, width, height)
+    if width * height * channels > MAX_SAMPLES:
+        raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise _decode_error(frame, "its content is corrupt")
@@ -109,24 +120,50 @@ def _unpadded_tail(data: NDArray[np.uint8]) -> bytes:
     return b""
 
 
-def _png_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return (width, height) from the IHDR chunk."""
-    size = data[_PNG_SIZE].tobytes()
-    return int.from_bytes(size[:4], "big"), int.from_bytes(size[4:], "big")
+def _png_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
+    """Return width, height and channels from the IHDR chunk; zeros without it, and for an animation."""
+    header = data[_PNG_HEADER].tobytes()
+    if len(header) < _PNG_HEADER.stop - _PNG_HEADER.start or not header.startswith(b"IHDR"):
+        return 0, 0, 0
+    if _is_animated(data):
+        return 0, 0, 0
+    channels = _PNG_CHANNELS.get(header[13], max(_PNG_CHANNELS.values()))
+    return int.from_bytes(header[4:8], "big"), int.from_bytes(header[8:12], "big"), channels
 
 
-def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return (width, height) from the start-of-frame segment, (0, 0) without one (ITU T.81, B.1.1 and B.2.2)."""
+def _is_animated(data: NDArray[np.uint8]) -> bool:
+    """True if a chunk acTL precedes the pixels, or they do not follow: OpenCV takes 10 bytes a pixel for an animation.
+    """
+    offset = _PNG_FIRST_CHUNK
+    for _ in range(_MAX_PNG_CHUNKS):
+        length, name = data[offset : offset + 4].tobytes(), data[offset + 4 : offset + 8].tobytes()
+        if name in (b"IDAT", b"acTL", b""):
+            return name != b"IDAT"
+        offset += int.from_bytes(length, "big") + _PNG_CHUNK_BYTES
+    return True
+
+
+def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
+    """Return width, height and channels from the start-of-frame segment (ITU T.81, B.1.1 and B.2.2).
+
+    Zeros where the header has none or several, or a marker that libjpeg skips and that has no length: a walk that takes
+    the bytes after it for a length would find another size than libjpeg does.
+    """
     offset = 2  # after the start of image
+    found: list[tuple[int, int, int]] = []
     for _ in range(_MAX_JPEG_SEGMENTS):
         segment = data[offset : offset + _JPEG_FRAME_BYTES].tobytes()
         if len(segment) < _JPEG_FRAME_BYTES or segment[0] != _JPEG_FILL:
             break
-        marker = segment[1]
+        marker, length = segment[1], int.from_bytes(segment[2:4], "big")
+        if marker == _JPEG_SCAN:
+            return found[0] if len(found) == 1 else (0, 0, 0)
+        if marker in _JPEG_NO_LENGTH or (marker != _JPEG_FILL and length < _JPEG_LENGTH_BYTES):
+            break
         if _JPEG_FIRST_FRAME <= marker <= _JPEG_LAST_FRAME and marker not in _JPEG_NO_FRAME:
-            return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
-        offset += 1 if marker == _JPEG_FILL else 2 + int.from_bytes(segment[2:4], "big")
-    return 0, 0
+            found.append((int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big"), segment[9]))
+        offset += 1 if marker == _JPEG_FILL else 2 + length
+    return 0, 0, 0
 
 
 def _require_size(frame: Frame, width: int, height: int) -> None:

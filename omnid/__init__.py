@@ -12,9 +12,13 @@ The geometry (camera models, rigs, panoramas) is the package `calib`, a client o
 `omnid/examples` has a program for each. Names are imported when they are first used: `import omnid` loads no numpy.
 """
 
+import os
 from typing import TYPE_CHECKING
 
 from omnid.version import __version__
+
+# OpenCV reads this when it is loaded. It is drivers.frame.MAX_PIXELS, which is not imported here.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
 
 if TYPE_CHECKING:
     from omnid.api import Odometry, replay

@@ -19,7 +19,6 @@ import difflib
 import json
 import math
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import reduce
@@ -27,6 +26,7 @@ from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
 
+from calib.bounded_toml import parse_toml
 from omnid.errors import OmnidError
 
 T = TypeVar("T")
@@ -186,7 +186,7 @@ def _bytes_of(path: str | PathLike[str]) -> bytes:
 
 def _table_of(data: bytes) -> dict[str, Any]:
     try:
-        return tomllib.loads(data.decode())
+        return parse_toml(data.decode())
     except UnicodeDecodeError as error:
         raise OmnidError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
     except (ValueError, RecursionError) as error:
@@ -210,7 +210,7 @@ def _parsed_override(root: type, text: str, keys: _Keys) -> tuple[_Path, object]
 
 def _scalar(raw: str) -> object:
     try:
-        table = tomllib.loads(f"value = {raw}")
+        table = parse_toml(f"value = {raw}")
     except (ValueError, RecursionError):
         return raw
     return table["value"] if table.keys() == {"value"} else raw

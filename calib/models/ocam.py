@@ -23,6 +23,8 @@ from calib.models.camera import Array
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")
 
+# The limit of the toolbox's own C reader.
+MAX_COEFFICIENTS = 64
 # Size of the table of radii in which the inversion starts; each solution stays within one interval.
 TABLE_SIZE = 1025
 # Newton steps on one table interval: 3 reach the last bit, the others are for the model's end, where the slope is 0.
@@ -51,11 +53,18 @@ class OcamCamera:
     def __post_init__(self) -> None:
         self._check()
         radii = np.linspace(0, self.radius_limit_px, TABLE_SIZE)
-        angles = np.arctan2(self.height(radii), radii)
+        with np.errstate(all="ignore"):
+            heights = self.height(radii)
+        if not np.isfinite(heights).all():
+            raise self._not_evaluable()
+        angles = np.arctan2(heights, radii)
         object.__setattr__(self, "_radii", radii)
         object.__setattr__(self, "_angles", np.maximum.accumulate(angles))
 
     def _check(self) -> None:
+        if len(self.polynomial) > MAX_COEFFICIENTS:
+            raise CalibError(f"ocam camera: expected at most {MAX_COEFFICIENTS} polynomial coefficients, found "
+                             f"{len(self.polynomial)}")
         values = (*self.polynomial, *self.center_row_column, *self.affine, *self.tangential)
         if not self.polynomial or not np.isfinite(values).all():
             raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
@@ -78,9 +87,17 @@ class OcamCamera:
         Beyond that radius two pixels would have the same ray.
         """
         diagonal = float(np.hypot(*self.size))
-        turning = np.roots(self._turning()[::-1])
+        with np.errstate(all="ignore"):
+            try:
+                turning = np.roots(self._turning()[::-1])
+            except np.linalg.LinAlgError:  # infinite coefficients
+                raise self._not_evaluable() from None
         real = turning.real[(np.abs(turning.imag) < REAL_ROOT_PART * diagonal) & (turning.real > 0)]
         return min(diagonal, float(real.min())) if real.size else diagonal
+
+    def _not_evaluable(self) -> CalibError:
+        return CalibError("ocam camera: the polynomial overflows on the image; check its coefficients, the largest of "
+                          f"which is {max(self.polynomial, key=abs):g}")
 
     def _turning(self) -> Array:
         """Return the coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""

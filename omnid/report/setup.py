@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any, Final
@@ -10,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib import se3
+from calib.bounded_toml import parse_toml
 from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
@@ -71,10 +71,10 @@ def _changed(settings: bytes) -> list[tuple[str, str, str]] | None:
     if len(settings) > _MAX_SETTINGS_BYTES:
         return None
     try:
-        given = tomllib.loads(settings.decode())
+        given = parse_toml(settings.decode())
     except (ValueError, RecursionError):
         return None
-    defaults = dict(_flat(tomllib.loads(dump(Config()))))
+    defaults = dict(_flat(parse_toml(dump(Config()))))
     found = [(name, _shown(value), _shown(defaults[name]) if name in defaults else "unknown to this omnid")
              for name, value in _flat(given) if name not in defaults or defaults[name] != value]
     return found[:_MAX_SETTINGS]

@@ -99,7 +99,7 @@ def test_makes_a_rounded_rotation_orthonormal(omni_rig: Rig) -> None:
     ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
     ("inner_px = 0.0", "image = 'nowhere.png'", "lower.mask.image"),
     ("inner_px = 0.0", "image = 'data:image/png;base64,?'", "lower.mask.image: expected base64"),
-    ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected an image"),
+    ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected a PNG"),
 ])
 def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) -> None:
     text = rig_toml(with_masks(omni_rig))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import random
 import struct
 from typing import Any
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import omnid  # noqa: F401 - sets the limit of OpenCV
 from drivers.errors import FrameDecodeError
-from drivers.frame import Frame, gray
+from drivers.frame import MAX_PIXELS, MAX_SAMPLES, Frame, gray
+from tests.limited import run_limited
 
 WIDTH, HEIGHT = 37, 23
 COLOURS = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8)
@@ -187,3 +190,74 @@ def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
             assert gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data))).ndim == 2
         except FrameDecodeError:
             continue
+
+
+def with_size(data: bytes, width: int, height: int, marker: bytes = b"\xff\xc0") -> tuple[bytes, bytes, bytes]:
+    """Return a JPEG's bytes before its frame header, that header with another size, and the bytes after it."""
+    start = data.index(marker)
+    end = start + 2 + int.from_bytes(data[start + 2 : start + 4], "big")
+    header = data[start : start + 5] + struct.pack(">HH", height, width) + data[start + 9 : end]
+    return data[:start], header, data[end:]
+
+
+@pytest.mark.parametrize("marker", [b"\xff\x01", b"\xff\xd0", b"\xff\xe0\0\0", b"\xff\xe0\0\1"])
+def test_refuses_markers_that_hide_the_size_from_a_walk_over_the_segments(marker: bytes) -> None:
+    """libjpeg goes on right after such a marker; a walk that adds a length arrives at a second, small header."""
+    data = encoded(".jpg")
+    before, large, after = with_size(data, 30_000, 30_000)
+    small = with_size(data, WIDTH, HEIGHT)[1]
+    hidden = before[:2] + marker + before[2:] + large + after[:-2]
+    for jump in (2, 2 + int.from_bytes(hidden[4:6], "big")):
+        tail = bytes(max(0, 2 + jump - len(hidden))) + small + after
+        with pytest.raises(FrameDecodeError, match="its size is"):
+            gray(frame("jpeg", hidden + tail))
+
+
+def test_refuses_a_second_frame_header() -> None:
+    before, small, after = with_size(encoded(".jpg"), WIDTH, HEIGHT)
+    with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
+        gray(frame("jpeg", before + small + small + after))
+
+
+def test_refuses_an_animated_png() -> None:
+    data = encoded(".png")
+    with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
+        gray(frame("png", data[:33] + b"\0\0\0\x04tEXtIDAT\0\0\0\0" + b"\0\0\0\x08acTL" + bytes(12) + data[33:]))
+
+
+def test_refuses_a_png_whose_first_chunk_is_no_header() -> None:
+    data = encoded(".png")
+    with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
+        gray(frame("png", data[:8] + b"\0\0\0\0tIME\0\0\0\0" + data[8:]))
+
+
+@pytest.mark.parametrize(("suffix", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
+def test_refuses_colour_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str) -> None:
+    """Decoders of progressive JPEG and interlaced PNG store all samples."""
+    data, side = encoded(suffix), 5000
+    assert side * side < MAX_PIXELS and 3 * side * side > MAX_SAMPLES
+    large = data[:16] + struct.pack(">II", side, side) + data[24:]
+    if encoding == "jpeg":
+        large = b"".join(with_size(data, side, side))
+    with pytest.raises(FrameDecodeError, match="5000 x 5000 px of 3 channels"):
+        gray(frame(encoding, large))
+
+
+DECODE = """
+import omnid
+import cv2
+import numpy as np
+size = np.array([9000, 9000], "<i4").tobytes()
+bmp = b"BM" + bytes(8) + b"\\x36\\0\\0\\0\\x28\\0\\0\\0" + size + b"\\1\\0\\x18\\0" + bytes(2000)
+try:
+    print(cv2.imdecode(np.frombuffer(bmp, np.uint8), 0))
+except cv2.error as error:
+    print("CV_IO_MAX_IMAGE_PIXELS" in str(error))
+"""
+
+
+def test_opencv_itself_refuses_larger_images() -> None:
+    """Formats whose header is not read here are bounded as well."""
+    printed, memory_mb = run_limited(DECODE)
+    assert printed == "True" and memory_mb < 200
+    assert os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] == str(MAX_PIXELS)

@@ -1,0 +1,178 @@
+"""Calibration files of unknown origin: short texts that describe huge values are refused in bounded memory."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import tomllib
+import zlib
+from contextlib import nullcontext
+from itertools import pairwise
+
+import pytest
+
+from calib.bounded_toml import MAX_BYTES, MAX_DOTS, parse_toml
+from calib.bounded_yaml import parse_yaml
+from calib.errors import CalibError
+from calib.kalibr import export_kalibr, parse_kalibr
+from calib.ocam_file import parse_ocam
+from calib.rig import Rig
+from calib.rig_file import parse_rig, rig_toml
+from tests.limited import run_limited
+
+MAX_MEMORY_MB = 200
+OCAM = "5 {a0} 0 1e-3 1e-7 {a4}\n3 1 2 3\n240 320\n1 0 0\n{size}\n"
+PARSE = """
+from calib.errors import CalibError
+from calib.{module} import {function}
+try:
+    {function}({text})
+except CalibError as error:
+    print(error)
+"""
+
+
+def refusal(module: str, function: str, text: str) -> str:
+    """Return the error for a text, an expression of Python, that is parsed in limited memory."""
+    printed, memory_mb = run_limited(PARSE.format(module=module, function=function, text=text))
+    assert memory_mb < MAX_MEMORY_MB
+    assert printed and "\n" not in printed and len(printed) < 400
+    return printed
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("'a.' * 20_000 + 'a = 1'", "a key of at most"),
+        ("'a . ' * 3_000_000 + 'a = 1'", "characters beside strings"),
+        ("'[' + '\"\".' * 100_000 + 'a]'", "a key of at most"),
+        ("'schema = 0x' + 'f' * 200_000", "keys and numbers of at most"),
+        ("'a = [' + '1,' * 7_000_000 + ']'", "characters beside strings"),
+        ("'a = [' + '\"\",' * 1_000_000 + ']'", "characters beside strings"),
+        ("'\\n' * 200_000", "lines"),
+        ("'a = ' + '[' * 100_000", "TOML"),
+        ("'a = \"' + 'x' * 15_000_000", "a string has no end"),
+        ("'a = \"' + '\\\\\\\\' * 1_000_000 + '\"'", "schema: expected version 1"),
+    ],
+)
+def test_refuses_a_rig_that_would_fill_the_memory(text: str, reason: str) -> None:
+    assert reason in refusal("rig_file", "parse_rig", text)
+
+
+def test_refuses_yaml_aliases() -> None:
+    text = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
+    assert "no anchors and aliases" in refusal("kalibr", "parse_kalibr", repr(f"{text}cam0: *p\ncam1: *p\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("'cam0: 0x' + 'f' * 5000 + '\\ncam1: 1'", "values of at most 1000 characters"),
+        ("'cam0: [' + '1, ' * 1_000_000 + ']'", "at most 32768 characters"),
+        ("'cam0: [' + '1, ' * 9_000 + ']'", "2000 values"),
+        ("'- ' * 5000", "16 levels"),
+    ],
+)
+def test_refuses_yaml_beyond_its_limits(text: str, reason: str) -> None:
+    assert reason in refusal("kalibr", "parse_kalibr", text)
+
+
+@pytest.mark.parametrize("text", ["'1\\n' * 7_000_000", "'1 ' * 7_000_000"])
+def test_refuses_a_long_ocam_file(text: str) -> None:
+    assert "at most 65536 bytes" in refusal("ocam_file", "parse_ocam", text)
+
+
+@pytest.mark.parametrize(
+    ("a0", "a4", "size", "reason"),
+    [
+        ("nan", "0", "480 640", "finite numbers"),
+        ("-200", "1e308", "480 640", "overflows"),
+        ("-1e300", "1e-310", "480 640", "overflows"),
+        ("-200", "0", "32767 32767", "at most 67108864 in all"),
+        ("-200", "0", "480.5 640", "in whole pixels"),
+        ("-200", "0", "1e300 1", "in whole pixels"),
+    ],
+)
+def test_refuses_an_ocam_camera_that_cannot_be_evaluated(a0: str, a4: str, size: str, reason: str) -> None:
+    with pytest.raises(CalibError, match=reason) as caught:
+        parse_ocam(OCAM.format(a0=a0, a4=a4, size=size))
+    assert "\n" not in str(caught.value)
+
+
+def test_refuses_many_ocam_coefficients(ocam_rig: Rig) -> None:
+    text = rig_toml(ocam_rig).replace("polynomial = [", "polynomial = [" + "-1.0, " * 5000, 1)
+    with pytest.raises(CalibError, match="at most 64 polynomial coefficients"):
+        parse_rig(text)
+
+
+def test_refuses_a_rig_with_huge_images(omni_rig: Rig) -> None:
+    width, height = omni_rig.lower.camera.size
+    with pytest.raises(CalibError, match="at most 67108864 in all"):
+        parse_rig(rig_toml(omni_rig).replace(f"size = [{width}, {height}]", "size = [32767, 32767]"))
+
+
+def png_of(width: int, height: int, content: bytes) -> bytes:
+    """Return a grey PNG with the given header."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", content), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(struct.pack(">I", len(data)) + name + data
+                                         + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks)
+
+
+def test_refuses_a_mask_of_another_size_before_it_is_decoded(omni_rig: Rig) -> None:
+    image = base64.b64encode(png_of(8000, 8000, zlib.compress(bytes(8001 * 8000)))).decode()
+    mask = f'\n[lower.mask]\ncenter = [1, 1]\nimage = "data:image/png;base64,{image}"\n'
+    reason = refusal("rig_file", "parse_rig", repr(rig_toml(omni_rig) + mask))
+    assert "lower.mask.image: expected" in reason and "found (8000, 8000)" in reason
+
+
+def test_refuses_an_animated_mask(omni_rig: Rig) -> None:
+    width, height = omni_rig.lower.camera.size
+    still = png_of(width, height, zlib.compress(bytes((width + 1) * height)))
+    animated = still[:33] + b"\0\0\0\x08acTL" + bytes(12) + still[33:]
+    for image, reason in ((still, ""), (animated, "a PNG without animation")):
+        text = base64.b64encode(image).decode()
+        rig = rig_toml(omni_rig) + f'\n[lower.mask]\ncenter = [1, 1]\nimage = "data:image/png;base64,{text}"\n'
+        with pytest.raises(CalibError, match=reason) if reason else nullcontext():
+            parse_rig(rig)
+
+
+@pytest.mark.parametrize("name", ["jpg", "bmp"])
+def test_an_embedded_mask_is_a_png(omni_rig: Rig, name: str) -> None:
+    start = {"jpg": b"\xff\xd8\xff", "bmp": b"BM"}[name]
+    image = base64.b64encode(start + bytes(100)).decode()
+    with pytest.raises(CalibError, match=r"lower\.mask\.image: expected a PNG"):
+        parse_rig(rig_toml(omni_rig) + f'\n[lower.mask]\ncenter = [1, 1]\nimage = "data:image/png;base64,{image}"\n')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "a.b.c = 1.5e-3\n", "[a.b]\r\nc = '...........'\r\n", '"a.b.c.d.e.f.g.h.i.j.k" = 1', "a = 1 # ..........",
+        'a = """\n"quoted" ""two\\""" .........."""', "a = '''...'....''...........'''", "a = '''x'''''",
+        'a = """x"""""', "a = ''\nb = \"\"", 'a = "\\"#.........."', "a = 'it is \"'\nb = '\\'",
+        "a = 2001-01-01T00:00:00.5Z",
+        "a = [" + "1.5, " * 5000 + "]", f"a = '{'0' * 10000}'", "# it's\na = 1", "a . b = { c = [ 0.1 , 0.2 ] }",
+    ],
+)
+def test_parses_the_same_as_tomllib(text: str) -> None:
+    assert parse_toml(text) == tomllib.loads(text)
+
+
+@pytest.mark.parametrize("text", ["a = '", 'a = "x\ny"', 'a = """x', "a = '''x''", 'a = """"', "a = ''''"])
+def test_refuses_a_string_without_an_end(text: str) -> None:
+    with pytest.raises(ValueError, match="a string has no end"):
+        parse_toml(text)
+
+
+def test_limits_of_toml() -> None:
+    parse_toml(".".join("a" * (MAX_DOTS + 1)) + " = 1")
+    with pytest.raises(ValueError, match="found 10"):
+        parse_toml(".".join("a" * (MAX_DOTS + 2)) + " = 1")
+    parse_toml("a = '" + "x" * MAX_BYTES + "'")
+
+
+def test_kalibr_files_are_far_below_the_limits(omni_rig: Rig) -> None:
+    text = export_kalibr(omni_rig)
+    several = "".join(text.replace("cam0", f"cam{2 * pair}").replace("cam1", f"cam{2 * pair + 1}") for pair in range(4))
+    assert len(parse_yaml(several + "# a & b *c\nnote: 'a & *b'\n")) == 9
+    assert parse_kalibr(text).baseline_m == pytest.approx(omni_rig.baseline_m)
