@@ -22,11 +22,13 @@ LAYERS = ("calib", "drivers", "omnid")
 ARROWS: Mapping[str, str] = {
     "calib": "",
     "calib.boards": "calib.errors calib.models calib.se3",
+    "calib.bounded_toml": "",
+    "calib.bounded_yaml": "",
     "calib.camera_file": "calib.camera_table calib.models calib.validation",
     "calib.camera_table": "calib.errors calib.models calib.validation",
     "calib.errors": "",
     "calib.fit": "calib.boards calib.errors calib.models calib.rig calib.se3",
-    "calib.kalibr": "calib.errors calib.models calib.rig calib.rig_frame calib.se3 calib.validation",
+    "calib.kalibr": "calib.bounded_yaml calib.errors calib.models calib.rig calib.rig_frame calib.se3 calib.validation",
     "calib.masks": "calib.errors calib.models",
     "calib.models": "calib.errors",
     "calib.ocam_file": "calib.errors calib.models calib.rig calib.rig_frame calib.validation",
@@ -35,8 +37,9 @@ ARROWS: Mapping[str, str] = {
     "calib.rig_file": "calib.camera_table calib.errors calib.models calib.rig calib.se3 calib.validation",
     "calib.rig_frame": "calib.errors calib.models calib.rig calib.se3",
     "calib.se3": "",
-    "calib.transform_file": "calib.errors calib.kalibr calib.models calib.rig calib.se3 calib.validation",
-    "calib.validation": "calib.errors calib.models calib.se3",
+    "calib.transform_file":
+        "calib.bounded_yaml calib.errors calib.kalibr calib.models calib.rig calib.se3 calib.validation",
+    "calib.validation": "calib.bounded_toml calib.errors calib.models calib.se3",
     "drivers": "",
     "drivers.cameras": "drivers.errors drivers.events drivers.frame drivers.logs",
     "drivers.errors": "",
@@ -94,7 +97,7 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
         "omnid.tracking_state omnid.transport",
     "omnid.report":
-        "calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
+        "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
     "omnid.runs":
@@ -103,7 +106,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.errors omnid.formats omnid.messages omnid.settings omnid.sinks omnid.stages "
         "omnid.tracking_state omnid.transport",
     "omnid.sample": "",
-    "omnid.settings": "omnid.errors",
+    "omnid.settings": "calib.bounded_toml omnid.errors",
     "omnid.sinks":
         "drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
         "omnid.core.control omnid.core.mapping omnid.diagnostics omnid.errors omnid.formats omnid.messages "
