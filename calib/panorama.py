@@ -22,6 +22,10 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # Least length of the horizon of a camera that sees it.
 MIN_HORIZON_PX = 64
+# Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
+MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
+# Rows of a table that are computed at once: the projection takes some 200 bytes a pixel.
+BLOCK_ROWS = 64
 # Guards against division by zero on the cylinder's axis.
 MIN_RADIUS = 1e-9
 
@@ -58,6 +62,8 @@ class Cylinder:
 def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0)) -> Cylinder:
     """Return the panorama of the elevations that both cameras see; width 0: the resolution of the images."""
     width = width_px or 8 * round(_horizon_px(rig) / 8)
+    if width > MAX_WIDTH_PX:
+        raise _too_large(f"{width} columns")
     focal = width / (2 * math.pi)
     low, high = (np.tan(np.deg2rad(elevation_deg)))
     seen = [_seen_slopes(rig, mounted, np.linspace(low, high, SLOPES)) for mounted in (rig.lower, rig.upper)]
@@ -67,7 +73,16 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
                          "of elevation; check the transforms and the masks")
     slopes = np.linspace(low, high, SLOPES)[both]
     row0 = float(focal * slopes.max())
-    return Cylinder(width, math.ceil(row0 - focal * slopes.min()) + 1, row0)
+    height = math.ceil(row0 - focal * slopes.min()) + 1
+    if width * height > MAX_PIXELS:
+        raise _too_large(f"{width} x {height} pixels")
+    return Cylinder(width, height, row0)
+
+
+def _too_large(found: str) -> CalibError:
+    return CalibError(f"rig: a panorama with the resolution of its images would have {found}, expected at most "
+                      f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or set "
+                      "panorama.width_px")
 
 
 def _seen_slopes(rig: Rig, mounted: MountedCamera, slopes: Array) -> NDArray[np.bool_]:
@@ -84,7 +99,8 @@ def _horizon_px(rig: Rig) -> float:
     """Return the length of the horizon [px] in the camera with the lower resolution."""
     azimuth = np.linspace(0, 2 * math.pi, 361)
     ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)])
-    around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1).sum() for m in (rig.lower, rig.upper)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1).sum() for m in (rig.lower, rig.upper)]
     if not np.isfinite(around).all() or min(around) < MIN_HORIZON_PX:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     return float(min(around))
@@ -101,11 +117,21 @@ def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: i
 
     pad_px columns are repeated on either side, so that windows and pyramids are continuous across the seam.
     """
-    columns, rows = np.meshgrid(np.arange(-pad_px, cylinder.width + pad_px), np.arange(cylinder.height))
+    shape = cylinder.height, cylinder.width + 2 * pad_px
+    u, v = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for top in range(0, cylinder.height, BLOCK_ROWS):
+        rows = np.arange(top, min(top + BLOCK_ROWS, cylinder.height))
+        u[rows], v[rows] = _block_tables(rig, mounted, cylinder, (rows, pad_px))
+    return u, v
+
+
+def _block_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, block: tuple[NDArray[np.int_], int]) -> Maps:
+    """Return the tables of some rows; block: the rows and the padding [px]."""
+    columns, rows = np.meshgrid(np.arange(-block[1], cylinder.width + block[1]), block[0])
     pixels = _project(rig, mounted, cylinder.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)))
     pixels[~inside_image(mounted.camera, pixels)] = -1
     u, v = pixels.astype(np.float32).T.reshape(2, *columns.shape)
-    return np.ascontiguousarray(u), np.ascontiguousarray(v)
+    return u, v
 
 
 def visible(mounted: MountedCamera, maps: Maps, margin_px: float = 0.0) -> NDArray[np.bool_]:

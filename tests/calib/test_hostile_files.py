@@ -9,14 +9,17 @@ import zlib
 from contextlib import nullcontext
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from calib.bounded_toml import MAX_BYTES, MAX_DOTS, parse_toml
 from calib.bounded_yaml import parse_yaml
 from calib.errors import CalibError
 from calib.kalibr import export_kalibr, parse_kalibr
+from calib.models.unified import UnifiedCamera
 from calib.ocam_file import parse_ocam
-from calib.rig import Rig
+from calib.panorama import Cylinder, fit_cylinder, remap_tables
+from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
 from tests.limited import run_limited
 
@@ -176,3 +179,50 @@ def test_kalibr_files_are_far_below_the_limits(omni_rig: Rig) -> None:
     several = "".join(text.replace("cam0", f"cam{2 * pair}").replace("cam1", f"cam{2 * pair + 1}") for pair in range(4))
     assert len(parse_yaml(several + "# a & b *c\nnote: 'a & *b'\n")) == 9
     assert parse_kalibr(text).baseline_m == pytest.approx(omni_rig.baseline_m)
+
+
+def enlarged(rig: Rig, factor: float) -> Rig:
+    """Return the rig with images that are larger and have the same field of view."""
+    mounted = []
+    for side in (rig.lower, rig.upper):
+        camera = side.camera
+        assert isinstance(camera, UnifiedCamera)
+        width, height = (round(side_px * factor) for side_px in camera.size)
+        focal, center = (tuple(factor * value for value in values) for values in (camera.focal, camera.center))
+        larger = UnifiedCamera(camera.xi, (focal[0], focal[1]), (center[0], center[1]), (width, height),
+                               camera.distortion)
+        mounted.append(MountedCamera(larger, side.T_cam_rig))
+    return Rig(mounted[0], mounted[1])
+
+
+@pytest.mark.parametrize(("factor", "reason"), [(11, "16384 columns"), (400, "columns"), (1e30, "columns")])
+def test_refuses_a_rig_that_asks_for_a_huge_panorama(omni_rig: Rig, factor: float, reason: str) -> None:
+    with pytest.raises(CalibError, match=reason) as caught:
+        fit_cylinder(enlarged(omni_rig, factor))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_the_width_of_a_panorama_may_be_chosen(omni_rig: Rig) -> None:
+    assert fit_cylinder(enlarged(omni_rig, 11), 1024).width == 1024
+
+
+TABLES = """
+from tests.calib.conftest import misaligned, omni_cameras
+from calib.panorama import Cylinder, remap_tables
+rig = misaligned(*omni_cameras())
+u, v = remap_tables(rig, rig.lower, Cylinder(4096, 1500, 700.0))
+print(u.shape)
+"""
+
+
+def test_tables_take_little_more_memory_than_they_need(omni_rig: Rig) -> None:
+    """6 million pixels: 49 MB of tables; all at once the projection would take more than 1 GB."""
+    printed, memory_mb = run_limited(TABLES)
+    assert printed == "(1500, 4096)" and memory_mb < 250
+
+
+def test_tables_in_blocks_are_the_tables_of_each_row(omni_rig: Rig) -> None:
+    cylinder = Cylinder(300, 150, 70.0)
+    whole = remap_tables(omni_rig, omni_rig.upper, cylinder, pad_px=3)
+    last = remap_tables(omni_rig, omni_rig.upper, Cylinder(300, 1, cylinder.row0 - 149), pad_px=3)
+    np.testing.assert_allclose([table[149] for table in whole], [table[0] for table in last], atol=1e-3)
