@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import math
 import os
 import termios
@@ -190,6 +191,8 @@ class SerialMotor:
         port, self._port, self._armed = self._port, None, False
         if port is not None:
             with contextlib.suppress(OSError, termios.error):
+                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
+            with contextlib.suppress(OSError, termios.error):
                 port.close()
 
     def _run(self, transaction: Transaction[T], deadline_s: float) -> T:
@@ -264,10 +267,20 @@ class SerialMotor:
 
 
 def _opened(port: str, baud: int) -> serial.Serial:
-    """Open the port for exclusive, non-blocking use; raise DriverError where it cannot be opened."""
+    """Open the port for exclusive, non-blocking use; raise DriverError where it cannot be opened.
+
+    pyserial's exclusive=True is flock(2), which only programs that lock as well respect. TIOCEXCL (ioctl_tty(2)) makes
+    the kernel refuse every further open(2) with EBUSY, except of a process with CAP_SYS_ADMIN. A program that is killed
+    leaves the mode only on a pseudo terminal whose other end stays open.
+    """
+    opened: serial.Serial | None = None
     try:
-        return serial.Serial(port, baud, timeout=0, exclusive=True)
+        opened = serial.Serial(port, baud, timeout=0, exclusive=True)
+        fcntl.ioctl(opened.fileno(), termios.TIOCEXCL)
+        return opened
     except (OSError, ValueError, termios.error) as error:
+        if opened is not None:
+            opened.close()
         reason = _REASONS.get(getattr(error, "errno", None) or 0)
         raise DriverError(
             f"motor port {port!r} at {baud} baud cannot be opened: "

@@ -6,8 +6,11 @@ Source: github.com/hbrobotics/ros_arduino_bridge, ROSArduinoBridge.ino, commands
     "e"              reply "left right", the encoders' counts, signed 32 bits
     "r"              sets them to 0; reply "OK"
 
-Lines end in CR, replies in CR LF. The wheels stop 2000 ms after the last "m" (AUTO_STOP_INTERVAL), which is compiled
-in: it can neither be set nor read. Speeds are whole ticks, so low speeds are coarse.
+Lines end in CR, replies in CR LF. Speeds are whole ticks, so low speeds are coarse.
+
+The wheels stop 2000 ms after the last "m". This time, AUTO_STOP_INTERVAL, is compiled in: it can neither be set nor
+read. So a robot at 0.5 m/s drives up to 1 m after this program or the cable fails, and motor.watchdog_ms has to admit
+it: a shorter value is refused. A board with a shorter AUTO_STOP_INTERVAL stops earlier, but is taken for 2000 ms.
 """
 
 from __future__ import annotations
@@ -49,8 +52,9 @@ class RosArduinoBridge:
         """
         if watchdog_ms < AUTO_STOP_MS:
             raise DriverError(
-                f"watchdog of {watchdog_ms} ms requested, {AUTO_STOP_MS} ms is compiled into ROSArduinoBridge; "
-                f"set motor.watchdog_ms = {AUTO_STOP_MS}"
+                f"watchdog of {watchdog_ms} ms requested, {AUTO_STOP_MS} ms is compiled into ROSArduinoBridge: the "
+                f"wheels turn for so long after the last command; if the robot may, set motor.watchdog_ms = "
+                f"{AUTO_STOP_MS}"
             )
         self._last = None
         yield from self._counts_after(b"r\re\r")

@@ -6,10 +6,12 @@ import contextlib
 import math
 import os
 import random
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -32,6 +34,7 @@ from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
 REPLY_S = 2.0
+NOBODY = 65534  # user without privileges
 
 
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
@@ -182,6 +185,24 @@ def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
         assert simulated.commands == before
         motor.send(stop_command(0))
         assert simulated.commands == before + 1 and simulated.errors == 0
+
+
+def opens_as_another_user(port: str) -> bool:
+    """True if another program can open the port; without the privileges of root, which ignores the exclusive mode."""
+    user: dict[str, Any] = {"user": NOBODY, "group": NOBODY, "extra_groups": []} if os.geteuid() == 0 else {}
+    return subprocess.run(["sh", "-c", 'exec 3<> "$0"', port], capture_output=True, check=False, **user).returncode == 0
+
+
+def test_no_other_program_can_open_the_port(simulated: SimulatedMotor) -> None:
+    os.chmod(simulated.port, 0o666)
+    assert opens_as_another_user(simulated.port)
+    motor = SerialMotor(simulated.port, timeout_s=REPLY_S)
+    assert not opens_as_another_user(simulated.port)
+    with pytest.raises(DriverError, match="in use by another program"):
+        SerialMotor(simulated.port, timeout_s=REPLY_S)
+    assert not opens_as_another_user(simulated.port), "the second driver has not ended the first one's exclusive mode"
+    motor.close()
+    assert opens_as_another_user(simulated.port)
 
 
 @pytest.mark.parametrize(
