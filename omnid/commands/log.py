@@ -39,7 +39,7 @@ def run_info(args: argparse.Namespace) -> int:
         try:
             found = read_log_info(path)
         except DriverError as error:
-            print(f"omnid: {error}", file=sys.stderr)
+            print(f"omnid: {_shown(str(error))}", file=sys.stderr)
             code = 2
             continue
         print(*[""] * bool(number), *_described(found), sep="\n")
@@ -52,7 +52,7 @@ def run_recover(args: argparse.Namespace) -> int:
     from drivers.logs.mcap_recovery import recover
 
     out = args.output or _default_output(args.log)
-    print("\n".join(_reported(recover(args.log, out), args.log, out)))
+    print("\n".join(map(_shown, _reported(recover(args.log, out), args.log, out))))
     return 0
 
 
@@ -77,7 +77,7 @@ def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
 
 
 def _described(found: LogInfo) -> Iterator[str]:
-    yield f"log          {found.path}"
+    yield f"log          {_shown(str(found.path))}"
     yield f"size         {_bytes(found.size_bytes)}"
     yield f"state        {_state(found)}"
     duration_s = 0.0
@@ -95,7 +95,7 @@ def _described(found: LogInfo) -> Iterator[str]:
 def _state(found: LogInfo) -> str:
     from drivers.logs.mcap_info import LogState
 
-    advice = f"`omnid log recover {found.path}`"
+    advice = f"`omnid log recover {_shown(str(found.path))}`"
     if found.state is LogState.BROKEN:
         corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
         position = f"byte {found.readable_bytes} of {found.size_bytes}"

@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the page."""
     from calib.rig_file import write_file
     from omnid.formats.tum import read_tum
+    from omnid.monitor.robot_state import plain
     from omnid.report.report import report_html
     from omnid.report.report_data import collect_report_data
     from omnid.sinks.files import check_outputs, on_stdout
@@ -34,5 +35,6 @@ def run(args: argparse.Namespace) -> int:
     html = report_html(args.log, data, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
     output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
-    print(f"{args.output}: {data.poses.poses} poses of {data.topic}, {len(html) / 1e6:.2f} MB", file=output)
+    line = f"{args.output}: {data.poses.poses} poses of {data.topic}, {len(html) / 1e6:.2f} MB"
+    print(plain(line), file=output)
     return 0

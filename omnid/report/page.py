@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Sequence
 from html import escape
 from typing import Final
@@ -20,11 +21,20 @@ td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1
 .bar{background:#d33;height:.7em;display:inline-block}.warn{color:#a40}"""
 
 
+# A page shows text from logs of unknown origin: it loads nothing and runs nothing.
+POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+# Control characters except tab and newline, which a terminal would obey where the page is printed.
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
+
+
 def page(title: str, parts: Sequence[str], style: str = "") -> str:
     """Return an HTML page of parts, which are HTML; style is appended to STYLE."""
-    return (f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta name='viewport' content='width=device-"
-            f"width'><title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
+    text = (f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta http-equiv='Content-Security-Policy' "
+            f"content=\"{POLICY}\"><meta name='viewport' content='width=device-width'>"
+            f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
             f"<body>{''.join(parts)}</body></html>\n")
+    return _CONTROL.sub(_REPLACEMENT, text)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

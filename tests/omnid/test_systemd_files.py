@@ -85,6 +85,10 @@ def test_the_unit_allows_what_the_configuration_asks_for() -> None:
     assert "RestrictRealtime" not in unit
 
 
+def test_recordings_are_not_readable_by_other_users() -> None:
+    assert settings()["UMask"] == "0027"
+
+
 def test_what_the_unit_starts_is_shipped() -> None:
     """The program's name is that of the package, its configuration that beside the unit."""
     project = tomllib.loads((SYSTEMD.parent / "pyproject.toml").read_text())["project"]

@@ -37,6 +37,7 @@ from tests.omnid.report.recorded_logs import (
     status,
 )
 
+TERMINAL = "x\x1b[31m\x07\x9b2J"
 SAMPLE = Path(__file__).parents[3] / "omnid" / "sample"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
 
@@ -100,7 +101,7 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
                   "of the map's 500 points", "no settings are attached".capitalize()):
         assert words in page.text, words
     assert any(tag == "image" for tag, _ in page.tags)  # the map
-    assert "http" not in out.read_text("utf-8")
+    assert "://" not in out.read_text("utf-8")
 
 
 def test_poses_have_the_state_reported_after_them(tmp_path: Path) -> None:
@@ -322,3 +323,37 @@ def test_refuses_a_truth_of_another_time(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["report", str(log), "--truth", str(truth), "-o", str(tmp_path / "out.html")]) == 2
     assert "do both use the same clock" in capsys.readouterr().err
     assert read_tum(truth).stamps_ns.size == 5
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A log whose topic, frames, states, file name, attachments and settings hold sequences that control a terminal."""
+    entries = [odom(k, topic=f"/{TERMINAL}/odom") for k in range(5)]
+    entries += [status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
+                status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {}))]
+    attachments = {f"{TERMINAL}.txt": b"", "omnid.toml": b'"\\u001b]0;x\\u0007" = "\\u009b31m"', "rig.toml": b"a = 1"}
+    return save(tmp_path / f"{TERMINAL}.mcap", entries, attachments)
+
+
+def test_prints_no_control_characters_of_a_log(hostile: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = hostile.with_name("page.html")
+    main(["report", str(hostile), "-o", str(page)])
+    main(["log", "info", str(hostile)])
+    main(["log", "info", str(hostile.with_name(f"{TERMINAL}.none"))])
+    main(["report", str(hostile), "--topic", TERMINAL, "-o", str(page)])
+    shown = "".join((*capsys.readouterr(), page.read_text("utf-8")))
+    assert "poses of" in shown and "odom" in shown
+    assert not set(shown) & {chr(code) for code in (*range(9), *range(11, 32), *range(127, 160))}
+
+
+def test_the_page_may_load_and_run_nothing(tmp_path: Path) -> None:
+    page = html_of(save(tmp_path / "run.mcap", run()))
+    head = page[: page.index("<title>")]
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+    assert f"http-equiv='Content-Security-Policy' content=\"{policy}\"" in head
+
+
+def test_settings_of_many_dotted_keys_are_not_parsed(tmp_path: Path) -> None:
+    settings = ("a." * 20_000 + "a = 1").encode()
+    log = save(tmp_path / "run.mcap", run(), {"omnid.toml": settings})
+    assert "The attached settings cannot be read." in html_of(log)
