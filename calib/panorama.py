@@ -81,8 +81,8 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
 
 def _too_large(found: str) -> CalibError:
     return CalibError(f"rig: a panorama with the resolution of its images would have {found}, expected at most "
-                      f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or set "
-                      "panorama.width_px")
+                      f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or "
+                      "set panorama.width_px")
 
 
 def _seen_slopes(rig: Rig, mounted: MountedCamera, slopes: Array) -> NDArray[np.bool_]:
