@@ -16,6 +16,7 @@ from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.relocalisation import Relocaliser
 from omnid.formats.tum import Trajectory
 from omnid.messages import StereoDepth
 from omnid.settings import load
@@ -61,7 +62,8 @@ class UnfilteredOdometry(VisualOdometry):
     """omnid's method without the filter; there it only predicts where the search for landmarks begins."""
 
     def __init__(self, geometry: Geometry, config: OdometryConfig) -> None:
-        super().__init__(geometry.model(config.noise_px), config.klt, config.limits)
+        model = geometry.model(config.noise_px)
+        super().__init__(model, config.klt, config.limits, Relocaliser(model))
         self._filter = PassThroughFilter()
 
 
