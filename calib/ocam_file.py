@@ -70,8 +70,9 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
     lines[1].counted("inverse polynomial coefficients")
     row, column = lines[2].numbers("row and column of the centre", 2)
     c, d, e = lines[3].numbers("affine c d e", 3)
+    size = _size(lines[4])
     try:
-        return OcamCamera(polynomial, (row, column), (c, d, e), _size(lines[4]), view)
+        return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
     except CalibError as error:
         raise CalibError(f"{name}: {error}") from error
 

@@ -27,6 +27,7 @@ from drivers.logs.mcap_records import (
 
 MAX_ATTACHMENT_BYTES = 16 * 2**20
 MAX_ATTACHMENTS = 32
+MAX_ALL_ATTACHMENTS_BYTES = 64 * 2**20
 _MAX_SUMMARY_BYTES = 64 * 2**20
 _MAX_NAME = 256  # characters
 _MAX_ATTACHMENT_HEAD_BYTES = 1024  # times, name and media type of an attachment
@@ -96,11 +97,14 @@ def summary_section(file: LogFile) -> ByteBuffer | None:
 def read_attachments(file: LogFile, summary: LogSummary | None) -> dict[str, bytes]:
     """Return name -> bytes of the valid attachments within the limits; without a summary, those before the messages."""
     found: dict[str, bytes] = {}
+    left = MAX_ALL_ATTACHMENTS_BYTES
     indexed = None if summary is None else _records_at(file, summary.attachments)
     for record in indexed or records(file, len(MAGIC), file.size):
         if record.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END) or len(found) >= MAX_ATTACHMENTS:
             break
-        if record.opcode == Opcode.ATTACHMENT and record.size <= MAX_ATTACHMENT_BYTES + _MAX_ATTACHMENT_HEAD_BYTES:
+        largest = min(left, MAX_ATTACHMENT_BYTES + _MAX_ATTACHMENT_HEAD_BYTES)
+        if record.opcode == Opcode.ATTACHMENT and record.size <= largest:
+            left -= record.size
             found.update(_attachment(file, record))
     return found
 

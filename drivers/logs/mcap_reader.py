@@ -88,7 +88,7 @@ class LogReader:
         return min(sum(counts.get(channel, 0) for channel in catalog.ids(topic)) for topic in self._cameras)
 
     def attachments(self) -> dict[str, bytes]:
-        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each."""
+        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
         return read_attachments(self._file, self._summary)
 
     def _reset(self) -> None:

@@ -98,8 +98,8 @@ def test_refuses_a_long_ocam_file(text: str) -> None:
 )
 def test_refuses_an_ocam_camera_that_cannot_be_evaluated(a0: str, a4: str, size: str, reason: str) -> None:
     with pytest.raises(CalibError, match=reason) as caught:
-        parse_ocam(OCAM.format(a0=a0, a4=a4, size=size))
-    assert "\n" not in str(caught.value)
+        parse_ocam(OCAM.format(a0=a0, a4=a4, size=size), name="my.txt")
+    assert "\n" not in str(caught.value) and str(caught.value).count("my.txt") == 1
 
 
 def test_refuses_many_ocam_coefficients(ocam_rig: Rig) -> None:
