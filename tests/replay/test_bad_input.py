@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -69,6 +70,23 @@ def test_refuses_a_log_without_a_rig(omnid: Command, scene: Path) -> None:
 def test_refuses_a_broken_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
     (tmp_path / "rig.toml").write_text("schema = 1\n[lower]\nmodel = 7\n")
     assert "rig.toml" in omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "reason"),
+    [
+        (r"fu = -?", "fu = -9000", "a panorama with the resolution of its images would have"),
+        (r"xi = .*", "xi = 0x" + "f" * 9000, "keys and numbers of at most 400 characters"),
+        (r"schema = 1", "a." * 20_000 + "a = 1", "a key of at most 9 parts"),
+        (r"size = .*", "size = [32767, 32767]", "at most 67108864 in all"),
+    ],
+)
+def test_refuses_a_rig_that_would_fill_the_memory(
+    omnid: Command, tmp_path: Path, scene: Path, pattern: str, replacement: str, reason: str
+) -> None:
+    """One line and exit code 2."""
+    (tmp_path / "rig.toml").write_text(re.sub(pattern, replacement, (scene / "rig.toml").read_text()))
+    assert reason in omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml")
 
 
 def test_skips_and_counts_broken_jpegs(omnid: Command, tmp_path: Path, scene: Path) -> None:
