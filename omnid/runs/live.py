@@ -159,7 +159,8 @@ class LiveRun:
     def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None
                   ) -> CommandReceiver:
         command_s = self._config.controller.deadlines.command_s
-        commands = CommandReceiver(controller.send_setpoint, controller.stop, command_s)
+        commands = CommandReceiver(controller.send_setpoint, controller.stop, command_s,
+                                   synchronised=self._config.bus.command_clock == "synchronised")
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns)
 
         def receive(key: str, payload: bytes) -> None:

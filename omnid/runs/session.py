@@ -50,7 +50,7 @@ class Session:
 
     def open_bus(self, rig: Rig) -> Bus:
         """Open the bus; it answers queries for the configuration and the rig."""
-        bus = Bus(self.config.bus)
+        bus = Bus(self.config.bus, self.warn)
         self.outputs.callback(bus.close)
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))

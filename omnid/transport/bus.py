@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Final
 
 import zenoh
@@ -16,13 +17,14 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.session import open_session, reason
 from omnid.transport.topics import PUBLISHED, SUBSCRIBED, Topic, ros_name
 
 __all__ = ["Bus", "BusConfig"]
 
 ALIVE: Final = "alive"  # liveliness token below the robot's name; exists as long as the daemon runs
+_ALIVE_TIMEOUT_S: Final = 1.0  # of the search for a robot of the same name
 CommandCallback = Callable[[str, bytes], None]  # key from `cmd` on, payload
 
 
@@ -32,10 +34,15 @@ class Bus:
     lost: messages that could not be sent because a client has not reached its router yet.
     """
 
-    def __init__(self, config: BusConfig) -> None:
-        """Open the session, or that of a client with the first `connect`. Raise OmnidError for a wrong configuration.
+    def __init__(self, config: BusConfig, warn: Callable[[str], None] = lambda _: None) -> None:
+        """Open the session, or that of a client with the first `connect`.
+
+        Raise OmnidError for a wrong configuration, and where a robot of the same name is on the bus already. Later ones
+        are reported by one call of warn, in a zenoh thread, and in the status.
         """
-        self._config = checked(config)
+        self._config, self._warn = checked(config), warn
+        self._namesakes: set[str] = set()  # keys of the liveliness tokens of other robots of the same name
+        self._warned = False
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, _TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
@@ -59,11 +66,14 @@ class Bus:
                 self._open()
 
     def status(self) -> DiagnosticStatus:
-        """Return whether the bus is open, and the number of messages lost before that."""
-        waiting = self._session is None
-        message = f"no router yet at {', '.join(self._config.connect)}" if waiting else "open"
-        values = {"mode": self._config.mode, "lost": str(self.lost)}
-        return DiagnosticStatus(status_names.BUS, WARN if waiting else OK, message, values)
+        """Return whether the bus is open and the name unique, and the number of messages lost before that."""
+        level, message = OK, "open"
+        if self._session is None:
+            level, message = WARN, f"no router yet at {', '.join(self._config.connect)}"
+        elif self._namesakes:
+            level, message = ERROR, self._same_name
+        values = {"mode": self._config.mode, "lost": str(self.lost), "same_name": str(len(self._namesakes))}
+        return DiagnosticStatus(status_names.BUS, level, message, values)
 
     def publish(self, topic: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Send CDR bytes as `<robot>/<topic>`, and under the key that ROS 2 expects; dropped in congestion.
@@ -101,8 +111,19 @@ class Bus:
                 self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
         self._closed = True
 
+    @property
+    def _same_name(self) -> str:
+        return (f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands; "
+                "change bus.robot of one of them")
+
     def _open(self) -> None:
         session = open_session(self._config)
+        if self._finds_same_name(session):
+            if not self.needs_router:
+                session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
+                raise OmnidError(self._same_name)
+            self._report_same_name()
+        self._watch_names(session)
         self._graph = graph = _RosGraph(session, self._config)
         self._declared.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
         self._publishers = {name: _TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
@@ -111,6 +132,43 @@ class Bus:
         if self._on_command is not None:
             self._declare_subscribers(session, self._on_command)
         self._session = session
+
+    def _finds_same_name(self, session: zenoh.Session) -> bool:
+        """True if a robot of this name is on the bus; peers that share a router only see it as a client."""
+        if _is_alive(session, self._config.robot):
+            return True
+        if self.needs_router or not self._config.connect:
+            return False
+        try:
+            client = open_session(replace(self._config, mode="client", listen=()), guarded=False)
+        except OmnidError:  # no router yet
+            return False
+        try:
+            return _is_alive(client, self._config.robot)
+        finally:
+            client.close()  # type: ignore[no-untyped-call]
+
+    def _watch_names(self, session: zenoh.Session) -> None:
+        """Declare a token with the session's identity, and watch those of other robots of the same name."""
+        own = f"{self._config.robot}/{ALIVE}/{session.zid()}"
+
+        def on_token(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._namesakes.discard(key)
+            elif key != own:
+                self._namesakes.add(key)
+                self._report_same_name()
+
+        liveliness = session.liveliness()
+        self._declared.append(liveliness.declare_token(own))
+        names = f"{self._config.robot}/{ALIVE}/*"
+        self._declared.append(liveliness.declare_subscriber(names, on_token, history=True))
+
+    def _report_same_name(self) -> None:
+        if not self._warned:
+            self._warned = True
+            self._warn(self._same_name)
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = f"{self._config.robot}/{name}"
@@ -134,6 +192,11 @@ class Bus:
         if self._graph is not None:
             for name, schema in SUBSCRIBED.items():
                 self._graph.announce("MS", name, schema)
+
+
+def _is_alive(session: zenoh.Session, robot: str) -> bool:
+    replies = session.liveliness().get(f"{robot}/{ALIVE}", timeout=_ALIVE_TIMEOUT_S)
+    return any(reply.ok is not None for reply in replies)
 
 
 def _sample_callback(

@@ -43,6 +43,9 @@ class BusConfig:
     users_file: str = knob("", "file with the users that may connect: lines user:password")
     command_names: tuple[str, ...] = knob((), "certificates (common names) that may send commands")
     command_users: tuple[str, ...] = knob((), "users that may send commands; with neither: all that can connect")
+    command_clock: str = knob("synchronised", "synchronised: stamps of commands must be within "
+                              "controller.deadlines.command_s of this machine's clock; arrival: for senders with "
+                              "another clock, stamps must only rise", choices=("synchronised", "arrival"))
     ros2: str = knob("off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds",
                      choices=("off", "rmw_zenoh", "ros2dds"))
     ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)

@@ -18,7 +18,6 @@ from omnid.transport.codec import heading_from_cdr, twist_from_cdr
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
-SAME_CLOCK_S = 60.0  # a stamp further from now is of another clock, or of none: only the arrival counts then
 
 
 class RefusedCommand(OmnidError):  # noqa: N818 - named after what it reports
@@ -64,14 +63,21 @@ def _check_frame(frame: str, expected: str) -> None:
 class CommandReceiver:
     """Passes valid commands on and counts the others by reason; called from threads of the bus.
 
-    on_setpoint receives the setpoint and its arrival, ns of CLOCK_MONOTONIC.
+    on_setpoint receives the setpoint and its arrival, ns of CLOCK_MONOTONIC. Stops are always obeyed.
     """
 
     def __init__(
-        self, on_setpoint: Callable[[Setpoint, int], None], on_stop: Callable[[], None], stale_s: float
+        self, on_setpoint: Callable[[Setpoint, int], None], on_stop: Callable[[], None], stale_s: float,
+        *, synchronised: bool = True
     ) -> None:
-        """stale_s: age from which a command is refused."""
-        self._on_setpoint, self._on_stop, self._stale_s = on_setpoint, on_stop, stale_s
+        """stale_s: largest difference of a command's stamp from this machine's clock, before and after.
+
+        synchronised: False where senders have other clocks. The stamps of each topic must then rise, so that a stream
+        that was recorded earlier in this run is refused.
+        """
+        self._on_setpoint, self._on_stop, self._stale_ns = on_setpoint, on_stop, round(stale_s * 1e9)
+        self._synchronised = synchronised
+        self._newest_ns: dict[str, int] = {}  # stamp of the newest command that was accepted, by topic
         self._parsers = {"cmd/twist": twist_command, "cmd/heading": heading_command}
         self.accepted = self.stops = 0
         self.refused: Counter[str] = Counter()
@@ -100,7 +106,20 @@ class CommandReceiver:
         if len(payload) > LONGEST_PAYLOAD:
             raise RefusedCommand("too long")
         command = self._parsers[key](payload)
-        age_s = time.time() - command.stamp_ns * 1e-9
-        if self._stale_s < age_s < SAME_CLOCK_S:
-            raise RefusedCommand("too old")
+        if self._synchronised:
+            self._check_age(command.stamp_ns)
+        else:
+            self._check_order(key, command.stamp_ns)
         return command
+
+    def _check_age(self, stamp_ns: int) -> None:
+        age_ns = time.time_ns() - stamp_ns
+        if age_ns > self._stale_ns:
+            raise RefusedCommand("too old")
+        if age_ns < -self._stale_ns:
+            raise RefusedCommand("stamp in the future")
+
+    def _check_order(self, key: str, stamp_ns: int) -> None:
+        if key in self._newest_ns and stamp_ns <= self._newest_ns[key]:
+            raise RefusedCommand("stamp does not rise")
+        self._newest_ns[key] = stamp_ns

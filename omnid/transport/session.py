@@ -14,8 +14,16 @@ from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
+_PROTOCOLS: Final = "transport/link/protocols"
+_PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
 _CONNECT_TIMEOUT_MS: Final = 1000  # a client that cannot reach its router opens no session
 _REAL_TIME_BATCHES: Final = 16  # the default of 2 is soon full on a busy host, and poses are dropped
+_MAX_RECEIVED_BYTES: Final = 1 << 20  # zenoh collects fragments up to its limit of 1 GiB before access rules apply
+# Connections that send nothing hold one of the places for the time-out: 1000 of them lock others out for 1 s at most.
+# zenoh's defaults are 100 places and 10 s.
+_MAX_PENDING: Final = 1000
+_ACCEPT_TIMEOUT_MS: Final = 1000
+_MAX_SESSIONS: Final = 128  # each holds received fragments in memory
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
     "tls_listen_key": "listen_private_key",
@@ -32,7 +40,8 @@ class Unreachable(OmnidError):  # noqa: N818 - a state that may pass, as the err
 def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     """Open a session. Raise OmnidError where an endpoint cannot be listened on, Unreachable for a client.
 
-    guarded: other programs may write commands only.
+    guarded: other programs may write commands only, and cannot send messages above 1 MiB. Clients are not guarded: the
+    messages of a robot may be larger.
     """
     prepared = zenoh_config(config, guarded=guarded)
     try:
@@ -60,7 +69,15 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     for key, value, knob in _settings(config, guarded):
         if knob == "mode" or knob in explicit or result.get_json(key) == untouched.get_json(key):
             result.insert_json5(key, json.dumps(value))
+    _restrict_protocols(result)
     return result
+
+
+def _restrict_protocols(result: zenoh.Config) -> None:
+    """Allow no links of other protocols than those of the endpoints, unless zenoh's own file names protocols."""
+    endpoints = result.get_json("listen/endpoints") + result.get_json("connect/endpoints")
+    if json.loads(result.get_json(_PROTOCOLS)) is None:
+        result.insert_json5(_PROTOCOLS, json.dumps(sorted(set(_PROTOCOL.findall(endpoints)))))
 
 
 def _of_file(config: BusConfig) -> zenoh.Config:
@@ -85,6 +102,7 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
     if client:
         yield "connect/timeout_ms", _CONNECT_TIMEOUT_MS, ""
     yield "scouting/multicast/enabled", False, ""
+    yield "scouting/gossip/enabled", False, ""  # else a peer makes this one connect to endpoints of its choice
     yield "transport/shared_memory/enabled", False, ""
     yield "transport/link/tx/queue/size/real_time", _REAL_TIME_BATCHES, ""
     for knob, key in _TLS.items():
@@ -94,6 +112,10 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
         yield "transport/link/tls/enable_mtls", True, "tls_mutual"
     yield from _users(config)
     if guarded:
+        yield "transport/link/rx/max_message_size", _MAX_RECEIVED_BYTES, ""
+        yield "transport/unicast/accept_pending", _MAX_PENDING, ""
+        yield "transport/unicast/accept_timeout", _ACCEPT_TIMEOUT_MS, ""
+        yield "transport/unicast/max_sessions", _MAX_SESSIONS, ""
         yield "access_control", access_control(config), "command_names" if config.command_names else "command_users"
 
 

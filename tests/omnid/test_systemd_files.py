@@ -20,6 +20,7 @@ UNIT = SYSTEMD / "omnid.service"
 RULES = SYSTEMD / "90-omnid.rules"
 COMMAND = "/opt/omnid/bin/omnid run --config /etc/omnid/omnid.toml"
 WORST_EXPOSURE = 3.0
+DAEMON_MB = 260  # measured with the default settings
 PART = re.compile(r'([A-Z_]+)(?:\{([\w./-]+)\})?(==|!=|\+=|=|:=)"((?:[^"\\]|\\.)*)"')
 MATCHED = {"SUBSYSTEM", "ATTR", "ATTRS", "ENV", "KERNEL"}  # the keys of udev(7) that the examples use
 ASSIGNED = {"SYMLINK", "ENV"}
@@ -87,6 +88,11 @@ def test_the_unit_allows_what_the_configuration_asks_for() -> None:
 
 def test_recordings_are_not_readable_by_other_users() -> None:
     assert settings()["UMask"] == "0027"
+
+
+def test_the_unit_limits_the_memory_to_two_to_four_times_what_the_daemon_needs() -> None:
+    limit = settings()["MemoryMax"]
+    assert limit.endswith("M") and 2 * DAEMON_MB <= int(limit[:-1]) <= 4 * DAEMON_MB
 
 
 def test_what_the_unit_starts_is_shipped() -> None:

@@ -53,6 +53,9 @@ def test_a_missing_knob_is_named(knobs: dict[str, Any], other: str) -> None:
     assert other in refused(**knobs)
 
 
+PROTOCOLS, LARGEST = "transport/link/protocols", "transport/link/rx/max_message_size"
+
+
 def setting(config: BusConfig, key: str) -> Any:
     return json.loads(zenoh_config(config).get_json(key))
 
@@ -61,6 +64,25 @@ def test_default_is_local_without_multicast_and_denies_writing() -> None:
     assert setting(BusConfig(), "listen/endpoints") == ["tcp/127.0.0.1:7447"]
     assert setting(BusConfig(), "scouting/multicast/enabled") is False
     assert setting(BusConfig(), "access_control")["default_permission"] == "deny"
+
+
+def test_introduces_no_peers_and_uses_the_configured_protocols_only(tmp_path: Path) -> None:
+    assert setting(BusConfig(), "scouting/gossip/enabled") is False
+    assert setting(BusConfig(), PROTOCOLS) == ["tcp"]
+    assert setting(BusConfig(listen=("tls/[::]:7447",)), PROTOCOLS) == ["tls"]
+    both = BusConfig(listen=("tls/[::]:7447",), connect=("quic/site:1", "tls/site:1"))
+    assert setting(both, PROTOCOLS) == ["quic", "tls"]
+    path = tmp_path / "zenoh.json5"
+    path.write_text("{ listen: {endpoints: {peer: ['ws/127.0.0.1:1']}} }")
+    assert setting(BusConfig(config=str(path)), PROTOCOLS) == ["ws"]
+    path.write_text("{ transport: {link: {protocols: ['udp', 'tcp']}} }")
+    assert setting(BusConfig(config=str(path)), PROTOCOLS) == ["udp", "tcp"]
+
+
+def test_limits_what_others_may_send_to_the_daemon_but_not_to_its_clients() -> None:
+    assert setting(BusConfig(), LARGEST) == 1 << 20
+    client = zenoh_config(BusConfig(mode="client", connect=("tcp/127.0.0.1:1",)), guarded=False)
+    assert json.loads(client.get_json(LARGEST)) > 1 << 28, "a cloud of ten million points is sent as one message"
 
 
 def test_settings_override_zenohs_own_file(tmp_path: Path) -> None:

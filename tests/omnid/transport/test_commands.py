@@ -20,11 +20,11 @@ STALE_S = 0.5
 class AcceptedCommands:
     """Collects the commands that were accepted."""
 
-    def __init__(self) -> None:
+    def __init__(self, synchronised: bool = True) -> None:
         self.setpoints: list[Setpoint] = []
         self.arrivals_ns: list[int] = []
         self.stops = 0
-        self.receiver = CommandReceiver(self._add, self._stop, STALE_S)
+        self.receiver = CommandReceiver(self._add, self._stop, STALE_S, synchronised=synchronised)
 
     def _add(self, setpoint: Setpoint, arrival_ns: int) -> None:
         self.setpoints.append(setpoint)
@@ -87,24 +87,66 @@ def test_refuses_other_frames_and_accepts_an_empty_one(accepted: AcceptedCommand
     assert accepted.receiver.accepted == 1
 
 
-@pytest.mark.parametrize("later_s", [-0.6, -30.0, -59.0])
+@pytest.mark.parametrize("later_s", [-0.6, -30.0, -59.0, -66.0, -1e8])
 def test_refuses_commands_that_are_too_old(accepted: AcceptedCommands, later_s: float) -> None:
     accepted.receiver.receive("cmd/twist", twist(later_s=later_s))
     assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 1}
 
 
-@pytest.mark.parametrize("later_s", [-0.1, 5.0, -61.0, -1e8, 86400.0])
-def test_ignores_the_stamp_of_another_clock(accepted: AcceptedCommands, later_s: float) -> None:
+@pytest.mark.parametrize("later_s", [5.0, 60.0, 86400.0])
+def test_refuses_commands_of_the_future(accepted: AcceptedCommands, later_s: float) -> None:
     accepted.receiver.receive("cmd/twist", twist(later_s=later_s))
-    assert accepted.receiver.accepted == 1
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"stamp in the future": 1}
 
 
-def test_ignores_invalid_stamps(accepted: AcceptedCommands) -> None:
-    for stamp in (struct.pack("<iI", 0, 0), struct.pack("<iI", -(2**31), 2**32 - 1), b"\xff" * 8):
+INVALID_STAMPS = (struct.pack("<iI", 0, 0), struct.pack("<iI", -(2**31), 2**32 - 1), b"\xff" * 8)
+
+
+def test_refuses_invalid_stamps(accepted: AcceptedCommands) -> None:
+    for stamp in INVALID_STAMPS:
         payload = bytearray(twist())
         payload[4:12] = stamp
         accepted.receiver.receive("cmd/twist", bytes(payload))
-    assert accepted.receiver.accepted == 3
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 3}
+
+
+def stream(start_ns: int, count: int = 5) -> list[bytes]:
+    """Return commands at 20 Hz by a sender's clock."""
+    return [codec.twist_stamped_cdr(start_ns + round(i * 5e7), "base_link", 0.3, 0.0) for i in range(count)]
+
+
+def test_refuses_a_stream_that_is_replayed_after_66_s(accepted: AcceptedCommands) -> None:
+    for payload in stream(now_ns(-66.0)):
+        accepted.receiver.receive("cmd/twist", payload)
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 5}
+
+
+@pytest.mark.parametrize("later_s", [-1e9, -3600.0, 3600.0])
+def test_takes_commands_of_another_clock_where_it_is_configured(later_s: float) -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    for payload in stream(now_ns(later_s)):
+        accepted.receiver.receive("cmd/twist", payload)
+    assert accepted.receiver.accepted == 5 and accepted.receiver.refused == {}
+
+
+def test_refuses_replayed_and_reordered_commands_of_another_clock() -> None:
+    accepted, recorded = AcceptedCommands(synchronised=False), stream(10**12)
+    for payload in recorded:
+        accepted.receiver.receive("cmd/twist", payload)
+    accepted.receiver.receive("cmd/stop", b"")
+    for payload in (*recorded, *reversed(recorded)):
+        accepted.receiver.receive("cmd/twist", payload)
+    assert len(accepted.setpoints) == 5 and accepted.receiver.refused == {"stamp does not rise": 10}
+    accepted.receiver.receive("cmd/heading", codec.heading_cdr(10**12, 0.4, 1.5))
+    accepted.receiver.receive("cmd/stop", recorded[0])
+    assert len(accepted.setpoints) == 6 and accepted.stops == 2
+
+
+def test_a_refused_command_does_not_move_the_sequence() -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    accepted.receiver.receive("cmd/twist", codec.twist_stamped_cdr(10**15, "base_link", math.nan, 0.0))
+    accepted.receiver.receive("cmd/twist", stream(10**12, 1)[0])
+    assert accepted.receiver.accepted == 1
 
 
 def test_refuses_long_payloads_without_decoding_them(accepted: AcceptedCommands) -> None:
@@ -140,7 +182,7 @@ def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: in
         accepted.receiver.receive(key, damaged(rng, good))
     refused = accepted.receiver.refused
     assert accepted.receiver.accepted + sum(refused.values()) == 1000 and accepted.receiver.accepted < 300
-    assert len(refused) <= 5 and refused["malformed"] > 400 and refused["not finite"] > 50
+    assert len(refused) <= 7 and refused["malformed"] > 400 and refused["not finite"] > 50
     for setpoint in accepted.setpoints:
         assert abs(setpoint.velocity_mps) <= 20 and abs(setpoint.yaw_rate_radps) <= 50
         assert setpoint.heading_rad is None or abs(setpoint.heading_rad) <= 1000
