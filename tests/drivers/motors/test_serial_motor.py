@@ -34,7 +34,7 @@ from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
 REPLY_S = 2.0
-NOBODY = 65534  # user without privileges
+OTHER_ID = 65534  # user and group without rights
 
 
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
@@ -189,7 +189,7 @@ def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
 
 def opens_as_another_user(port: str) -> bool:
     """True if another program can open the port; without the privileges of root, which ignores the exclusive mode."""
-    user: dict[str, Any] = {"user": NOBODY, "group": NOBODY, "extra_groups": []} if os.geteuid() == 0 else {}
+    user: dict[str, Any] = {"user": OTHER_ID, "group": OTHER_ID, "extra_groups": []} if os.geteuid() == 0 else {}
     return subprocess.run(["sh", "-c", 'exec 3<> "$0"', port], capture_output=True, check=False, **user).returncode == 0
 
 

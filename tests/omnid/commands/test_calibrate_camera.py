@@ -50,7 +50,7 @@ def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path,
     assert read.mask is not None and read.mask.outer_px == pytest.approx(MASK.outer_px, abs=3)
     assert read.mask.inner_px == pytest.approx(MASK.inner_px, abs=4)
     page = report.read_text()
-    assert page.count("data:image/jpeg;base64,") == 10 and "http" not in page
+    assert page.count("data:image/jpeg;base64,") == 10 and "://" not in page
     assert all(f"p{number}.png" in page for number in range(8)) and "standard deviation" in page
 
 
