@@ -16,15 +16,17 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
+from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.ray_caster import render_grey
+from tests.simulation.readout import Readout, body_twists
+from tests.simulation.rigs import nominal_rig
 from tests.simulation.sensor import Exposure, Floats, Sensor
 from tests.simulation.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
-PERIOD_NS = 100_000_000
 # Delay from an image's stamp to its arrival at the recorder.
 ARRIVAL_NS = 3_000_000
-# Largest difference of the two cameras' stamps.
+# Largest difference of the two cameras' stamps where the exposures are simultaneous.
 SKEW_NS = 2_000_000
 SCHEMA = "sensor_msgs/msg/CompressedImage"
 # [ns]
@@ -36,37 +38,41 @@ ImageSource = Callable[[int, int], Floats]
 
 
 def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
-              supersample: int = 2, progress: Callable[[int, int], None] | None = None) -> None:
+              supersample: int = 2, readout: Readout | None = None,
+              progress: Callable[[int, int], None] | None = None) -> None:
     """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder."""
-    cameras = (rig.lower, rig.upper)
+    readout = readout or Readout()
+    cameras, delay_s = (rig.lower, rig.upper), readout.delay_s(len(poses))
+    twists = body_twists(poses, 1e-9 * readout.period_ns)
 
     def ideal_image(pair: int, camera: int) -> Floats:
-        return render_grey(scene, cameras[camera], poses[pair], supersample)
+        T_world_rig = poses[pair] @ se3.exp(twists[pair] * delay_s[pair]) if camera else poses[pair]
+        row_twist = twists[pair] * 1e-6 * readout.line_time_us[camera]
+        return render_grey(scene, cameras[camera], T_world_rig, supersample, row_twist)
 
-    pack_log(folder, rig, poses, ideal_image, sensor=sensor, seed=seed, progress=progress)
+    pack_log(folder, rig, poses, ideal_image, sensor=sensor, seed=seed, readout=readout, progress=progress)
 
 
 def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, sensor: Sensor | None = None,
-             seed: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
+             seed: int = 0, readout: Readout | None = None,
+             progress: Callable[[int, int], None] | None = None) -> None:
     """Write the log of a run at poses T_world_rig (N, 4, 4), and its ground truth, from ideal images.
 
-    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. Both
-    images of a pair show the instant of the lower camera's stamp. Same arguments, same bytes.
+    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
+    of ray-traced mirrors has no model: nominal.toml is what its builder knows. Without a readout both images of a pair
+    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. Same arguments, same bytes.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stamps: Stamps = START_NS + PERIOD_NS * np.arange(len(poses), dtype=np.int64)
+    readout = readout or Readout()
+    stamps: Stamps = START_NS + readout.period_ns * np.arange(len(poses), dtype=np.int64)
     (folder / "truth.txt").write_text(tum(stamps, poses))
-    # Kalibr's file holds unified cameras only.
-    if isinstance(rig.lower.camera, UnifiedCamera):
-        (folder / "camchain.yaml").write_text(camchain(rig))
-    write_rig(folder / "rig.toml", rig)
     rng = np.random.default_rng([seed, 6])
     skews: Stamps = rng.integers(-SKEW_NS, SKEW_NS + 1, len(poses), dtype=np.int64)
+    if not readout.is_synchronous:
+        skews = readout.skew_ns(len(poses)).astype(np.int64)
     sensor = sensor or Sensor()
     exposures = [Exposure.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
-    if any(e.hidden.any() for e in exposures):
-        lower, upper = (_masked(m, e) for m, e in zip((rig.lower, rig.upper), exposures, strict=True))
-        write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
+    _write_rigs(folder, rig, exposures)
 
     def images() -> Images:
         for i in range(len(poses)):
@@ -78,6 +84,20 @@ def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, 
     # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
     (folder / "log.mcap.part").replace(folder / "log.mcap")
+
+
+def _write_rigs(folder: Path, rig: Rig, exposures: list[Exposure]) -> None:
+    """Write the files that describe the rig."""
+    if isinstance(rig.lower.camera, MirrorCamera):
+        write_rig(folder / "nominal.toml", nominal_rig(rig))
+        return
+    # Kalibr's file holds unified cameras only.
+    if isinstance(rig.lower.camera, UnifiedCamera):
+        (folder / "camchain.yaml").write_text(camchain(rig))
+    write_rig(folder / "rig.toml", rig)
+    if any(e.hidden.any() for e in exposures):
+        lower, upper = (_masked(m, e) for m, e in zip((rig.lower, rig.upper), exposures, strict=True))
+        write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
 
 
 def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], images: Images) -> None:

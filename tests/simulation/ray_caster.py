@@ -2,12 +2,12 @@
 
 The camera's lift() defines the rays of a central camera. A MirrorCamera has a ray of its own, with its own origin on
 the mirror, for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the tiles whose
-cone of directions overlaps its own (all tiles of a MirrorCamera).
+cone of directions overlaps its own. With a rolling shutter every row has a pose of its own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -50,6 +50,7 @@ class RayTable:
     axes: Array  # (M, 3) unit
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
     origins: Floats | None = None  # (3, N) [m] camera frame; None: all rays start at the camera's origin
+    reach_m: float = 0.0  # of the farthest origin from the camera's
 
 
 def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
@@ -66,7 +67,12 @@ def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
     axes, angles = _cones(rays[index], starts)
     origins = _origins(mounted, supersample, index)
     return RayTable((height, width), supersample, np.ascontiguousarray(rays[index].T), spacing[index], index,
-                    starts, axes, angles, origins)
+                    starts, axes, angles, origins, _reach_m(origins))
+
+
+def _reach_m(origins: Floats | None) -> float:
+    """Return the distance of the farthest of origins (3, N) from the camera's origin."""
+    return 0.0 if origins is None else float(np.sqrt((origins**2).sum(axis=0).max()))
 
 
 def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats | None:
@@ -123,9 +129,15 @@ def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample
     return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
 
 
-def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
-    """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle."""
+def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2,
+                row_twist: Array | None = None) -> Floats:
+    """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle.
+
+    row_twist (6,): motion of the rig in its own frame from one image row to the next (rolling shutter).
+    """
     table = _cached_table(mounted, supersample)
+    if row_twist is not None and np.any(row_twist):
+        table = _moving(table, se3.adjoint(mounted.T_cam_rig) @ row_twist)
     T_world_cam = T_world_rig @ se3.inverse(mounted.T_cam_rig)
     hits = _Hits.none(table.rays.shape[1])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -135,6 +147,20 @@ def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supers
     canvas = np.zeros((height * supersample, width * supersample), np.float32)
     canvas.ravel()[table.index] = _shade(table, scene, hits, T_world_cam)
     return np.asarray(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _moving(table: RayTable, row_twist: Array) -> RayTable:
+    """Return the table of a camera that moves by a twist (6,) in its own frame per row; to second order in it."""
+    height, width = table.shape
+    row = ((table.index // (width * table.supersample) + 0.5) / table.supersample - 0.5).astype(np.float32)
+    v, W = row_twist[:3].astype(np.float32)[:, None], se3.hat(row_twist[3:]).astype(np.float32)
+    half = row * row / 2
+    origins = row * v + half * (W @ v)
+    if table.origins is not None:
+        origins += table.origins + row * (W @ table.origins) + half * (W @ W @ table.origins)
+    rays = table.rays + row * (W @ table.rays) + half * (W @ W @ table.rays)
+    angles = table.angles + height * np.linalg.norm(row_twist[3:])
+    return replace(table, rays=rays, origins=origins, angles=angles, reach_m=_reach_m(origins))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,14 +197,26 @@ def _cast(table: RayTable, rectangle: Rectangle, T_world_cam: Array, target: tup
 
 
 def _tiles_that_see(table: RayTable, rectangle: Rectangle, T_world_cam: Array) -> NDArray[np.bool_]:
-    """Return the mask (M,) of tiles whose cone overlaps the cone through the rectangle's corners."""
+    """Return the mask (M,) of tiles whose cone overlaps the cone through the rectangle's corners.
+
+    Rays that start beside the camera's origin see a point at most asin(offset / distance) beside its direction.
+    """
     corners = se3.apply(se3.inverse(T_world_cam), rectangle.corners)
+    distance_m = _distance_m(corners)
+    aside = float(np.arcsin(table.reach_m / distance_m)) if table.reach_m < distance_m else np.pi
     rays = corners / np.maximum(np.linalg.norm(corners, axis=1, keepdims=True), MIN_DISTANCE_M)
     axis = rays.sum(axis=0) / max(float(np.linalg.norm(rays.sum(axis=0))), MIN_DISTANCE_M)
     angle = np.arccos(np.clip(rays @ axis, -1, 1)).max()
-    if angle > MAX_CONE_RAD or table.origins is not None:
+    if angle > MAX_CONE_RAD:
         return np.ones(len(table.angles), bool)
-    return np.asarray(np.arccos(np.clip(table.axes @ axis, -1, 1)) <= angle + table.angles)
+    return np.asarray(np.arccos(np.clip(table.axes @ axis, -1, 1)) <= angle + table.angles + aside)
+
+
+def _distance_m(corners: Array) -> float:
+    """Return the distance [m] of a rectangle (4, 3) in the camera frame from the camera's origin."""
+    u, v = corners[1] - corners[0], corners[3] - corners[0]
+    part = np.clip([-corners[0] @ u / (u @ u), -corners[0] @ v / (v @ v)], 0, 1)
+    return float(np.linalg.norm(corners[0] + part[0] * u + part[1] * v))
 
 
 def _runs(table: RayTable, chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:

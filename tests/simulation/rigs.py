@@ -10,12 +10,15 @@ from calib import se3
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
+from tests.simulation.mirrors import MirrorCamera
 
 # Radii of the horizon at scale 1 and of the mirror's rim, in parts of the image's width.
 HORIZON = 207.5676 / 768
 RIM = 373.0 / 768
 TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
 # The image's centre shows the floor; up in the image is forward, and the mirror's flip is in fu < 0.
+# Deviation of real mirrors: tilt of a camera below its mirror, shape, centre of the image.
+TILT_RAD, SHAPE, CENTRE_PX = np.deg2rad(0.7), 0.015, 3.0
 R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
@@ -38,6 +41,47 @@ def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, ri
     lower = MountedCamera(camera, _T_cam_rig(lower_misaligned_deg, (*lower_offset_mm, 0.0)), mask)
     upper = MountedCamera(camera, _T_cam_rig(misaligned_deg, (*offset_mm, 1e3 * baseline_m)), mask)
     return Rig(lower, upper, topics=TOPICS)
+
+
+def with_real_mirrors(rig: Rig, seed: int, amount: float = 1.0) -> Rig:
+    """Return the rig with ray-traced mirrors: cameras tilted below them, shapes off the paraboloid, centres off.
+
+    amount: part of TILT_RAD, SHAPE and CENTRE_PX; the cameras' viewpoints become the foci of the nominal mirrors.
+    """
+    rng = np.random.default_rng([seed, 11])
+    return replace(rig, lower=_real_mirror(rig.lower, rng, amount), upper=_real_mirror(rig.upper, rng, amount))
+
+
+def _real_mirror(mounted: MountedCamera, rng: np.random.Generator, amount: float) -> MountedCamera:
+    """Tilt is TILT_RAD in any direction; conic and ellipticity are up to SHAPE."""
+    camera = mounted.camera
+    assert isinstance(camera, UnifiedCamera) and camera.xi == 1 and mounted.mask is not None
+    direction = rng.uniform(0, 2 * np.pi)
+    tilt = amount * TILT_RAD * np.array([np.cos(direction), np.sin(direction)])
+    conic, ellipticity = amount * SHAPE * rng.uniform(-1, 1, 2)
+    u, v = np.array(camera.center) + amount * rng.uniform(-CENTRE_PX, CENTRE_PX, 2)
+    mirror = MirrorCamera(abs(camera.focal[0]), (u, v), camera.size, tilt_rad=(tilt[0], tilt[1]), conic=conic,
+                          ellipticity=ellipticity)
+    return MountedCamera(mirror, mounted.T_cam_rig, replace(mounted.mask, center=(u, v)))
+
+
+def nominal_rig(rig: Rig) -> Rig:
+    """Return what the builder of a rig of ray-traced mirrors knows, without masks.
+
+    xi = 1, centre of the image, focal length by the mirror's data sheet and its rim in the image (to half a pixel),
+    cameras upright one above the other, and the distance of their viewpoints by ruler (to half a millimetre).
+    """
+    cameras = []
+    for mounted in (rig.lower, rig.upper):
+        mirror, rim = mounted.camera, mounted.visible
+        assert isinstance(mirror, MirrorCamera)
+        focal = mirror.horizon_px * (round(2 * rim.outer_px) / 2) / rim.outer_px
+        centre = ((mirror.size[0] - 1) / 2, (mirror.size[1] - 1) / 2)
+        cameras.append(UnifiedCamera(1.0, (-focal, focal), centre, mirror.size))
+    ruler_mm = round(2e3 * rig.baseline_m) / 2
+    lower, upper = (MountedCamera(camera, _T_cam_rig((0, 0, 0), (0, 0, height_mm)))
+                    for camera, height_mm in zip(cameras, (0.0, ruler_mm), strict=True))
+    return Rig(lower, upper, rig.T_base_rig, rig.topics)
 
 
 def _T_cam_rig(misaligned_deg: tuple[float, float, float], viewpoint_mm: tuple[float, float, float]) -> Array:

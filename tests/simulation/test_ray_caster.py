@@ -8,9 +8,10 @@ import pytest
 
 from calib import se3
 from calib.rig import MountedCamera, Rig
-from tests.simulation import Rectangle, Scene, build, make_rig, render
+from tests.simulation import Rectangle, Scene, build, make_rig, ray_caster, render
 from tests.simulation.builders import wall
 from tests.simulation.paths import planar_poses
+from tests.simulation.rigs import with_real_mirrors
 
 SIZE = 192
 SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
@@ -118,3 +119,11 @@ def test_distant_texture_is_averaged() -> None:
     inner = cv2.erode((image > 0).astype(np.uint8), np.ones((5, 5))) > 0
     assert inner.sum() > 100
     assert image[inner].std() < 3
+
+
+def test_a_ray_traced_mirror_sees_what_all_tiles_would_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = build("rooms", 3, SIZE, 5)
+    mounted = with_real_mirrors(run.rig, 3).lower
+    culled = render(run.scene, mounted, run.poses[2])
+    monkeypatch.setattr(ray_caster, "_tiles_that_see", lambda table, *_: np.ones(len(table.angles), bool))
+    np.testing.assert_array_equal(culled, render(run.scene, mounted, run.poses[2]))

@@ -23,7 +23,7 @@ from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.status_names import RIG
 from tests.simulation import build, write_log
-from tests.simulation.logs import PERIOD_NS
+from tests.simulation.readout import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
 
 SECONDS = 10**9
