@@ -9,6 +9,7 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
+from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3
 
@@ -34,12 +35,13 @@ class MountedCamera:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lower and the upper camera; T_base_rig is the rig's pose on the robot."""
+    """The lower and the upper camera; T_base_rig is the rig's pose on the robot; covariance None if unknown."""
 
     lower: MountedCamera
     upper: MountedCamera
     T_base_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4)
     topics: tuple[str, str] = ("", "")  # of the lower and the upper camera's images; "" if unknown
+    covariance: RigCovariance | None = None  # of the calibration
 
     def __post_init__(self) -> None:
         for name, T in (("lower T_cam_rig", self.lower.T_cam_rig), ("upper T_cam_rig", self.upper.T_cam_rig),

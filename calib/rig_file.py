@@ -1,6 +1,7 @@
 """The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
 
-Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras.
+Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
+optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from calib import se3
 from calib.camera_table import camera_text, intrinsics_text, mask_text, number_text, png, read_camera_table
+from calib.covariance_table import covariance_text, read_covariance
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
@@ -34,12 +36,14 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    table.allow_only(("schema", "T_base_rig", *SIDES))
+    table.allow_only(("schema", "T_base_rig", "covariance", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)
     topics = [side.text("topic") if side.has("topic") else "" for side in (lower, upper)]
     mounted = [_mounted(side, folder, f"T_rig_{side.path}") for side in (lower, upper)]
-    return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]))
+    cameras = (mounted[0].camera, mounted[1].camera)
+    covariance = read_covariance(table.table("covariance"), cameras) if table.has("covariance") else None
+    return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]), covariance)
 
 
 def _mounted(table: ValidatedTable, folder: Path | None, transform: str) -> MountedCamera:
@@ -88,6 +92,8 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
         parts.append(intrinsics_text(side, mounted.camera))
         if mounted.mask is not None:
             parts.append(mask_text(side, mounted.mask, (images or {}).get(side, "")))
+    if rig.covariance is not None:
+        parts.append(covariance_text(rig.covariance))
     return "".join(parts)
 
 

@@ -114,7 +114,7 @@ class RigParameters:
         lower = replace(rig.lower, camera=self.lower.camera_at(steps[:first]))
         upper = replace(rig.upper, camera=self.upper.camera_at(steps[first:second]),
                         T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
-        return replace(rig, lower=lower, upper=upper)
+        return replace(rig, lower=lower, upper=upper, covariance=None)
 
 
 @dataclass(frozen=True, slots=True)

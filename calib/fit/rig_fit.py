@@ -50,6 +50,7 @@ class RigCalibration:
     parameters: tuple[tuple[tuple[str, float, float], ...], ...]  # of lower and upper: name, value, sigma
     motion_sigma: Array  # (6,) sigmas of T_upper_lower, translation [m] and rotation [rad], in the upper frame
     baseline_sigma_m: float
+    covariance: Array  # (P, P) of the cameras' parameters, if refined, and of T_upper_lower (as motion_sigma)
     rejected: tuple[RejectedView, ...] = ()
 
     @property
@@ -237,8 +238,10 @@ def _rig_calibration(good: Sequence[PairView], board: Board, solved: tuple[Bundl
     parts = ((0, lower), (lower, upper))
     parameters = tuple(tuple(side.values(fit.parameters[a:b], sigma[a:b])) if unknowns.refined else ()
                        for side, (a, b) in zip(unknowns.parameterisations, parts, strict=True))
-    motion = fit.covariance[upper:, upper:] * np.outer(unknowns.units, unknowns.units)
+    units = np.concatenate([*(side.units for side in unknowns.parameterisations if unknowns.refined), unknowns.units])
+    covariance = fit.covariance * np.outer(units, units)
+    motion = covariance[upper:, upper:]
     along = found.T_upper_lower[:3, 3] / np.linalg.norm(found.T_upper_lower[:3, 3])
     return RigCalibration(found.lower, found.upper, found.T_upper_lower, board, tuple(good), fit, parameters,
                           np.sqrt(np.maximum(0, np.diag(motion))), float(np.sqrt(along @ motion[:3, :3] @ along)),
-                          tuple(rejected))
+                          covariance, tuple(rejected))

@@ -120,6 +120,7 @@ def _export_ocam(rig: Rig, path: Path) -> list[Path]:
 def _left_out(rig: Rig) -> str:
     masks = rig.lower.mask is not None or rig.upper.mask is not None
     left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
+    left += ["covariance"] * (rig.covariance is not None)
     return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
 
 

@@ -15,6 +15,7 @@ from calib.camera_file import CameraFile, read_camera
 from calib.fit.camera_fit import RejectedView
 from calib.fit.model_selection import MODEL_CHOICES, refine_selection, select_calibration
 from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, refine_rig_calibration
+from calib.fit.rig_uncertainty import drive_uncertainty, rig_covariance
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
@@ -82,7 +83,9 @@ def run(args: argparse.Namespace) -> int:
     misfit = misfit_warnings({f"{name} camera": found.structure(side) for side, name in enumerate(SIDES)})
     for line in (*misfit, *warnings, *unmasked, *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)):
         print(f"warning: {line}", file=sys.stderr)
-    print(f"{args.output}: {'MISFIT: ' if misfit else ''}{describe(found)}")
+    uncertainty = drive_uncertainty(rig)
+    predicted = f"; drives: {uncertainty}" if uncertainty is not None and any(found.parameters) else ""
+    print(f"{args.output}: {'MISFIT: ' if misfit else ''}{describe(found)}{predicted}")
     return 0
 
 
@@ -220,14 +223,15 @@ def _check_baseline(found: RigCalibration, args: argparse.Namespace) -> list[str
 
 def _rig(found: RigCalibration, images: PairedImages, given: tuple[CameraFile, CameraFile] | None,
          args: argparse.Namespace) -> tuple[Rig, list[str]]:
-    """Return the rig with its masks, and warnings about mirrors without a rim in the images."""
+    """Return the rig with its masks and covariance, and warnings about mirrors without a rim in the images."""
     rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
     masks = [_mask(found_camera.center, side, file, with_struts=args.mask)
              for found_camera, side, file in zip((found.lower, found.upper), images.sides, given or (None, None),
                                                  strict=True)]
     warnings = [f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
                 f"add [{name}.mask] by hand" for name, mask in zip(SIDES, masks, strict=True) if mask is None]
-    return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings
+    masked = replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1]))
+    return replace(masked, covariance=rig_covariance(found, rig)), warnings
 
 
 def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, *, with_struts: bool) -> Mask | None:

@@ -138,8 +138,11 @@ def test_views_of_one_camera_are_used_if_cameras_are_refined(folder: Path, alone
     words = [*given(folder), "--refine-cameras", "--report", alone / "report.html"]
     assert run(alone, "-o", alone / "rig.toml", *words) == 0
     output = capsys.readouterr()
-    assert output.out.endswith("5 pairs, 2 views of one camera alone\n") and output.err == ""
-    assert "not seen" in (alone / "report.html").read_text() and turn_off_deg(read_rig(alone / "rig.toml")) < 0.05
+    assert "5 pairs, 2 views of one camera alone; drives: scale uncertain by 0." in output.out and output.err == ""
+    found = read_rig(alone / "rig.toml")
+    assert "not seen" in (alone / "report.html").read_text() and turn_off_deg(found) < 0.05
+    assert found.covariance is not None and "upper fv" in found.covariance.names
+    assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 4e-3
 
 
 def test_given_cameras_are_kept_and_single_views_rejected(

@@ -1,0 +1,163 @@
+"""The covariance of a calibrated rig, and its effect on the motion that the rig measures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib import se3
+from calib.errors import CalibError
+from calib.fit.parameterisation import parameterise
+from calib.fit.rig_fit import RigCalibration
+from calib.models.camera import Array
+from calib.rig import Rig
+from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+
+# Step of numeric derivatives by twists [m, rad] and by points [m]; by parameters, in sigmas.
+TWIST_STEP, POINT_STEP_M, SIGMA_STEP = 1e-6, 1e-5, 0.1
+# The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
+WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
+# Length of the predicted drive, and its directions.
+DRIVE_M, DIRECTIONS = 0.1, 4
+# Least number of points that both cameras must see.
+MIN_POINTS = 30
+
+
+@dataclass(frozen=True, slots=True)
+class DriveUncertainty:
+    """Standard deviations of a drive's length (relative) and heading (per metre) by the errors of a rig."""
+
+    scale: float
+    heading_rad_m: float
+
+    def __str__(self) -> str:
+        return (f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} "
+                "degree/m")
+
+
+def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
+    """Return the covariance of a calibration's parameters for its rig; of the transform alone if the cameras are fixed.
+    """
+    names = [f"{side} {name}" for side, values in zip(("lower", "upper"), found.parameters, strict=True)
+             for name, _, _ in values]
+    J = np.eye(len(found.covariance))
+    J[len(names):, len(names):] = _transform_by_twist(found.T_upper_lower, rig)
+    return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.covariance @ J.T)
+
+
+def _transform_by_twist(T_upper_lower: Array, rig: Rig) -> Array:
+    """Return the derivatives (6, 6) of the parameters TRANSFORM_NAMES by twists of T_upper_lower."""
+    R_rect_lower = rig.T_rect_rig[:3, :3] @ rig.lower.T_cam_rig[:3, :3].T
+    R_upper_rect = T_upper_lower[:3, :3] @ R_rect_lower.T
+
+    def values(twist: Array) -> Array:
+        T_lower_upper = se3.inverse(se3.exp(twist) @ T_upper_lower)
+        turn = se3.rotation_log(R_rect_lower @ T_lower_upper[:3, :3] @ R_upper_rect)
+        x, y, z = R_rect_lower @ T_lower_upper[:3, 3]
+        return np.array([*turn, x / z, y / z, np.linalg.norm(T_lower_upper[:3, 3])])
+
+    return _differences(values, TWIST_STEP * np.ones(6))
+
+
+def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
+    """Return the rig after changes (P,) of its named parameters, in their own units; names as in RigCovariance.
+
+    Raises CalibError if the result is no camera.
+    """
+    change = dict(zip(names, changes.tolist(), strict=True))
+    cameras = []
+    for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
+        parameters = parameterise(mounted.camera)
+        steps = [change.pop(f"{side} {name}", 0.0) / unit
+                 for name, unit in zip(parameters.names, parameters.units, strict=True)]
+        cameras.append(parameters.camera_at(np.array(steps)))
+    r_x, r_y, r_z, e_x, e_y, longer = (change.pop(name, 0.0) for name in TRANSFORM_NAMES)
+    if change:
+        raise CalibError(f"covariance: the rig has no parameter {next(iter(change))!r}")
+    R_rig_rect = rig.T_rect_rig[:3, :3].T
+    along = np.array([e_x, e_y, 1.0]) / np.linalg.norm([e_x, e_y, 1.0])
+    viewpoint = rig.lower.viewpoint + (rig.baseline_m + longer) * R_rig_rect @ along
+    R_rig_upper = R_rig_rect @ se3.rotation_exp([r_x, r_y, r_z]) @ R_rig_rect.T @ rig.upper.T_cam_rig[:3, :3].T
+    upper = replace(rig.upper, camera=cameras[1], T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
+    return replace(rig, lower=replace(rig.lower, camera=cameras[0]), upper=upper)
+
+
+def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
+    """Predict the errors of a drive by the covariance of its rig; None if it has none or sees too little.
+
+    A drive among walls: points are triangulated by both cameras at its start, then the pose at its end is fitted to
+    their pixels in both cameras, all to first order. Errors are root mean squares over the directions of the drive.
+    """
+    if rig.covariance is None:
+        return None
+    points = _seen_points(rig)
+    if len(points) < MIN_POINTS:
+        return None
+    names, sigmas = rig.covariance.names, np.maximum(rig.covariance.sigmas, np.finfo(float).tiny)
+    variances = np.zeros(2)
+    for azimuth in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        direction = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        J = _motion_by_parameters(rig, points, DRIVE_M * direction, (names, sigmas))
+        effect = np.stack([direction @ J[:3], J[5]]) / DRIVE_M
+        variances += np.einsum("ep,pq,eq->e", effect, rig.covariance.correlation, effect) / DIRECTIONS
+    scale, heading_rad_m = np.sqrt(np.maximum(0.0, variances)).tolist()
+    return DriveUncertainty(scale, heading_rad_m)
+
+
+def _seen_points(rig: Rig) -> Array:
+    """Return points (N, 3) in the rectified frame, on walls around the rig, that both cameras see."""
+    azimuth, slope, distance = (part.ravel() for part in np.meshgrid(
+        2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M))
+    points = distance[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), slope])
+    pixels = _pixels(rig, points)
+    seen = [mounted.visible.contains(side) for mounted, side in zip((rig.lower, rig.upper), np.split(pixels, 2, axis=1),
+                                                                     strict=True)]
+    return np.asarray(points[np.isfinite(pixels).all(axis=1) & seen[0] & seen[1]])
+
+
+def _pixels(rig: Rig, points: Array) -> Array:
+    """Return the pixels (N, 4) in the lower and the upper camera of points (N, 3) in the rectified frame."""
+    in_rig = se3.apply(se3.inverse(rig.T_rect_rig), points)
+    return np.column_stack([mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig))
+                            for mounted in (rig.lower, rig.upper)])
+
+
+def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
+    """Return the derivatives (6, P) of the measured motion (translation, rotation) by parameters in units of scaled.
+
+    The points' pixels stay the same. Their triangulation at the start: J_point dX + J_parameter = 0. The pose at the
+    end, by the same pixels' equations: J_point dX + J_pose dp + J_parameter = 0, in least squares.
+    """
+    T_rig_rect = se3.inverse(rig.T_rect_rig)
+    ends = points - move
+    first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
+    by_start, by_end = (_pixels_by_point(rig, at) for at in (points, ends))
+    shift = -np.linalg.pinv(by_start) @ first  # (N, 3, P)
+    # The pose moves and turns the points the other way: dX_end = -dp - w x X_end.
+    by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)
+    right = (by_end @ shift + last).reshape(-1, first.shape[2])
+    return np.asarray(-np.linalg.lstsq(by_pose.reshape(-1, 6), right, rcond=None)[0])
+
+
+def _pixels_by_point(rig: Rig, points: Array) -> Array:
+    """Return the derivatives (N, 4, 3) of the pixels by points (N, 3) in the rectified frame."""
+    return _differences(lambda shift: _pixels(rig, points + shift), POINT_STEP_M * np.ones(3))
+
+
+def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
+    """Return the derivatives (N, 4, P) of the pixels of points (N, 3) in the rig frame."""
+    names, units = scaled
+
+    def pixels(changes: Array) -> Array:
+        changed = perturbed_rig(rig, names, changes * units)
+        return np.column_stack([mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig))
+                                for mounted in (changed.lower, changed.upper)])
+
+    return _differences(pixels, SIGMA_STEP * np.ones(len(names)))
+
+
+def _differences(function: Callable[[Array], Array], steps: Array) -> Array:
+    """Return the central differences (..., P) of a function about zero."""
+    return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)

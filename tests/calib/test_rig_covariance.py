@@ -1,0 +1,82 @@
+"""The covariance of a rig in rig.toml: exact round trips, names, hostile tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.covariance_table import covariance_text
+from calib.errors import CalibError
+from calib.fit.parameterisation import parameterise
+from calib.models.camera import Array
+from calib.rig import Rig
+from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig_file import parse_rig, rig_toml
+
+
+def names_of(rig: Rig) -> tuple[str, ...]:
+    sides = (("lower", rig.lower), ("upper", rig.upper))
+    return (*(f"{side} {name}" for side, mounted in sides for name in parameterise(mounted.camera).names),
+            *TRANSFORM_NAMES)
+
+
+def random_matrix(count: int) -> Array:
+    """Return a covariance whose variances span 16 orders of magnitude."""
+    rng = np.random.default_rng(3)
+    factor = rng.standard_normal((count, count)) * np.logspace(-8, 0, count)[:, None]
+    return np.asarray(factor @ factor.T)
+
+
+def test_round_trip_is_exact(rig: Rig) -> None:
+    names = names_of(rig)
+    matrix = random_matrix(len(names))
+    text = rig_toml(replace(rig, covariance=RigCovariance.of_matrix(names, matrix)))
+    found = parse_rig(text).covariance
+    assert found is not None and found.names == names
+    np.testing.assert_allclose(found.matrix, matrix, rtol=0, atol=1e-11 * np.diag(matrix).max())
+    np.testing.assert_allclose(found.sigmas**2, np.diag(matrix), rtol=1e-12)
+    assert rig_toml(parse_rig(text)) == text
+    assert parse_rig(rig_toml(rig)).covariance is None
+
+
+def test_select_returns_the_marginal_covariance(omni_rig: Rig) -> None:
+    names = names_of(omni_rig)
+    matrix = random_matrix(len(names))
+    found = RigCovariance.of_matrix(names, matrix).select(["baseline", "lower fv"])
+    chosen = [names.index("baseline"), names.index("lower fv")]
+    np.testing.assert_allclose(found.matrix, matrix[np.ix_(chosen, chosen)], rtol=1e-9)
+    assert found.sigma("baseline") == pytest.approx(np.sqrt(matrix[-1, -1]))
+    with pytest.raises(CalibError, match="no parameter 'lower k1'"):
+        found.select(["lower k1"])
+
+
+SMALL = RigCovariance.of_matrix(("lower xi", "r_x", "baseline"), np.array([[4, 1, 0], [1, 9.0, 3], [0, 3, 16]]))
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("version = 1", "version = 2", "covariance.version: expected 1, found 2"),
+    ("version = 1", "version = true", "covariance.version"),
+    ("version = 1", "version = 1\nmatrix = 3", "covariance.matrix: unknown key"),
+    ('"r_x"', '"r_q"', "covariance.parameters: expected 1 to 160 names"),
+    ('"lower xi"', '"lower a0"', "covariance.parameters"),
+    ('"lower xi"', '"baseline"', "covariance: covariance: expected 1 to 160 different parameters"),
+    ('"lower xi", ', '', "covariance.sigma: expected 2 finite numbers"),
+    ('["lower xi", "r_x", "baseline"]', "[]", "covariance.parameters"),
+    ("sigma = [2.0", "sigma = [-2.0", "expected sigmas of 0"),
+    ("sigma = [2.0", "sigma = [1e200", "expected sigmas of 0"),
+    ("sigma = [2.0", "sigma = [nan", "covariance.sigma: expected 3 finite numbers"),
+    ("[0.0, 0.25]", "[0.0]", "covariance.correlation: expected 3 rows"),
+    ("[0.0, 0.25]", "[0.0, 1.5]", "between -1 and 1"),
+    ("[0.0, 0.25]", "[-0.99, 0.99]", "contradict each other"),
+    ("[0.0, 0.25]", "[0.0, 'a']", "covariance.correlation: expected 2 finite numbers"),
+    ("[0.0, 0.25]", "3", "covariance.correlation"),
+])
+def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) -> None:
+    text = rig_toml(omni_rig) + covariance_text(SMALL)
+    assert text.count(old) >= 1 and parse_rig(text).covariance is not None
+    at = text.index("[covariance]")
+    with pytest.raises(CalibError) as caught:
+        parse_rig(text[:at] + text[at:].replace(old, new, 1), name="my.toml")
+    assert message in str(caught.value) and str(caught.value).startswith("my.toml: ") and "\n" not in str(caught.value)
