@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,3 +29,14 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run, other = build("two_walls", seed=3, size=256, pairs=PAIRS), build("two_walls", seed=8, size=256, pairs=PAIRS)
     write_log(folder, run.rig, run.poses, other.scene, sensor=run.sensor, seed=8)
     return folder
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Handle SIGINT and SIGHUP as in a terminal, also in child processes, although a parent ignores them (nohup)."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -29,6 +29,8 @@ from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
 from tests.replay.command import Command
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 ROOT = Path(__file__).parents[2]
 Pair = tuple[int, np.ndarray, np.ndarray]
 

@@ -18,6 +18,8 @@ from drivers.logs.mcap_writer import LogWriter
 from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.replay.command import Command
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 ROOT = Path(__file__).parents[2]
 RECORDS = """
 import os

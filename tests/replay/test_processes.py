@@ -25,6 +25,8 @@ from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
 from tests.replay.command import Command, rows
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 

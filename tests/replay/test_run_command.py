@@ -16,6 +16,8 @@ from omnid.formats.tum import read_tum
 from tests.replay.command import Command
 from tests.replay.live import PATIENCE_S, ROOT, answers, free_port, robot, started, wait_until
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 

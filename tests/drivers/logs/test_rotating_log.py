@@ -122,6 +122,20 @@ def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> Non
     assert recording.state.deleted == 8 and recording.state.lost == 0
 
 
+def test_symbolic_links_are_neither_counted_nor_deleted(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    """A link with the name of a recording may lead out of the folder."""
+    outside = tmp_path / "outside.mcap"
+    outside.write_bytes(bytes(100))
+    recording = bench(replace(ROOMY, file_s=1.0, keep_files=2))
+    recording.folder.mkdir()
+    link = recording.folder / "robot_20000101T000000Z_001.mcap"  # older than all others
+    link.symlink_to(outside)
+    recording.write(200)
+    recording.log.close()
+    assert link.is_symlink() and outside.stat().st_size == 100
+    assert len(recording.names()) == 1 + 2 and recording.state.deleted == recording.state.files - 2 > 0
+
+
 def test_limits_the_size_of_all_files(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_bytes=300_000, keep_bytes=1_000_000))
     sizes = []

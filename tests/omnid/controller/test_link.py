@@ -30,6 +30,8 @@ from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from tests.replay.live import ROOT, Base, wait_until
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 DEADLINES = Deadlines(pose_s=5.0, command_s=5.0, tick_s=5.0)  # a busy machine is late with everything
 AHEAD = Setpoint(0.4, None, 0.0)
 DECELERATION_MPS2 = 0.8

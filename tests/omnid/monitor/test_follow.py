@@ -28,6 +28,8 @@ from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 
 @contextlib.contextmanager
 def listening(*words: object) -> Iterator[subprocess.Popen[str]]:

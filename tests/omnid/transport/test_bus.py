@@ -168,6 +168,15 @@ def test_direct_subscribers_lose_nothing_when_a_router_is_killed(tmp_path: Path)
     assert max(np.diff(numbers(behind))) > 50, "the router was away"
 
 
+def appears(endpoint: str) -> bool:
+    """True if a robot can be reached by the router."""
+    try:
+        Robot(connect=(endpoint,)).close()
+    except Unreachable:
+        return False
+    return True
+
+
 def test_a_client_waits_for_its_router() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(mode="client", listen=(), connect=(endpoint,)))) as bus:
@@ -179,10 +188,12 @@ def test_a_client_waits_for_its_router() -> None:
         assert bus.status().level == WARN and bus.status().values["lost"] == "1"
         assert bus.status().message == f"no router yet at {endpoint}"
         with script(ROUTER, endpoint):
-            wait_until(lambda: bus.connect() is None and bus.publish("odom", odometry(2)) is None and bus.lost < 20
-                       and bus._session is not None)
+            wait_until(lambda: bus.connect() is None and bus.status().level == OK)
+            bus.publish("odom", odometry(2))
+            assert bus.status().values["lost"] == "1"
+            wait_until(lambda: appears(endpoint))
             with Robot(connect=(endpoint,)) as robot:
-                assert robot.query("config") == "robot = 1"
+                wait_until(lambda: robot.query("config") == "robot = 1")  # the router hears of it a moment later
                 driver = robot.driver()
                 wait_until(lambda: driver.stop() is None and "cmd/stop" in received)
                 pose = robot.subscribe(Pose).newest()

@@ -33,6 +33,8 @@ from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.omnid.viewer.rrd import need_rerun, positions, rows, verified
 from tests.omnid.viewer.test_view import START_NS, made
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 
 @contextlib.contextmanager
 def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:

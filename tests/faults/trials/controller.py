@@ -6,7 +6,7 @@ import random
 import time
 
 from omnid.core.control.safety_rules import FAILED
-from tests.replay.faults.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
+from tests.faults.trials.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
 from tests.replay.live import command_line, free_port, wait_until
 
 

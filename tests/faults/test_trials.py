@@ -1,4 +1,4 @@
-"""No fault ends the daemon or moves the wheels without a command; `python -m tests.replay.faults` lists the results."""
+"""No fault ends the daemon or moves the wheels without a command; `python -m tests.faults` lists the results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.replay.faults import TRIALS, Setting
+from tests.faults.trials import TRIALS, Setting
 
 
 @pytest.mark.slow

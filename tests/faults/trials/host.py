@@ -11,7 +11,7 @@ from pathlib import Path
 
 from omnid.core.control.safety_rules import POSE_STALE
 from omnid.transport import codec
-from tests.replay.faults.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
+from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
 from tests.replay.live import PATIENCE_S, Base, Operator, robot, wait_until
 
 

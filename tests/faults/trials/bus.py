@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 
 from omnid.transport import codec
-from tests.replay.faults.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
+from tests.faults.trials.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
 from tests.replay.live import ROOT, Base, Operator, command_line, free_port, wait_until
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.replay.faults.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
+from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
 from tests.replay.live import wait_until
 
 

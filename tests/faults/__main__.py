@@ -1,0 +1,95 @@
+"""Attack the daemon: `python -m tests.faults [PART ...]` prints tables in Markdown and returns 1 where it did not hold.
+
+Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), commands (mutated commands),
+files (mutated files). The whole campaign is seeded and bounded; with the numbers of the defaults it takes some hours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from tests.faults import hostile_commands, hostile_files, stop_times
+from tests.faults.trials import TRIALS, Outcome, Setting
+from tests.simulation import build, write_log
+
+Report = Callable[[str], None]
+BUSY_LOOP = "while True: pass"
+
+
+def scene(folder: Path) -> Path:
+    """Render a small run into the folder."""
+    run = build("two_walls", seed=3, size=256, pairs=24)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    return folder
+
+
+def run_trials(recorded: Path, folder: Path, words: list[str], report: Report) -> int:
+    """Print the outcome of each trial whose name has one of the words; return the number of failures."""
+    report("| fault | process | wheels | status |\n|---|---|---|---|")
+    failed = 0
+    for number, fault in enumerate(name for name in TRIALS if not words or any(word in name for word in words)):
+        own = folder / f"trial-{number}" / "in"
+        own.mkdir(parents=True)
+        try:
+            outcome = TRIALS[fault](Setting(recorded, own))
+        except AssertionError as error:
+            failed += 1
+            outcome = Outcome("FAILED", "", " ".join(str(error).split())[:200])
+        report(f"| {fault} | {' | '.join(outcome)} |")
+    return failed
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Keep so many other processes busy in this block."""
+    with ExitStack() as ends:
+        for _ in range(count):
+            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", BUSY_LOOP]))
+            ends.callback(process.kill)
+        yield
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the options."""
+    result = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parts = ("trials", "stops", "commands", "files")
+    result.add_argument("parts", nargs="*", choices=[*parts, []], default=parts, metavar="PART", help=", ".join(parts))
+    result.add_argument("--only", action="append", default=[], metavar="WORD",
+                        help="of trials and stops, those whose name has the word; may be given several times")
+    result.add_argument("--seed", type=int, default=1)
+    result.add_argument("--stops", type=int, default=200, help="stops to measure for each cause")
+    result.add_argument("--commands", type=int, default=30_000, help="mutated commands to send")
+    result.add_argument("--files", type=int, default=10_000, help="mutated files of each format")
+    result.add_argument("--busy", type=int, default=0, metavar="N", help="keep N other processes busy meanwhile")
+    return result
+
+
+def main() -> int:
+    """Run the parts; return 1 where one did not hold."""
+    args = parser().parse_args()
+    failed = 0
+
+    def report(line: str) -> None:
+        print(line, flush=True)
+
+    with tempfile.TemporaryDirectory() as name, busy_processes(args.busy):
+        recorded, folder = scene(Path(name) / "scene"), Path(name)
+        if "trials" in args.parts:
+            failed += run_trials(recorded, folder, args.only, report)
+        if "stops" in args.parts:
+            failed += stop_times.run(recorded, folder, args.only, args.stops, args.seed, report)
+        if "commands" in args.parts:
+            failed += hostile_commands.run(recorded, folder, args.commands, args.seed, report)
+        if "files" in args.parts:
+            failed += hostile_files.run(folder, args.files, args.seed, report)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""Mutated commands against a live daemon: nothing moves without a valid one, limits hold, each is counted."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.transport import codec
+from tests.faults.mutation import mutated
+from tests.replay.live import Operator, robot, wait_until
+
+TOPICS: Final = ("cmd/heading", "cmd/twist", "cmd/unknown")
+OLD_S: Final = 3600.0
+BATCH: Final = 500  # commands between two looks at the daemon
+SETTLE_S: Final = 1.0
+
+
+def command(rng: random.Random, age_s: float) -> tuple[str, bytes]:
+    """Return topic and payload of a mutated command whose stamp is so old before the mutation."""
+    stamp_ns = time.time_ns() - round(age_s * 1e9)
+    payload = rng.choice((codec.heading_cdr(stamp_ns, rng.uniform(-3, 3), rng.uniform(-9, 9)),
+                          codec.twist_stamped_cdr(stamp_ns, "base_link", rng.uniform(-3, 3), rng.uniform(-9, 9))))
+    return rng.choice(TOPICS), mutated(rng, payload)
+
+
+def counted(operator: Operator) -> int:
+    """Return the number of commands that the daemon has counted, accepted and refused."""
+    values = operator.values("wheels")
+    return int(values["commands"]) + sum(int(count) for name, count in values.items() if name.startswith("refused"))
+
+
+def attack(operator: Operator, rng: random.Random, count: int, age_s: float) -> None:
+    """Send mutated commands, and wait until the daemon has counted them all."""
+    before = counted(operator)
+    for sent in range(1, count + 1):
+        operator.send(*command(rng, age_s))
+        if sent % BATCH == 0 or sent == count:
+            wait_until(lambda sent=sent: counted(operator) == before + sent, f"the count of {sent} commands")
+
+
+def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[str], None]) -> int:
+    """Print a row for each attack; return the number of attacks that did not hold."""
+    rng, limits = random.Random(seed), VelocityLimits()
+    own = folder / "commands"
+    own.mkdir()
+    report("| mutated commands | sent | wheels | daemon |\n|---|---|---|---|")
+    with robot(recorded, own) as (daemon, operator, base):
+        try:
+            attack(operator, rng, count // 2, OLD_S)
+            assert not base.line.moved_since(0.0), "the wheels turned by an old command"
+            report(f"| an hour old, nobody drives | {count // 2} | never turned | alive, all counted |")
+            operator.drive()
+            wait_until(lambda: base.drives, "motion")
+            operator.stop_sending()
+            attack(operator, rng, count // 2, 0.0)
+            fastest = max(abs(sum(note.wheels_mps)) / 2 for note in base.line.notes)
+            assert fastest <= limits.velocity_mps + 1e-3, f"{fastest} m/s"
+            wait_until(lambda: not base.drives, "the stop")
+            time.sleep(SETTLE_S)
+            assert not base.drives, "the wheels turn although nobody commands"
+            report(f"| of now, the operator has stopped | {count // 2} | at most {fastest:.2f} m/s, stood afterwards "
+                   "| alive, all counted |")
+            code, err = daemon.end()
+            assert code == 0 and "Traceback" not in err, (code, err)
+        except AssertionError as error:
+            report(f"| FAILED | | | {' '.join(str(error).split())[:200]} |")
+            return 1
+    return 0

@@ -1,0 +1,176 @@
+"""Mutated files against every parser, in a process of limited memory: one clear error or a result, never more.
+
+`python -m tests.faults.hostile_files FORMAT FOLDER FILES SEED` is that process; it prints the files that did not hold.
+"""
+
+from __future__ import annotations
+
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from calib.camera_file import CameraFile, camera_toml, parse_camera
+from calib.errors import CalibError
+from calib.kalibr import export_kalibr, parse_kalibr
+from calib.ocam_file import parse_ocam
+from calib.rig_file import parse_rig, read_rig
+from drivers.errors import DriverError
+from drivers.frame import gray
+from drivers.logs.mcap_reader import LogReader
+from drivers.logs.mcap_recovery import recover
+from omnid.config import Config, load_config
+from omnid.errors import OmnidError
+from omnid.formats.tum import read_tum
+from omnid.settings import dump
+from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
+from tests.faults.mutation import mutated
+from tests.simulation import build, write_log
+
+ROOT: Final = Path(__file__).parents[2]
+MEMORY_BYTES: Final = 1 << 30  # of address space: numpy, OpenCV and zenoh take about half of it
+LONGEST_S: Final = 10.0  # for one file
+MOST_FAILURES: Final = 5
+EXPECTED: Final = (CalibError, DriverError, OmnidError)
+OCAM: Final = b"4 -200 0 1e-3 1e-7\n3 1 2 3\n240 320\n1 0 0\n480 640\n"
+
+
+class Format(NamedTuple):
+    """A file format: a good file from a folder with a short rendered run, and its parser."""
+
+    good: Callable[[Path], bytes]
+    parse: Callable[[Path], object]
+
+
+class TooLongError(Exception):
+    """A file took too long."""
+
+
+def read_log(path: Path) -> None:
+    """Read a log as a replay does, and recover it."""
+    reader = LogReader(path)
+    try:
+        reader.attachments()
+        for frame in reader.frames():
+            try:
+                gray(frame)
+            except DriverError:
+                continue
+    finally:
+        reader.close()
+    recover(path, path.with_name("recovered.mcap"))
+
+
+def read_messages(path: Path) -> None:
+    """Decode the bytes as each message of the bus; the first two bytes choose the length of the attachment."""
+    data = path.read_bytes()
+    split = int.from_bytes(data[:2], "little") % (len(data) + 1)
+    for decode in (decode_pose, decode_diagnostics, decode_cloud, decode_map):
+        try:
+            decode(data[split:], data[:split])
+        except EXPECTED:
+            continue
+
+
+def camera_text(folder: Path) -> bytes:
+    """Return a camera.toml."""
+    mounted = read_rig(folder / "rig.toml").lower
+    return camera_toml(CameraFile(mounted.camera, mounted.mask)).encode()
+
+
+FORMATS: Final = {
+    "rig.toml": Format(lambda folder: (folder / "rig.toml").read_bytes(), lambda path: parse_rig(path.read_bytes())),
+    "camera.toml": Format(camera_text, lambda path: parse_camera(path.read_bytes())),
+    "camchain.yaml": Format(lambda folder: export_kalibr(read_rig(folder / "rig.toml")).encode(),
+                            lambda path: parse_kalibr(path.read_bytes())),
+    "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),
+    "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
+    "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),
+    "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_log),
+    "message.cdr": Format(lambda _: random.Random(0).randbytes(3000), read_messages),
+}
+
+
+def too_long(_: int, __: FrameType | None) -> None:
+    """Interrupt a parser."""
+    raise TooLongError(f"longer than {LONGEST_S:g} s")
+
+
+def failures(name: str, folder: Path, count: int, seed: int) -> list[str]:
+    """Parse mutated files; return a line for each that did not hold, at most MOST_FAILURES."""
+    form, path, found = FORMATS[name], folder / f"mutated-{name}", list[str]()
+    good = form.good(folder)
+    path.write_bytes(good)
+    form.parse(path)
+    for number in range(count):
+        path.write_bytes(mutated(random.Random(f"{name} {seed} {number}"), good))
+        signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+        try:
+            form.parse(path)
+        except EXPECTED as error:
+            if "\n" in str(error):
+                found.append(f"{name} {number}: more than one line: {error}")
+        except Exception as error:
+            found.append(f"{name} {number}: {type(error).__name__}: {error}")
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        if len(found) >= MOST_FAILURES:
+            break
+    return found
+
+
+def limited_main(name: str, folder: str, count: str, seed: str) -> int:
+    """Attack one parser in this process, whose memory is limited; print the failures and the largest memory."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    signal.signal(signal.SIGALRM, too_long)
+    with np.errstate(all="ignore"):
+        found = failures(name, Path(folder), int(count), int(seed))
+    status = Path("/proc/self/status").read_text()  # not ru_maxrss, which contains the parent of this process
+    print(int(status.split("VmHWM:")[1].split()[0]) // 1024)
+    for line in found:
+        print(line[:300].replace("\n", " "))
+    return int(bool(found))
+
+
+def attack(name: str, folder: Path, count: int, seed: int) -> tuple[int, list[str]]:
+    """Attack one parser in a process of its own; return its largest memory [MB] and the failures."""
+    command = [sys.executable, "-m", __name__, name, str(folder), str(count), str(seed)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False,
+                          env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    first, *found = done.stdout.splitlines() or ["0"]
+    if done.returncode not in (0, 1) or (done.returncode == 1 and not found):
+        found.append(f"{name}: the process ended with {done.returncode}: {done.stderr[-300:]}")
+    return int(first), found
+
+
+def short_run(folder: Path) -> Path:
+    """Render three pairs into the folder."""
+    run = build("two_walls", seed=3, size=128, pairs=3)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    return folder
+
+
+def run(folder: Path, count: int, seed: int, report: Callable[[str], None]) -> int:
+    """Print a row for each format; return the number of formats that did not hold."""
+    short_run(folder / "short")
+    failed = 0
+    report("| mutated files | number | most memory, MB | time, s | result |\n|---|---|---|---|---|")
+    for name in FORMATS:
+        begin_s = time.monotonic()
+        memory_mb, found = attack(name, folder / "short", count, seed)
+        failed += bool(found)
+        result = "; ".join(found) if found else "a result or one line, each"
+        report(f"| {name} | {count} | {memory_mb} | {time.monotonic() - begin_s:.0f} | {result} |")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(limited_main(*sys.argv[1:5]))
