@@ -52,7 +52,7 @@ def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[s
         try:
             attack(operator, rng, count // 2, OLD_S)
             assert not base.line.moved_since(0.0), "the wheels turned by an old command"
-            report(f"| an hour old, nobody drives | {count // 2} | never turned | alive, all counted |")
+            report(f"| an hour old, without an operator | {count // 2} | never turned | alive, all counted |")
             operator.drive()
             wait_until(lambda: base.drives, "motion")
             operator.stop_sending()
@@ -61,7 +61,7 @@ def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[s
             assert fastest <= limits.velocity_mps + 1e-3, f"{fastest} m/s"
             wait_until(lambda: not base.drives, "the stop")
             time.sleep(SETTLE_S)
-            assert not base.drives, "the wheels turn although nobody commands"
+            assert not base.drives, "the wheels turn without a command"
             report(f"| of now, the operator has stopped | {count // 2} | at most {fastest:.2f} m/s, stood afterwards "
                    "| alive, all counted |")
             code, err = daemon.end()
