@@ -24,7 +24,7 @@ HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\
 
 def row(folder: Path, overrides: Sequence[str]) -> str:
     """Return one row of the table: the errors of one log, and the shares of its states."""
-    result = omnid.replay(folder / "log.mcap", _rig(folder), overrides=overrides)
+    result = omnid.replay(folder / "log.mcap", rig_of(folder), overrides=overrides)
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
     cells = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
              f"{1e3 * m.end_error_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
@@ -32,7 +32,7 @@ def row(folder: Path, overrides: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _rig(folder: Path) -> Rig:
+def rig_of(folder: Path) -> Rig:
     """Return the rig of a log; Kalibr's by way of a rig.toml, whose rounding moves the last digits of the errors."""
     camchain = folder / "camchain.yaml"
     if not camchain.exists():

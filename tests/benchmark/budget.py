@@ -1,0 +1,167 @@
+"""Processor time a pair of each step inside each stage: `python -m tests.benchmark.budget FOLDER [--runs N]`.
+
+The folder holds log.mcap and a rig.toml or camchain.yaml. All stages run inline in one thread, whose processor time is
+measured. So that figures of different machines and loads compare, they are also given as ratios to reference kernels
+that are timed in the same run on the same panoramas: one StereoSGBM, and one Lucas-Kanade call.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.logs.mcap_reader import LogReader
+from omnid.config import load_config
+from omnid.engine.graph import Graph
+from omnid.messages import OdometryUpdate
+from omnid.runs.pipeline import Sinks, wire
+from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.synchronise import Synchronise
+from tests.benchmark.accuracy import rig_of
+from tests.benchmark.budget_steps import STEPS, StepClock, measured_steps
+from tests.replay.test_memory import to_and_fro
+
+REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
+SKIPPED: Final = 10  # first pairs, in which caches, buffers and the first map are filled
+SGBM_DISPARITIES, SGBM_BLOCK_PX = 128, 5
+LK_CORNERS, LK_WINDOW_PX, LK_LEVELS = 500, 15, 3
+LK_QUALITY, LK_APART_PX = 0.001, 8
+LUCAS_KANADE: Final = cv2.calcOpticalFlowPyrLK  # not the one that is timed as a step
+Image = NDArray[np.uint8]
+Labels = tuple[str, ...]
+HEAD: Final = ("| step | ms a pair | of SGBM + LK | calls a pair |\n|---|---|---|---|")
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Result of one run. Paths are the labels of a step and of those around it; () is what no stage did."""
+
+    own_ms: dict[Labels, float]  # processor time a pair, without inner steps
+    calls: dict[Labels, float]  # a pair
+    sgbm_ms: float
+    lk_ms: float
+
+    def total_ms(self, path: Labels) -> float:
+        """Return the time a pair of a step with its inner steps."""
+        return sum(own for labels, own in self.own_ms.items() if labels[: len(path)] == path)
+
+
+class ReferenceKernels:
+    """A sink of poses that times one StereoSGBM and one Lucas-Kanade call on the panoramas of some pairs [ns]."""
+
+    def __init__(self, clock: StepClock) -> None:
+        self._clock = clock
+        self.sgbm_ns: list[int] = []
+        self.lk_ns: list[int] = []
+        self._before: Image | None = None
+        self._sgbm = cv2.StereoSGBM.create(
+            minDisparity=0, numDisparities=SGBM_DISPARITIES, blockSize=SGBM_BLOCK_PX, P1=8 * SGBM_BLOCK_PX**2,
+            P2=32 * SGBM_BLOCK_PX**2, mode=cv2.STEREO_SGBM_MODE_SGBM)
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Time the kernels at every REFERENCE_EVERY-th pair; after the first pairs, forget the steps so far."""
+        if odometry.seq == SKIPPED - 1:
+            self._clock.clear()
+        pair = odometry.depth.panoramas
+        lower, before = np.ascontiguousarray(pair.lower.panorama), self._before
+        self._before = lower
+        if odometry.seq % REFERENCE_EVERY or before is None:
+            return
+        turned = [np.ascontiguousarray(image.T[:, ::-1]) for image in (lower, pair.upper.panorama)]
+        start_ns = time.thread_time_ns()
+        self._sgbm.compute(*turned)
+        middle_ns = time.thread_time_ns()
+        self.sgbm_ns.append(middle_ns - start_ns)
+        corners = cv2.goodFeaturesToTrack(before, LK_CORNERS, LK_QUALITY, LK_APART_PX)
+        start_ns = time.thread_time_ns()
+        LUCAS_KANADE(before, lower, corners, None, winSize=(LK_WINDOW_PX, LK_WINDOW_PX), maxLevel=LK_LEVELS)
+        self.lk_ns.append(time.thread_time_ns() - start_ns)
+
+
+def measure(folder: Path, pairs: int, overrides: Sequence[str]) -> Budget:
+    """Run the stages inline over so many pairs, to and fro through the log, and return the times."""
+    config = load_config(None, overrides)
+    frames = list(LogReader(folder / "log.mcap").frames())
+    place = geometry(with_rims(rig_of(folder), frames), config.panorama)
+    cv2.setNumThreads(config.graph.opencv_threads)
+    clock = StepClock()
+    reference = ReferenceKernels(clock)
+    with TemporaryDirectory() as work, measured_steps(clock):
+        graph = Graph(threaded=False)
+        sinks = Sinks({"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference},
+                      {"map": MapFile(Path(work) / "m")})
+        read = graph.source("read", lambda: to_and_fro(frames, pairs))
+        wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
+        graph.run()
+    count = pairs - SKIPPED
+    return Budget({path: ns * 1e-6 / count for path, ns in clock.own_ns.items()},
+                  {path: calls / count for path, calls in clock.calls.items()},
+                  1e-6 * median(reference.sgbm_ns), 1e-6 * median(reference.lk_ns))
+
+
+def table(budgets: Sequence[Budget]) -> str:
+    """Return the table of the medians over the runs: stages and their steps, in the order of the flow."""
+    sgbm_ms, lk_ms = (median(getattr(budget, name) for budget in budgets) for name in ("sgbm_ms", "lk_ms"))
+    order = {step.label: number for number, step in enumerate(STEPS)}
+    paths = sorted({path for budget in budgets for path in budget.own_ms if path}, key=lambda p: [order[x] for x in p])
+    lines = [HEAD, *(_row(budgets, path) for path in paths)]
+    stages = [sum(budget.total_ms(path) for path in paths if len(path) == 1) for budget in budgets]
+    ratios = [ms / (budget.sgbm_ms + budget.lk_ms) for ms, budget in zip(stages, budgets, strict=True)]
+    lines.append(f"| **all stages** | {median(stages):.2f} | {median(ratios):.3f} | |")
+    lines.append(f"| reference: StereoSGBM | {sgbm_ms:.2f} | | |")
+    lines.append(f"| reference: LK of {LK_CORNERS} corners | {lk_ms:.2f} | | |")
+    return "\n".join(lines)
+
+
+def _row(budgets: Sequence[Budget], path: Labels) -> str:
+    """Return the row of a step: total of a stage in bold, own time of the steps inside."""
+    inner = len(path) > 1
+    spent = [budget.own_ms.get(path, 0.0) if inner else budget.total_ms(path) for budget in budgets]
+    ratio = median(ms / (budget.sgbm_ms + budget.lk_ms) for ms, budget in zip(spent, budgets, strict=True))
+    calls = median(budget.calls.get(path, 0.0) for budget in budgets)
+    label = "&nbsp;" * 3 * (len(path) - 1) + path[-1] if inner else f"**{path[0]}**"
+    return f"| {label} | {median(spent):.2f} | {ratio:.3f} | {calls:.2f} |"
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Run processes that only compute."""
+    with ExitStack() as ends:
+        for _ in range(count):
+            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            ends.callback(process.kill)
+        yield
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--pairs", type=int, default=200, help="pairs of a run (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=5, help="runs, of which the medians are printed (default: 5)")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="computing processes per core beside it")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
+    args = parser.parse_args()
+    if args.pairs < SKIPPED + 2 * REFERENCE_EVERY or args.runs < 1:
+        parser.error(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}, --runs at least 1")
+    with busy_processes(args.busy * (os.cpu_count() or 1)):
+        print(table([measure(args.folder, args.pairs, args.overrides) for _ in range(args.runs)]))
+
+
+if __name__ == "__main__":
+    main()
