@@ -1,7 +1,8 @@
 """`omnid run` on a log whose cameras are made faulty by lines on the standard input.
 
     upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
-    lower cut       halves of JPEGs           both ok         no fault
+    lower cut       halves of JPEGs           both frozen     the same image again and again
+    both ok         no fault
     clock 3600      the system clock is that many seconds ahead
 """
 
@@ -36,6 +37,7 @@ class FaultyCamera(LogCamera):
         self._camera, self._faults = camera, faults
         first = gray((images.lower if camera == "lower" else images.upper)[0][1])
         self._black = cv2.imencode(".jpg", np.zeros_like(first))[1].tobytes()
+        self._last = b""  # image without a fault
         self._rng = random.Random(1)
 
     def frames(self) -> Iterator[Frame]:
@@ -53,6 +55,9 @@ class FaultyCamera(LogCamera):
                 return data[: len(data) // 2]
             case "black":
                 return self._black
+            case "frozen":
+                return self._last
+        self._last = data
         return data
 
 
