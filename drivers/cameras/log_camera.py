@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -67,29 +68,49 @@ def _limited(frames: Iterator[Frame], path: Path) -> Iterator[Frame]:
         yield frame
 
 
+class LogClock:
+    """The time at which a log starts, the same for both cameras: when the first of them begins to deliver.
+
+    A run that loads for some time before it takes images loses none of them.
+    """
+
+    def __init__(self, epoch_ns: int | None = None) -> None:
+        """epoch_ns: a fixed start of the log [ns of CLOCK_MONOTONIC]."""
+        self._epoch_ns = epoch_ns
+        self._lock = threading.Lock()
+
+    def epoch_ns(self) -> int:
+        """Return the start of the log [ns of CLOCK_MONOTONIC]; the first call, from any thread, starts it."""
+        with self._lock:
+            if self._epoch_ns is None:
+                self._epoch_ns = time.monotonic_ns()
+            return self._epoch_ns
+
+
 class LogCamera:
     """One camera of a log, played forwards and backwards until it is closed.
 
-    epoch_ns: start of the log [ns of CLOCK_MONOTONIC], the same for both cameras. pace: speed relative to the
-    recording. once: play the log once, forwards. The stamp of a frame is the time at which it is due; frames that are
-    due before the construction are not delivered. Raises DriverError for a pace out of range.
+    clock: start of the log, shared by both cameras. pace: speed relative to the recording. once: play the log once,
+    forwards. The stamp of a frame is the time at which it is due; frames that are due before the construction are not
+    delivered. Raises DriverError for a pace out of range.
     """
 
-    def __init__(self, images: LogImages, camera: Camera, epoch_ns: int, *, pace: float = 1.0, once: bool = False
+    def __init__(self, images: LogImages, camera: Camera, clock: LogClock, *, pace: float = 1.0, once: bool = False
                  ) -> None:
         if not MIN_PACE <= pace <= MAX_PACE:
             raise DriverError(f"the pace of a log is {pace:g}; give a number from {MIN_PACE:g} to {MAX_PACE:g}; above "
                               "1 is faster than it was recorded")
         self._images, self._frames = images, images.lower if camera == "lower" else images.upper
-        self._epoch_ns, self._pace, self._once = epoch_ns, pace, once
+        self._clock, self._pace, self._once = clock, pace, once
         self._created_ns = time.monotonic_ns()
         self._closed = False
         self.state = CameraState(mode="a recorded log")
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames when they are due, until closed; those that are not read in time are dropped and counted."""
+        epoch_ns = self._clock.epoch_ns()
         for seq, (due_ns, frame) in enumerate(self._schedule()):
-            stamp_ns = self._epoch_ns + round(due_ns / self._pace)
+            stamp_ns = epoch_ns + round(due_ns / self._pace)
             self._sleep_until(stamp_ns)
             if self._closed:
                 break

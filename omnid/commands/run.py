@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
-import time
+from collections import Counter, defaultdict
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,8 @@ from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
+    from drivers.cameras.log_camera import LogCamera
+    from drivers.frame import Camera
     from omnid.config import Config
     from omnid.runs.live import OpenCamera
 
@@ -67,11 +69,17 @@ def _devices(config: Config) -> OpenCamera:
 
 
 def _recorded(args: argparse.Namespace) -> OpenCamera:
-    from drivers.cameras.log_camera import LogCamera, LogImages
+    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
 
     images = LogImages.load(args.log)
-    epoch_ns = time.monotonic_ns()
-    return lambda camera: LogCamera(images, camera, epoch_ns, pace=args.pace, once=args.once)
+    clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened
+    opened: Counter[Camera] = Counter()
+
+    def open_camera(camera: Camera) -> LogCamera:
+        opened[camera] += 1
+        return LogCamera(images, camera, clocks[opened[camera]], pace=args.pace, once=args.once)
+
+    return open_camera
 
 
 def _rig_of(log: Path) -> Rig:

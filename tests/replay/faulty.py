@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from calib.rig_file import read_rig
-from drivers.cameras.log_camera import LogCamera, LogImages
+from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
 from omnid.runs.live import LiveRun
@@ -32,8 +32,8 @@ TIME, TIME_NS = time.time, time.time_ns
 class FaultyCamera(LogCamera):
     """A camera of a log with a fault in its images."""
 
-    def __init__(self, images: LogImages, camera: Camera, epoch_ns: int, faults: dict[str, str]) -> None:
-        super().__init__(images, camera, epoch_ns)
+    def __init__(self, images: LogImages, camera: Camera, clock: LogClock, faults: dict[str, str]) -> None:
+        super().__init__(images, camera, clock)
         self._camera, self._faults = camera, faults
         first = gray((images.lower if camera == "lower" else images.upper)[0][1])
         self._black = cv2.imencode(".jpg", np.zeros_like(first))[1].tobytes()
@@ -87,9 +87,9 @@ def main() -> int:
     args = parser.parse_args()
     faults: dict[str, str] = {}
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
-    images, epoch_ns = LogImages.load(args.log), time.monotonic_ns()
+    images, clock = LogImages.load(args.log), LogClock(time.monotonic_ns())
     config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
-    live = LiveRun(config, lambda camera: FaultyCamera(images, camera, epoch_ns, faults),
+    live = LiveRun(config, lambda camera: FaultyCamera(images, camera, clock, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()
 

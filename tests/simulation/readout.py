@@ -1,7 +1,8 @@
 """Times of exposure of a pair's two images: speed of the run, skew between the cameras, rolling shutters.
 
 The upper exposure begins at lower exposure + skew + stamp offset; its stamp is lower stamp + skew, so the offset is an
-error that no stamp shows. A camera's stamp is the exposure of its first image row; row r is exposed r * line time later.
+error that no stamp shows. A camera's stamp is the exposure of its first image row; row r is exposed r * line time
+later.
 """
 
 from __future__ import annotations

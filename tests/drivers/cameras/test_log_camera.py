@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.mcap_reader import LogReader
@@ -27,12 +27,12 @@ def recorded(scene: Path) -> LogImages:
 
 def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
     """Return the due times of a camera at pace 1 [ns], without waiting."""
-    return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, 0)._schedule(), count)]
+    return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, LogClock(0))._schedule(), count)]
 
 
 def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> None:
     epoch_ns = time.monotonic_ns()
-    seen: list[Frame] = list(LogCamera(recorded, "upper", epoch_ns, pace=FAST, once=True).frames())
+    seen: list[Frame] = list(LogCamera(recorded, "upper", LogClock(epoch_ns), pace=FAST, once=True).frames())
     reader = LogReader(scene / "log.mcap")
     expected = [frame for frame in reader.frames() if frame.camera == "upper"]
     reader.close()
@@ -48,7 +48,7 @@ def reader_first(scene: Path) -> int:
 
 
 def test_no_frame_comes_before_its_stamp(recorded: LogImages) -> None:
-    camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
+    camera = LogCamera(recorded, "lower", LogClock(), pace=FAST)
     for frame in islice(camera.frames(), 2 * PAIRS + 5):
         assert frame.stamp_ns <= time.monotonic_ns() and frame.camera == "lower"
     assert camera.state.status == "streaming" and camera.state.frames + camera.state.drops >= 2 * PAIRS + 5
@@ -73,7 +73,7 @@ def test_cameras_stay_synchronised_where_one_has_lost_images(tmp_path: Path, sce
 
 
 def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
-    camera = LogCamera(recorded, "lower", time.monotonic_ns(), pace=FAST)
+    camera = LogCamera(recorded, "lower", LogClock(), pace=FAST)
     frames = camera.frames()
     first = next(frames)
     time.sleep(0.4)
@@ -83,13 +83,13 @@ def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) 
 
 
 def test_frames_due_before_construction_are_not_drops(recorded: LogImages) -> None:
-    camera = LogCamera(recorded, "lower", time.monotonic_ns() - 10**9, pace=FAST)
+    camera = LogCamera(recorded, "lower", LogClock(time.monotonic_ns() - 10**9), pace=FAST)
     first = next(camera.frames())
     assert first.seq > 10 and camera.state.drops == 0
 
 
 def test_close_ends_a_wait(recorded: LogImages) -> None:
-    camera = LogCamera(recorded, "lower", time.monotonic_ns() + 10**12)
+    camera = LogCamera(recorded, "lower", LogClock(time.monotonic_ns() + 10**12))
     seen: list[Frame] = []
     thread = threading.Thread(target=lambda: seen.extend(camera.frames()))
     thread.start()
@@ -102,7 +102,7 @@ def test_close_ends_a_wait(recorded: LogImages) -> None:
 @pytest.mark.parametrize("pace", [0.0, -1.0, float("nan"), float("inf"), 1e-300])
 def test_refuses_an_invalid_pace(recorded: LogImages, pace: float) -> None:
     with pytest.raises(DriverError, match="pace"):
-        LogCamera(recorded, "lower", 0, pace=pace)
+        LogCamera(recorded, "lower", LogClock(), pace=pace)
 
 
 def test_refuses_logs_without_images(tmp_path: Path, scene: Path) -> None:
@@ -112,3 +112,13 @@ def test_refuses_logs_without_images(tmp_path: Path, scene: Path) -> None:
         LogImages.load(save(tmp_path / "few.mcap", few))
     with pytest.raises(DriverError):
         LogImages.load(tmp_path / "none.mcap")
+
+
+def test_a_log_starts_when_the_first_camera_is_read(recorded: LogImages) -> None:
+    """A run may load for longer than the log lasts before it takes the first image."""
+    clock = LogClock()
+    cameras = [LogCamera(recorded, name, clock, pace=1000, once=True) for name in ("lower", "upper")]
+    time.sleep(1.1 * recorded.last_ns * 1e-9 / 1000 + 0.15)
+    streams = [camera.frames() for camera in cameras]
+    assert [next(stream).seq for stream in streams] == [0, 0]
+    assert clock.epoch_ns() == clock.epoch_ns()
