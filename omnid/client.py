@@ -165,6 +165,15 @@ class Robot:
         answer = _queried(self._session, f"{self.name}/{name}")
         return "" if answer is None else answer.payload.to_bytes().decode("utf-8", "replace")
 
+    def on_alive(self, callback: Callable[[bool], None]) -> None:
+        """Call callback(True) when the robot's daemon is there, callback(False) when it is gone, in a zenoh thread."""
+
+        def on_token(sample: zenoh.Sample) -> None:
+            callback(sample.kind == zenoh.SampleKind.PUT)
+
+        tokens = self._session.liveliness()
+        self._declared.append(tokens.declare_subscriber(f"{self.name}/alive", on_token, history=True))
+
     @property
     def alive(self) -> bool:
         """True if the robot's daemon runs and can be reached."""

@@ -55,6 +55,7 @@ def _connected(bus: BusConfig, end_s: float, screen: Screen) -> Robot | None:
 def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[Writer], end_s: float) -> None:
     inbox = Inbox()
     robot.on_message(inbox.put)
+    robot.on_alive(state.set_alive)
     with robot.subscribe(Diagnostics) as subscription:
         latched = subscription.newest()  # published before this connection was made
     if latched is not None:

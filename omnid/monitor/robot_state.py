@@ -59,6 +59,7 @@ class RobotState:
     def __init__(self) -> None:
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
+        self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.poses = self.missed = self.broken = 0
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
@@ -74,6 +75,10 @@ class RobotState:
         except OmnidError:
             self.broken += 1
         return None
+
+    def set_alive(self, alive: bool) -> None:
+        """Keep whether the daemon's liveliness token is there; from any thread."""
+        self.alive = alive
 
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:
         """Keep the newest status of each part of the robot."""
@@ -107,9 +112,10 @@ class RobotState:
 
     @property
     def state(self) -> str:
-        """Tracking state of the newest pose, or the time since it."""
+        """Tracking state of the newest pose, or the time since it and whether the daemon is still there."""
         if self.pose is None or self.time_since_pose_s > NO_POSE_S:
-            return f"no pose for {self.time_since_pose_s:.0f} s"
+            gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
+            return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
         return plain(self.pose.state)
 
 

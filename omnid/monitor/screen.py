@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import IO, Final
 
 import numpy as np
 
 from omnid.monitor.robot_state import RobotState, plain
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Pose
-from omnid.transport.status_names import short_name
+from omnid.transport.status_names import STAGE_PREFIX, short_name
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")
 _CLEAR: Final = "\x1b[H\x1b[J"
@@ -33,7 +35,9 @@ class Screen:
     def show(self, state: RobotState, dropped: int = 0) -> None:
         """Write the state; dropped: messages that the inbox could not hold."""
         if self._out.isatty():
-            self._out.write(_CLEAR + "\n".join(status_table(self._robot, state, dropped)) + "\n")
+            size = shutil.get_terminal_size()
+            lines = fitted(status_table(self._robot, state, dropped), size.columns, size.lines)
+            self._out.write(_CLEAR + "\n".join(lines) + "\n")
         else:
             self._out.write(summary_line(self._robot, state) + "\n")
         self._out.flush()
@@ -48,17 +52,34 @@ def summary_line(robot: str, state: RobotState) -> str:
 
 
 def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
-    """Yield the same line, the uncertainty of the pose, and a line for each part of the robot."""
-    yield summary_line(robot, state)
+    """Yield the state, the pose with its uncertainty, latencies, and a line for each part of the robot.
+
+    Parts with a warning or an error come first, stages last: a small terminal shows what matters.
+    """
+    yield f"{robot}: {state.state}  {state.rate_hz:.1f} poses/s" if state.pose is not None else f"{robot}: no pose yet"
     if state.pose is not None:
         sigma = np.sqrt(np.maximum(0.0, state.pose.covariance.diagonal()))
         details = state.pose.attachment
+        yield f"  {_position(state.pose)}"
         yield (f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
-               f"inliers {details.inliers} of {details.tracked} landmarks; resets {details.resets}; "
-               f"unreadable {state.broken}, dropped {dropped}")
-    for status in state.statuses.values():
+               f"inliers {details.inliers} of {details.tracked}; resets {details.resets}")
+        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  dropped {dropped}"
+    for status in sorted(state.statuses.values(), key=_importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")
+
+
+def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:
+    """Return the lines cut to a terminal of so many columns and rows; its last row is for the cursor."""
+    cut = [line if len(line) <= columns else f"{line[: max(0, columns - 1)]}\N{HORIZONTAL ELLIPSIS}" for line in lines]
+    if len(cut) < rows:
+        return cut
+    shown = max(1, rows - 2)
+    return [*cut[:shown], f"  ... {len(cut) - shown} more; make the window higher"[:columns]]
+
+
+def _importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
+    return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name
 
 
 def _position(pose: Pose) -> str:

@@ -17,6 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib import se3
+from omnid.client import Robot
 from omnid.formats.tum import read_tum
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen, status_table, summary_line
@@ -25,7 +26,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.status_names import BUS, WHEELS
-from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, wait_until
 from tests.replay.command import Command, rows
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -152,9 +153,36 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
     Screen("omnid", terminal).show(state)
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
-    assert len(shown.splitlines()) == 4 and "1 sigma 1.0 mm" in shown
+    assert len(shown.splitlines()) == 6 and "1 sigma 1.0 mm" in shown
+    assert shown.index("wheels") < shown.index("bus"), "the error comes first"
     assert summary_line("omnid", RobotState()) == "omnid: no pose yet"
     assert list(status_table("omnid", RobotState(), 0)) == ["omnid: no pose yet"]
+
+
+@pytest.mark.parametrize(("columns", "lines"), [(80, 24), (60, 20), (20, 3), (1, 1)])
+def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, lines: int) -> None:
+    state = received(1, 2)
+    many = [DiagnosticStatus(f"omnid: part {n}", n % 3, "a message " * 10, {"key": "value" * 30}) for n in range(40)]
+    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, many), b""))
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("LINES", str(lines))
+    terminal = Terminal()
+    Screen("omnid", terminal).show(state)
+    shown = terminal.getvalue().removeprefix("\x1b[H\x1b[J").splitlines()
+    assert len(shown) <= max(2, lines - 1) and max(map(len, shown)) <= columns
+    assert "omnid: tracking".startswith(shown[0][: columns - 1][:15])
+    assert lines < 20 or "more; make the window higher" in shown[-1]
+
+
+def test_tells_that_the_daemon_has_ended() -> None:
+    endpoint, state = free_endpoint(), received(1)
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
+        robot.on_alive(state.set_alive)
+        wait_until(lambda: state.alive is True)
+        bus.close()
+        wait_until(lambda: state.alive is False)
+    state._arrivals_s[-1] -= 10
+    assert "its daemon has ended" in state.state and state.state in summary_line("omnid", state)
 
 
 def test_the_inbox_drops_the_oldest_when_full() -> None:
