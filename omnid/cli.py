@@ -13,8 +13,8 @@ from typing import NoReturn
 
 from omnid.version import __version__
 
-COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "listen", "view", "record", "report", "log",
-            "diff", "doctor", "config")
+COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "listen", "view", "record",
+            "report", "log", "diff", "doctor", "config")
 MODULES = {"eval": "evaluate"}  # eval is a name of Python itself
 WRONG_INPUT = 2
 

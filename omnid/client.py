@@ -37,6 +37,7 @@ from omnid.transport.decode import (
 )
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.session import Unreachable, open_session
+from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
 __all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Map", "Pose", "PoseAttachment", "Robot", "Subscription",
            "Unreachable", "subscribe"]
@@ -52,6 +53,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 _QUERY_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.002
 _MAX_RETRY_S: Final = 0.5
+_SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 
 
 class Subscription(Generic[T]):
@@ -156,9 +158,12 @@ class Robot:
 
         self._declared.append(self._session.declare_subscriber(f"{self.name}/*", on_sample))
 
-    def driver(self) -> Driver:
-        """Return a sender of commands to the wheels."""
-        return Driver(self._session, self.name)
+    def driver(self, source: str = "") -> Driver:
+        """Return a sender of commands to the wheels.
+
+        source: one of controller.sources.names, such as "planner"; empty for that of the highest priority.
+        """
+        return Driver(self._session, self.name, source)
 
     def query(self, name: str) -> str:
         """Return the robot's `config` or `rig`, both TOML; "" where it does not answer."""
@@ -214,6 +219,9 @@ def _connected(config: BusConfig, timeout_s: float) -> zenoh.Session:
 class Driver:
     """Sender of commands. Each is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
 
+    The wheels turn only while the robot is armed: it is disarmed at its start, by each stop and by each fault. Two
+    senders of one source do not drive at once: the first keeps it until it has been silent for a while.
+
     Drive from one waypoint to the next:
 
         import math
@@ -221,6 +229,7 @@ class Driver:
 
         with Robot("omnid") as robot:
             driver, poses = robot.driver(), robot.subscribe(Pose)
+            driver.arm()
             for x_m, y_m in [(1.0, 0.0), (1.0, 1.0)]:
                 for pose in poses:
                     dx_m, dy_m = x_m - pose.x_m, y_m - pose.y_m
@@ -230,28 +239,44 @@ class Driver:
             driver.twist(0.0, 0.0)
     """
 
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
-        self._publishers = {name: _command_publisher(session, f"{robot}/cmd/{name}")
-                            for name in ("twist", "heading", "stop")}
+    def __init__(self, session: zenoh.Session, robot: str, source: str = "") -> None:
+        prefix = f"cmd/{source}" if source else "cmd"
+        topics = {TWIST: f"{prefix}/{TWIST}", HEADING: f"{prefix}/{HEADING}", STOP: STOP, ARM: ARM}
+        self._publishers = {name: _command_publisher(session, f"{robot}/{topic}") for name, topic in topics.items()}
+        self._sent = 0
 
     @property
     def connected(self) -> bool:
         """True if a robot subscribes to the commands."""
-        status: Any = self._publishers["twist"].matching_status  # zenoh's stub takes it for a bool
+        status: Any = self._publishers[TWIST].matching_status  # zenoh's stub takes it for a bool
         return bool(status.matching)
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Drive with this forward speed and yaw rate (counter-clockwise)."""
         payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
-        self._publishers["twist"].put(payload)
+        self._put(TWIST, payload)
 
     def heading(self, velocity_mps: float, heading_rad: float) -> None:
         """Drive with this speed and hold a heading in odom (counter-clockwise)."""
-        self._publishers["heading"].put(codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
+        self._put(HEADING, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
 
     def stop(self) -> None:
-        """Stop the wheels, whatever else was commanded."""
-        self._publishers["stop"].put(b"")
+        """Stop the wheels, whatever else was commanded, until `arm` is called."""
+        self._put(STOP, b"")
+
+    def arm(self) -> int:
+        """Ask the robot to arm; it refuses while a fault holds. Return the stamp, which its status repeats, ns.
+
+        Only commands that arrive after it move the wheels. See omnid.monitor.arming for a request with an answer.
+        """
+        stamp_ns = time.time_ns()
+        self._put(ARM, codec.header_cdr(stamp_ns))
+        return stamp_ns
+
+    def _put(self, name: str, payload: bytes) -> None:
+        """Send with the identity of this program, by which the robot tells two senders apart."""
+        publisher, self._sent = self._publishers[name], (self._sent + 1) % _SEQUENCE
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent))
 
 
 def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:

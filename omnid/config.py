@@ -225,7 +225,9 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
 USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
     "bus.panorama_hz": "run",
     "cameras": "run",
+    "controller.arming": "run",
     "controller.setpoint": "replay",
+    "controller.sources": "run",
     "graph.depth": "replay",
     "live": "run",
     "log": "replay",

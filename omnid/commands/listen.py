@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:
+    from omnid.config import Config
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `listen` to the command line."""
     parser = subparsers.add_parser("listen", help="show pose, state, rates and latencies of a robot, and record them")
-    parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
-                        "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+    add_robot(parser)
     parser.add_argument("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format")
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="record all received messages to a log")
     parser.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
@@ -21,16 +23,29 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Show the robot until the end; return 1 if no pose was received."""
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Add the options --robot and --connect."""
+    parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
+                        "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+
+
+def config_of(args: argparse.Namespace) -> Config:
+    """Return the configuration with the robot's name and endpoints of --robot and --connect."""
     from dataclasses import replace
 
     from omnid.config import load_config
+
+    config = load_config(args.config, args.overrides)
+    robot, connect = args.robot or config.bus.robot, tuple(args.connect or config.bus.connect)
+    return replace(config, bus=replace(config.bus, robot=robot, connect=connect))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the robot until the end; return 1 if no pose was received."""
     from omnid.errors import OmnidError
     from omnid.monitor.follow import listen
 
     if args.seconds is not None and not 0 < args.seconds < 1e9:
         raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
-    bus = load_config(args.config, args.overrides).bus
-    bus = replace(bus, robot=args.robot or bus.robot, connect=tuple(args.connect or bus.connect))
-    return listen(bus, args.tum, args.mcap, args.seconds)
+    return listen(config_of(args).bus, args.tum, args.mcap, args.seconds)

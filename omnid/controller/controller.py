@@ -10,7 +10,9 @@ from drivers.errors import DriverError
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
-from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
 from omnid.engine.flow import nothing
@@ -48,15 +50,22 @@ class Controller:
 
     def set_pose(self, pose: ControllerPose) -> None:
         """Replace the pose."""
-        self._law.pose = pose
+        self._law.set_pose(pose)
 
     def set_command(self, command: TimedSetpoint) -> None:
-        """Replace the setpoint."""
-        self._law.command = command
+        """Offer a setpoint; the newest of the source of the highest priority counts."""
+        conflict = self._law.commands.conflict
+        self._law.set_command(command)
+        if self._law.commands.conflict != conflict:
+            self._report(self._law.commands.conflict)
 
     def stop(self, asked_ns: int) -> None:
-        """Stop the wheels at the next tick; all setpoints that arrived until then are void."""
+        """Stop the wheels at the next tick, until a request to arm that arrives later."""
         self._law.stop(asked_ns)
+
+    def arm(self, request: ArmRequest) -> None:
+        """Ask to arm: the wheels may turn from the next tick on, by setpoints that arrive later."""
+        self._law.arm(request)
 
     def end(self) -> None:
         """Stop the wheels for good."""
@@ -68,11 +77,12 @@ class Controller:
         dt_s, late_s = self._keep_rhythm(now_ns)
         output = self._law.step(now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed,
                                 motor_stopped=self._motor_stopped)
+        self._report_arming()
         self._count_stop(output.reason)
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
         if status is not None:
-            self._take_status(status, now_ns)
+            self._take_status(status)
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
         return TickReport(None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s,
@@ -92,13 +102,25 @@ class Controller:
         self.state.missed += missed
         return dt_ns * S_PER_NS, (now_ns - due_ns) * S_PER_NS
 
+    def _report_arming(self) -> None:
+        """Keep the state of the arming and of the sources; report each arming, and refusals when the reason changes."""
+        state, arming, commands = self.state, self._law.arming, self._law.commands
+        before, answer = state.arm_answer, arming.answer
+        if answer != before and (not answer.refusal or answer.refusal != before.refusal):
+            self._report(f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm")
+        state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, answer
+        state.needs_request = arming.needs_request
+        state.refused = commands.refused
+        state.source = "" if self._law.reason or commands.current is None else commands.current.source
+
     def _count_stop(self, reason: str) -> None:
         """Keep the reason; count it where it ends a drive, and report it unless the end was asked for."""
         before, self.state.reason = self.state.reason, reason
         if reason and not before:
             self.state.stops[reason] += 1
             if reason != ENDS:
-                self._report(f"the wheels stop: {reason}")
+                latched = "; they stay stopped until cmd/arm (`omnid arm`)" if self._law.arming.needs_request else ""
+                self._report(f"the wheels stop: {reason}{latched}")
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""
@@ -120,13 +142,13 @@ class Controller:
         self.state.sent += 1
         return status
 
-    def _take_status(self, status: MotorStatus, now_ns: int) -> None:
+    def _take_status(self, status: MotorStatus) -> None:
         self._motor_stopped = status.watchdog_expired
         self.state.expiries += status.watchdog_expired
         self.state.fault = status.fault
         if status.watchdog_expired:  # it stands: the command was not obeyed
             self._law.motion = STOP
-        self._law.motor_heading(status.heading_rad, now_ns)
+        self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
 
     def _to_wheel_s(self, done_ns: int) -> float:
         """Return the age of the pose's images where this command is the first that follows from them, else NaN."""

@@ -15,8 +15,9 @@ from drivers.motor import VelocityCommand
 from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.statistics import ControllerStatistics, TickReport
-from omnid.core.control.control_law import S_PER_NS, ControllerPose, TimedSetpoint
-from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 
@@ -54,14 +55,21 @@ class ControllerLink:
         """Send a pose, from any thread; the newest counts."""
         self._send(pose)
 
-    def send_setpoint(self, setpoint: Setpoint, arrival_ns: int) -> None:
-        """Send a setpoint that arrived then (CLOCK_MONOTONIC), from any thread; the newest counts."""
-        self._send(TimedSetpoint(arrival_ns, setpoint))
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        """Send a setpoint, its arrival by CLOCK_MONOTONIC, from any thread; the newest counts."""
+        self._send(command)
 
     def stop(self) -> None:
-        """Stop the wheels, whatever was commanded until now; from any thread."""
+        """Stop the wheels until `arm` is called later; from any thread."""
         self._stop_ns = time.monotonic_ns()
         self._send(None)
+
+    def arm(self, request: ArmRequest) -> None:
+        """Ask to arm, with the arrival of the request by CLOCK_MONOTONIC, from any thread.
+
+        A request that is lost is not repeated: the sender sees that the robot is not armed.
+        """
+        self._send(request)
 
     def end(self) -> None:
         """Have the wheels slow down to a stop and the process end; from any thread."""
@@ -96,7 +104,7 @@ class ControllerLink:
             self._process.wait()
         self._channel.close()
 
-    def _send(self, update: ControllerPose | TimedSetpoint | None) -> None:
+    def _send(self, update: ControllerPose | TimedSetpoint | ArmRequest | None) -> None:
         self._channel.send(ControllerUpdate(self._stop_ns, update))
 
     def _receive(self, timeout_s: float) -> object:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from omnid.controller.motor_settings import MotorSettings
-from omnid.core.control.control_law import ControllerPose, ControllerSettings, TimedSetpoint
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings
 
 LONGEST_RAMP_S: Final = 3.0  # at the end: wheels that have not come to a stop within it are stopped at once
@@ -20,13 +22,13 @@ class ControllerStart(NamedTuple):
 
 
 class ControllerUpdate(NamedTuple):
-    """One message of the daemon: a pose or a setpoint, if there is a new one, and always the last stop request.
+    """One message of the daemon: a pose, a setpoint or a request to arm, if any, and always the last stop request.
 
     So a stop arrives with the next message that does, even if its own was lost.
     """
 
     stop_ns: int  # 0: none
-    update: ControllerPose | TimedSetpoint | None
+    update: ControllerPose | TimedSetpoint | ArmRequest | None
 
 
 class StartFailed(NamedTuple):

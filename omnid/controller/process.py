@@ -18,7 +18,9 @@ from omnid.controller.controller import Controller
 from omnid.controller.ipc import NO_MESSAGE, Channel
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
-from omnid.core.control.control_law import S_PER_NS, ControllerPose, TimedSetpoint
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
 from omnid.engine.signals import STOP_SIGNALS
 
@@ -77,6 +79,8 @@ class ControllerLoop:
             self._controller.set_pose(message.update)
         elif isinstance(message.update, TimedSetpoint):
             self._controller.set_command(message.update)
+        elif isinstance(message.update, ArmRequest):
+            self._controller.arm(message.update)
 
 
 def run_controller(channel: Channel) -> int:

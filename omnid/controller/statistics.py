@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from drivers.motor import VelocityCommand
+from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.safety_rules import IDLE
 from omnid.engine.telemetry import Histogram, StageStats
 
@@ -18,6 +19,11 @@ class ControllerState:
     """The state of the controller and its counts since the start."""
 
     reason: str = IDLE  # why the wheels must stop now; empty: they may turn
+    armed: bool = False
+    disarmed_by: str = STARTED  # empty while armed
+    needs_request: bool = False  # only cmd/arm lets the wheels turn again
+    arm_answer: ArmAnswer = NO_ANSWER
+    source: str = ""  # of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command
     fault: int = 0  # the motor controller's own number
     sent: int = 0  # commands that were answered
@@ -26,6 +32,7 @@ class ControllerState:
     expiries: int = 0  # how often the motor controller had stopped the wheels by itself
     missed: int = 0  # ticks that were left out
     lost_reports: int = 0  # reports of ticks that the daemon was too slow to take
+    refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
     stops: Counter[str] = field(default_factory=Counter)  # of wheels that turned, by reason
 
 

@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
-from omnid.controller.statistics import ControllerStatistics
-from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE
+from omnid.controller.statistics import ControllerState, ControllerStatistics
+from omnid.core.control.arming import STARTED
+from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.stages.synchronise import Synchronise
@@ -23,6 +24,7 @@ from omnid.transport.status_names import Key, time_key
 MAX_SKEW_DRIFT_NS: Final = 3_000_000  # of the skew between the cameras: their clocks do not run alike
 TIMEOUT_S: Final = 1.0  # without an image of a camera, or without a pose
 EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons to stand that are no fault
+REMEDY: Final = "send cmd/arm: `omnid arm`"
 LEVELS: Final = {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}
 _CAMERA_COUNTERS: Final = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
 _WHEEL_COUNTERS: Final = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports")
@@ -140,18 +142,23 @@ class StatusCollector:
         values |= _times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel)
         values |= _times(status_names.TICK_LATE, controller.lateness)
         values[time_key(status_names.TICK_LATE, "p999")] = f"{1e3 * controller.lateness.p(0.999):.2f}"
+        values |= _arming(state)
         if commands is not None:
-            refused = dict(commands.refused)  # a copy, for another thread adds to it
+            refused = dict(commands.refused) | dict(state.refused)  # a copy, for another thread adds to it
             values |= {Key.COMMANDS: str(commands.accepted), Key.STOPS: str(commands.stops)}
             values |= {f"{status_names.REFUSED_PREFIX}{reason}": str(count) for reason, count in refused.items()}
-        return DiagnosticStatus(status_names.WHEELS, self._wheels_level(controller), state.reason or "driving", values)
+        message = state.reason or "driving"
+        if state.reason == NOT_ARMED:
+            message = state.disarmed_by if state.disarmed_by == STARTED else f"not armed: {state.disarmed_by}"
+        return DiagnosticStatus(status_names.WHEELS, self._wheels_level(controller), message, values)
 
     @staticmethod
     def _wheels_level(controller: ControllerStatistics) -> int:
         state = controller.state
         if state.reason == FAILED or state.failed or state.fault:
             return ERROR
-        return OK if state.reason in EXPECTED_STOPS else WARN
+        reason = state.disarmed_by if state.reason == NOT_ARMED else state.reason
+        return OK if reason in (*EXPECTED_STOPS, STARTED) else WARN
 
     def _stage(self, stage: StageStats) -> DiagnosticStatus:
         lost = Key.MISSED if stage.name in self._sources.tickers else Key.DROPPED
@@ -177,6 +184,13 @@ def summary_status(counters: RunCounters) -> DiagnosticStatus:
     for prefix, counts in (("dropped", counters.drops), ("map", counters.map), ("motor", counters.motor)):
         values |= {f"{prefix}_{name}": str(count) for name, count in counts.items()}
     return DiagnosticStatus(status_names.SUMMARY, OK, "the run has ended", values)
+
+
+def _arming(state: ControllerState) -> dict[str, str]:
+    """Return the values about arming and about the source of the commands."""
+    return {Key.ARMED: str(int(state.armed)), Key.DISARMED_BY: state.disarmed_by,
+            Key.REMEDY: REMEDY if state.needs_request else "", Key.ARM_STAMP_NS: str(state.arm_answer.stamp_ns),
+            Key.ARM_REFUSAL: state.arm_answer.refusal, Key.SOURCE: state.source}
 
 
 def _times(name: str, histogram: Histogram) -> dict[str, str]:

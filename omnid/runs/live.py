@@ -40,6 +40,7 @@ from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.topics import command_topics
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
@@ -158,16 +159,17 @@ class LiveRun:
 
     def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None
                   ) -> CommandReceiver:
-        command_s = self._config.controller.deadlines.command_s
-        commands = CommandReceiver(controller.send_setpoint, controller.stop, command_s,
+        settings = self._config.controller
+        commands = CommandReceiver(controller, settings.deadlines.command_s, sources=settings.sources.names,
                                    synchronised=self._config.bus.command_clock == "synchronised")
-        record = nothing if recorder is None else command_recorder(recorder, session.offset_ns)
+        topics = command_topics(settings.sources.names)
+        record = nothing if recorder is None else command_recorder(recorder, session.offset_ns, topics)
 
-        def receive(key: str, payload: bytes) -> None:
-            commands.receive(key, payload)  # before it is recorded: a stop must not wait
+        def receive(key: str, payload: bytes, sender: str) -> None:
+            commands.receive(key, payload, sender)  # before it is recorded: a stop must not wait
             record(key, payload)
 
-        bus.subscribe_commands(receive)
+        bus.subscribe_commands(receive, topics)
         return commands
 
 

@@ -164,8 +164,8 @@ class _Replay:
                       recorder=options.observer(geometry, session.graph.telemetry) if options.observer else None,
                       bus=self._bus(session, geometry) if options.publish else None)
         if config.motor.port:
-            setpoint, T_base_rig = config.controller.setpoint.setpoint(), geometry.rig.T_base_rig
-            self._drive = ReplayDrive(session.start_controller(UNPRIVILEGED), setpoint, T_base_rig)
+            controller = session.start_controller(UNPRIVILEGED, of_replay=True)
+            self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
             sinks = replace(sinks, replay_drive=self._drive)
         if options.record:
             sinks = replace(sinks, recorder=self._recorder(session, geometry, options.record))

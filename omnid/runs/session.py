@@ -58,12 +58,13 @@ class Session:
             self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
         return bus
 
-    def start_controller(self, realtime: RealtimeSettings) -> ControllerLink:
+    def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
         """Start the controller process; DriverError where the motor cannot be opened.
 
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
-        start = ControllerStart(self.config.motor, self.config.controller, realtime)
+        settings = self.config.controller.of_replay if of_replay else self.config.controller
+        start = ControllerStart(self.config.motor, settings, realtime)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)
         return link

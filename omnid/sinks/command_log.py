@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from omnid.errors import OmnidError
@@ -11,31 +11,32 @@ from omnid.sinks.encoder import OutgoingMessage
 from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import message_from_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD
-from omnid.transport.topics import EMPTY_SCHEMA, SUBSCRIBED
+from omnid.transport.topics import EMPTY_SCHEMA
 
 _EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the encapsulation header and one byte
 
 
-def command_recorder(recorder: Recorder, offset_ns: int) -> Callable[[str, bytes], None]:
+def command_recorder(recorder: Recorder, offset_ns: int, topics: Mapping[str, str]) -> Callable[[str, bytes], None]:
     """Return a function that records a command, by key and payload, at the time of its arrival.
 
-    It may be called in any thread and never raises. offset_ns: from CLOCK_MONOTONIC to Unix time.
+    It may be called in any thread and never raises. offset_ns: from CLOCK_MONOTONIC to Unix time. topics: of commands,
+    with their types; others are not recorded.
     """
 
     def record(key: str, payload: bytes) -> None:
-        message = logged_command(key, payload)
+        message = logged_command(key, payload, topics)
         if message is not None:
             recorder.add(message, time.monotonic_ns() + offset_ns)
 
     return record
 
 
-def logged_command(key: str, payload: bytes) -> OutgoingMessage | None:
+def logged_command(key: str, payload: bytes, topics: Mapping[str, str]) -> OutgoingMessage | None:
     """Return the message for the log; None for a payload that no reader could decode. Any bytes may come.
 
     A stop is recorded as an empty message, whatever its payload.
     """
-    schema = SUBSCRIBED.get(key)
+    schema = topics.get(key)
     if schema is None or len(payload) > LONGEST_PAYLOAD:
         return None
     if schema == EMPTY_SCHEMA:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerLink
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
 from omnid.messages import OdometryUpdate
@@ -58,7 +59,7 @@ class ReplayDrive:
         """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
         now_ns = time.monotonic_ns()
         self._link.send_pose(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
-        self._link.send_setpoint(self._setpoint, now_ns)
+        self._link.send_setpoint(TimedSetpoint(now_ns, self._setpoint))
         self._link.receive_waiting()
         if not self._link.statistics.state.failed:
             self._failed_since_ns = 0

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motor import VelocityCommand
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import (
     S_PER_NS,
     ControlLaw,
     ControllerPose,
     ControllerSettings,
     ControlOutput,
-    TimedSetpoint,
 )
 from omnid.core.control.velocity_limits import STOP
 from omnid.messages import OdometryUpdate
@@ -40,14 +40,14 @@ class LockstepDrive:
         """period_s: between two ticks."""
         self._setpoint, self._T_base_rig = settings.setpoint.setpoint(), T_base_rig
         self._period_ns = round(period_s * 1e9)
-        self._law = ControlLaw(settings, start_ns=-1)
+        self._law = ControlLaw(settings.of_replay, start_ns=-1)
         self._last_ns: int | None = None
 
     def process(self, odometry: OdometryUpdate) -> VelocityCommand:
         """Return the command that follows from a pose, at its stamp."""
         stamp_ns = odometry.stamp_ns
         self._tick_until(stamp_ns)
-        self._law.pose = controller_pose(odometry, self._T_base_rig)
+        self._law.set_pose(controller_pose(odometry, self._T_base_rig))
         output = self._step(stamp_ns)
         return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
 
@@ -66,7 +66,7 @@ class LockstepDrive:
     def _step(self, now_ns: int) -> ControlOutput:
         dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * S_PER_NS
         self._last_ns = now_ns
-        self._law.command = TimedSetpoint(now_ns, self._setpoint)
+        self._law.set_command(TimedSetpoint(now_ns, self._setpoint))
         return self._law.step(now_ns, dt_s)
 
 

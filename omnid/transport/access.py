@@ -1,7 +1,8 @@
 """Permissions on the bus, as rules of zenoh's access control.
 
-Every connected program may subscribe and query. Only commands may be written, and only by those that the configuration
-names. zenoh applies the rules where a link enters the session, so that refused messages never reach the daemon.
+Every connected program may subscribe, query, and stop the wheels. Other commands, and the release of a stop, may be
+written by those only that the configuration names; nothing else can be written. zenoh applies the rules where a link
+enters the session, so that refused messages never reach the daemon.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.topics import STOP
 
 _ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
                   "declare_liveliness_subscriber")
@@ -27,11 +29,12 @@ def access_control(config: BusConfig) -> dict[str, Any]:
         "rules": [
             _rule("subscribe", "egress", (*_ALWAYS, "put", "delete"), list(_EVERYTHING)),
             _rule("query", "ingress", _ALWAYS, list(_EVERYTHING)),
+            _rule("stop", "ingress", ("put",), stop_keys(config)),
             _rule("command", "ingress", ("put",), command_keys(config)),
         ],
         "subjects": [everybody, *commanders],
         "policies": [
-            {"id": "all", "rules": ["subscribe", "query"], "subjects": [everybody["id"]]},
+            {"id": "all", "rules": ["subscribe", "query", "stop"], "subjects": [everybody["id"]]},
             {"id": "some", "rules": ["command"], "subjects": allowed},
         ],
     }
@@ -41,6 +44,12 @@ def command_keys(config: BusConfig) -> list[str]:
     """Return the key expressions of commands."""
     plain = f"{config.robot}/cmd/**"
     return [plain, f"{config.ros2_domain}/{plain}"] if config.ros2 == "rmw_zenoh" else [plain]
+
+
+def stop_keys(config: BusConfig) -> list[str]:
+    """Return the key expressions of the stop."""
+    plain = f"{config.robot}/{STOP}"
+    return [plain, f"{config.ros2_domain}/{plain}/**"] if config.ros2 == "rmw_zenoh" else [plain]
 
 
 def _subject(name: str, **properties: list[str]) -> dict[str, Any]:

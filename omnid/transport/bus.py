@@ -7,7 +7,7 @@ so only sinks with a bounded inbox of their own, and tickers, call it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Final
@@ -19,13 +19,13 @@ from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.session import open_session, reason
-from omnid.transport.topics import PUBLISHED, SUBSCRIBED, Topic, ros_name
+from omnid.transport.topics import PUBLISHED, Topic, ros_name
 
 __all__ = ["Bus", "BusConfig"]
 
 ALIVE: Final = "alive"  # liveliness token below the robot's name; exists as long as the daemon runs
 _ALIVE_TIMEOUT_S: Final = 1.0  # of the search for a robot of the same name
-CommandCallback = Callable[[str, bytes], None]  # key from `cmd` on, payload
+CommandCallback = Callable[[str, bytes, str], None]  # key from `cmd` on, payload, identity of the sender
 
 
 class Bus:
@@ -47,6 +47,7 @@ class Bus:
         self._publishers: dict[str, _TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
         self._on_command: CommandCallback | None = None
+        self._command_topics: Mapping[str, str] = {}
         self._graph: _RosGraph | None = None
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._closed = False
@@ -98,9 +99,12 @@ class Bus:
         if self._session is not None:
             self._declare_queryable(self._session, name)
 
-    def subscribe_commands(self, callback: CommandCallback) -> None:
-        """Call callback(key, payload) for each message on `<robot>/cmd/...`, key from `cmd` on, in a zenoh thread."""
-        self._on_command = callback
+    def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str]) -> None:
+        """Call callback(key, payload, sender) for each message on `<robot>/cmd/...`, in a zenoh thread.
+
+        key: from `cmd` on. sender: empty where the message does not name it. topics: with their types, for ROS 2.
+        """
+        self._on_command, self._command_topics = callback, topics
         if self._session is not None:
             self._declare_subscribers(self._session, callback)
 
@@ -190,7 +194,7 @@ class Bus:
             on_sample = _sample_callback(callback, prefix_length, suffix_parts=2)  # message type and its hash
             self._declared.append(session.declare_subscriber(key, on_sample))
         if self._graph is not None:
-            for name, schema in SUBSCRIBED.items():
+            for name, schema in self._command_topics.items():
                 self._graph.announce("MS", name, schema)
 
 
@@ -202,13 +206,26 @@ def _is_alive(session: zenoh.Session, robot: str) -> bool:
 def _sample_callback(
     callback: CommandCallback, prefix_length: int, suffix_parts: int = 0
 ) -> Callable[[zenoh.Sample], None]:
-    """Return a zenoh callback that passes key and payload on, without the key's first characters and last parts."""
+    """Return a zenoh callback that passes on the key without its first characters and last parts, payload and sender.
+    """
 
     def on_sample(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)[prefix_length:]
-        callback(key.rsplit("/", suffix_parts)[0] if suffix_parts else key, sample.payload.to_bytes())
+        topic = key.rsplit("/", suffix_parts)[0] if suffix_parts else key
+        callback(topic, sample.payload.to_bytes(), _sender(sample))
 
     return on_sample
+
+
+def _sender(sample: zenoh.Sample) -> str:
+    """Return the identity of the program that sent a sample, empty where it names none.
+
+    Programs with omnid.client give the source of their messages, those of rmw_zenoh the gid of their publisher; zenoh
+    itself adds nothing. No proof: permissions are those of the access rules.
+    """
+    if sample.source_info is not None:
+        return str(sample.source_info.source_id.zid)
+    return "" if sample.attachment is None else ros2.gid_in(sample.attachment.to_bytes())
 
 
 class _RosGraph:
@@ -218,6 +235,7 @@ class _RosGraph:
         self._session, self._config = session, config
         self._node = ros2.RmwNode(config.ros2_domain, str(session.zid()), ros2.node_name(config.robot))
         self._tokens: list[zenoh.LivelinessToken] = []
+        self._topics = list(PUBLISHED)  # their places are the ids of the entities
         if config.ros2 == "rmw_zenoh":
             self._declare(self._node.token)
 
@@ -225,7 +243,9 @@ class _RosGraph:
         """Declare a publisher (MP) or a subscription (MS) and return its token, "" where ROS 2 is off."""
         name = ros_name(self._config.robot, topic)
         if self._config.ros2 == "rmw_zenoh":
-            entity = 1 + [*PUBLISHED, *SUBSCRIBED].index(topic)
+            if topic not in self._topics:
+                self._topics.append(topic)
+            entity = 1 + self._topics.index(topic)
             make = self._node.publisher if kind == "MP" else self._node.subscription
             return self._declare(make(entity, name, schema))
         if self._config.ros2 == "ros2dds":

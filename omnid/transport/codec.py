@@ -29,8 +29,9 @@ DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
+HEADER_SCHEMA = "std_msgs/msg/Header"
 SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA, TWIST_SCHEMA,
-           VECTOR_SCHEMA, GRID_SCHEMA)
+           VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
@@ -270,6 +271,18 @@ def heading_from_cdr(payload: bytes) -> HeadingRecord:
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
     return HeadingRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
                           message.vector.z)
+
+
+def header_cdr(stamp_ns: int, frame: str = "") -> bytes:
+    """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
+    return _cdr(_header(stamp_ns, frame), HEADER_SCHEMA)
+
+
+def stamp_from_cdr(payload: bytes) -> int:
+    """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, HEADER_SCHEMA)
+    assert isinstance(message, ros.std_msgs__msg__Header)
+    return _unchecked_stamp_ns(message.stamp)
 
 
 def message_from_cdr(payload: bytes, schema: str) -> object:

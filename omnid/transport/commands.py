@@ -1,22 +1,27 @@
-"""Commands from the network, validated: `<robot>/cmd/twist`, `/cmd/heading` and `/cmd/stop`.
+"""Commands from the network, validated: `<robot>/cmd/twist`, `/cmd/heading`, `/cmd/stop` and `/cmd/arm`.
 
 twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s. heading is a
-geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. stop may have any payload.
+geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. Both also exist for each source of
+commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
-from collections.abc import Callable
-from typing import Final, NamedTuple
+from collections import Counter, deque
+from collections.abc import Sequence
+from typing import Final, NamedTuple, Protocol
 
+from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
+from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
-from omnid.transport.codec import heading_from_cdr, twist_from_cdr
+from omnid.transport.codec import heading_from_cdr, stamp_from_cdr, twist_from_cdr
+from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
+MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
 
 
@@ -60,66 +65,104 @@ def _check_frame(frame: str, expected: str) -> None:
         raise RefusedCommand("wrong frame")
 
 
+class CommandTarget(Protocol):
+    """The controller; its methods may be called from any thread."""
+
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        """Take a setpoint; its arrival is ns of CLOCK_MONOTONIC."""
+
+    def stop(self) -> None:
+        """Stop the wheels until `arm` is called later."""
+
+    def arm(self, request: ArmRequest) -> None:
+        """Take a request to arm."""
+
+
 class CommandReceiver:
     """Passes valid commands on and counts the others by reason; called from threads of the bus.
 
-    on_setpoint receives the setpoint and its arrival, ns of CLOCK_MONOTONIC. Stops are always obeyed.
+    Stops are always obeyed. The controller decides which of several sources and senders drives.
     """
 
-    def __init__(
-        self, on_setpoint: Callable[[Setpoint, int], None], on_stop: Callable[[], None], stale_s: float,
-        *, synchronised: bool = True
-    ) -> None:
+    def __init__(self, target: CommandTarget, stale_s: float, *, sources: Sequence[str] = (OPERATOR, PLANNER),
+                 synchronised: bool = True) -> None:
         """stale_s: largest difference of a command's stamp from this machine's clock, before and after.
 
-        synchronised: False where senders have other clocks. The stamps of each topic must then rise, so that a stream
-        that was recorded earlier in this run is refused.
+        sources: names; the first has the short topics cmd/twist and cmd/heading, too. synchronised: False where senders
+        have other clocks. The stamps of each topic must then rise, so that a stream that was recorded earlier is
+        refused; a request to arm lets them begin again, and needs a stamp that none of the last ones had.
         """
-        self._on_setpoint, self._on_stop, self._stale_ns = on_setpoint, on_stop, round(stale_s * 1e9)
-        self._synchronised = synchronised
+        self._target, self._stale_ns, self._synchronised = target, round(stale_s * 1e9), synchronised
         self._newest_ns: dict[str, int] = {}  # stamp of the newest command that was accepted, by topic
-        self._parsers = {"cmd/twist": twist_command, "cmd/heading": heading_command}
-        self.accepted = self.stops = 0
+        self._arm_stamps_ns: deque[int] = deque(maxlen=MOST_ARM_STAMPS)
+        self._stop_ns = 0  # arrival of the newest stop
+        parsers = {TWIST: twist_command, HEADING: heading_command}
+        self._topics = {f"cmd/{name}": (sources[0], parser) for name, parser in parsers.items()}
+        self._topics |= {f"cmd/{source}/{name}": (source, parser) for source in sources
+                         for name, parser in parsers.items()}
+        self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
 
-    def receive(self, key: str, payload: bytes) -> None:
-        """Handle one message; never raises."""
+    def receive(self, key: str, payload: bytes, sender: str = "") -> None:
+        """Handle one message; never raises. sender: identity of the program that sent it, empty if unknown."""
         arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
-        if key == "cmd/stop":
+        if key == STOP:
+            self._stop_ns = arrival_ns
             self.stops += 1
-            self._on_stop()
+            self._target.stop()
             return
         try:
-            command = self._parsed(key, payload)
+            if key == ARM:
+                self._arm(payload, arrival_ns)
+            else:
+                self._drive(key, payload, arrival_ns, sender)
         except RefusedCommand as refusal:
             self.refused[str(refusal)] += 1
-            return
         except OmnidError:
             self.refused["malformed"] += 1
-            return
-        self.accepted += 1
-        self._on_setpoint(command.setpoint, arrival_ns)
 
-    def _parsed(self, key: str, payload: bytes) -> CommandMessage:
-        if key not in self._parsers:
-            raise RefusedCommand("unknown topic")
-        if len(payload) > LONGEST_PAYLOAD:
-            raise RefusedCommand("too long")
-        command = self._parsers[key](payload)
+    def _arm(self, payload: bytes, arrival_ns: int) -> None:
+        _check_length(payload)
+        stamp_ns = stamp_from_cdr(payload)
         if self._synchronised:
-            self._check_age(command.stamp_ns)
+            age_ns = self._checked_age_ns(stamp_ns)
+            if arrival_ns - age_ns <= self._stop_ns:
+                raise RefusedCommand(OLDER_THAN_STOP)
+        elif stamp_ns in self._arm_stamps_ns:
+            raise RefusedCommand("stamp was used before")
+        self._arm_stamps_ns.append(stamp_ns)
+        self._newest_ns.clear()
+        self.arms += 1
+        self._target.arm(ArmRequest(arrival_ns, stamp_ns))
+
+    def _drive(self, key: str, payload: bytes, arrival_ns: int, sender: str) -> None:
+        if key not in self._topics:
+            raise RefusedCommand("unknown topic")
+        _check_length(payload)
+        source, parser = self._topics[key]
+        command = parser(payload)
+        if self._synchronised:
+            self._checked_age_ns(command.stamp_ns)
         else:
             self._check_order(key, command.stamp_ns)
-        return command
+        self.accepted += 1
+        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, sender))
 
-    def _check_age(self, stamp_ns: int) -> None:
+    def _checked_age_ns(self, stamp_ns: int) -> int:
+        """Return the age of a stamp. Raise RefusedCommand where it is too old or from the future."""
         age_ns = time.time_ns() - stamp_ns
         if age_ns > self._stale_ns:
             raise RefusedCommand("too old")
         if age_ns < -self._stale_ns:
             raise RefusedCommand("stamp in the future")
+        return age_ns
 
     def _check_order(self, key: str, stamp_ns: int) -> None:
         if key in self._newest_ns and stamp_ns <= self._newest_ns[key]:
             raise RefusedCommand("stamp does not rise")
         self._newest_ns[key] = stamp_ns
+
+
+def _check_length(payload: bytes) -> None:
+    if len(payload) > LONGEST_PAYLOAD:
+        raise RefusedCommand("too long")

@@ -43,6 +43,12 @@ def attachment(seq: int, source_ns: int, gid: bytes) -> bytes:
     return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid
 
 
+def gid_in(attached: bytes) -> str:
+    """Return the publisher's id in an attachment of rmw_zenoh, in hexadecimal; empty for any other attachment."""
+    size = struct.calcsize("<qqB")
+    return attached[size:].hex() if len(attached) == size + GID_BYTES and attached[size - 1] == GID_BYTES else ""
+
+
 def gid_of(token: str) -> bytes:
     """Return the unique id (16 bytes) of the publisher with this token."""
     return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, NamedTuple
 
+from omnid.core.control.safety_rules import ASKED
 from omnid.tracking_state import TrackingState
 
 PREFIX: Final = "omnid: "
@@ -25,6 +26,8 @@ STAGE_PREFIX: Final = f"{PREFIX}stage "
 
 STOPPED_PREFIX: Final = "stopped, "  # begins the keys that count stops of the wheels, by reason
 REFUSED_PREFIX: Final = "refused, "  # begins the keys that count refused commands, by reason
+
+DISARMED_BY_STOP: Final = ASKED  # the value of disarmed_by after a stop
 
 _TIME_SUFFIX: Final = "_ms"
 
@@ -56,6 +59,12 @@ class Key(StrEnum):
     EXPIRIES = "expiries"
     COMMANDS = "commands"
     STOPS = "stops"
+    SOURCE = "source"  # of the commands that drive, empty while none does
+    ARMED = "armed"  # 1 or 0
+    DISARMED_BY = "disarmed_by"  # the reason, empty while armed; DISARMED_BY_STOP after a stop
+    REMEDY = "remedy"  # the way to arm, empty where none is needed
+    ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
+    ARM_REFUSAL = "arm_refusal"  # the reason, empty where it was accepted
 
 
 # Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from omnid.transport import codec
@@ -28,11 +29,18 @@ PUBLISHED: Final = {
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(IMAGE_SCHEMA),
 }
-SUBSCRIBED: Final = {
-    "cmd/twist": codec.TWIST_SCHEMA,
-    "cmd/heading": codec.VECTOR_SCHEMA,
-    "cmd/stop": EMPTY_SCHEMA,
-}
+STOP: Final = "cmd/stop"
+ARM: Final = "cmd/arm"
+TWIST: Final = "twist"
+HEADING: Final = "heading"
+_SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
+
+
+def command_topics(sources: Sequence[str]) -> dict[str, str]:
+    """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
+    setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
+    named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
+    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **named}
 
 
 def ros_name(robot: str, topic: str) -> str:

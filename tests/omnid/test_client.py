@@ -134,7 +134,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
     state = {"x": 0.0, "y": 0.0}
     stops: list[str] = []
 
-    def execute(key: str, payload: bytes) -> None:
+    def execute(key: str, payload: bytes, _: str) -> None:
         if key == "cmd/heading":
             _, _, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
@@ -143,7 +143,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
             stops.append(key)
 
     with robot() as (bus, endpoint):
-        bus.subscribe_commands(execute)
+        bus.subscribe_commands(execute, {})
         code = example(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
         with script(f"print('ready', flush=True)\n{code}") as process:
             def run() -> bool:
@@ -158,17 +158,26 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
 
 
 def test_sends_commands() -> None:
-    received: list[tuple[str, bytes]] = []
+    received: list[tuple[str, bytes, str]] = []
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         driver = connection.driver()
         assert not driver.connected
-        bus.subscribe_commands(lambda key, payload: received.append((key, payload)))
+        bus.subscribe_commands(lambda *message: received.append(message), {})
         wait_until(lambda: driver.connected)
         driver.twist(0.5, -0.25)
         driver.heading(0.75, 1.5)
         driver.stop()
-        wait_until(lambda: len(received) == 3)
-    (twist, a), (heading, b), (stop, _) = received
-    assert (twist, heading, stop) == ("cmd/twist", "cmd/heading", "cmd/stop")
+        stamp_ns = driver.arm()
+        connection.driver("planner").twist(0.5, -0.25)
+        wait_until(lambda: len(received) == 5)
+        with Robot(connect=(endpoint,)) as other:
+            other.driver().stop()
+            wait_until(lambda: len(received) == 6)
+    (twist, a, _), (heading, b, _), (stop, _, _), (arm, c, _), (planned, d, _), _ = received
+    assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
+    assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
+    assert codec.stamp_from_cdr(c) == stamp_ns
+    senders = [sender for *_, sender in received]
+    assert len(set(senders[:5])) == 1 and senders[5] != senders[0] and len(senders[0]) >= 16
     assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
     assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)

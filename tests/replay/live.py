@@ -201,11 +201,12 @@ class Daemon:
 
 
 def command_line(scene: Path, port: int, motor: Path | None, *words: object, module: str = "omnid") -> list[str]:
-    """Return the command of `omnid run` on the images of a scene."""
+    """Return the command of `omnid run` on the images of a scene; without an operator, unless words change it."""
     run = [] if module != "omnid" else ["run"]
     log = ["--log", scene / "log.mcap", "--rig", scene / "rig.toml"]
     wheels = [] if motor is None else ["--motor", motor]
-    settings = [f'bus.listen=["tcp/127.0.0.1:{port}"]', "live.status_s=0.2", "live.cloud_s=0.5"]
+    settings = [f'bus.listen=["tcp/127.0.0.1:{port}"]', "live.status_s=0.2", "live.cloud_s=0.5",
+                'controller.arming="automatic"']
     sets = [word for setting in settings for word in ("--set", setting)]
     return [sys.executable, "-m", module, *map(str, [*run, *log, *wheels, *sets, *words])]
 

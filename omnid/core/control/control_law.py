@@ -1,23 +1,32 @@
 """The one control law: from the newest pose and the newest setpoint to a motion within all limits.
 
 It reads no clock: time is an argument. The controller process steps it on CLOCK_MONOTONIC, a replay on the stamps of
-its log (omnid.stages.drive).
+its log (omnid.stages.lockstep_drive).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
-from omnid.core.control.heading_controller import HeadingController, HeadingLimits, Setpoint, Twist
+from omnid.core.control.arming import AUTOMATIC, Arming, ArmRequest, arming_knob
+from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
+from omnid.core.control.heading_controller import (
+    LONGEST_TICK_S,
+    HeadingController,
+    HeadingLimits,
+    Setpoint,
+    Twist,
+    wrap_angle,
+)
 from omnid.core.control.heading_goal import HeadingGoal
-from omnid.core.control.safety_rules import COMMAND_STALE, IDLE, Deadlines, SafetyInputs, stop_reason
+from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.settings import knob
 
 S_PER_NS: Final = 1e-9
-REASONS_WITH_GOOD_POSE: Final = ("", IDLE, COMMAND_STALE)  # the rules before these have accepted the pose
+JUMP_RAD: Final = 0.3  # of the heading, beyond what the base can turn: odometry was corrected, or is wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +49,16 @@ class ControllerSettings:
     limits: VelocityLimits = field(default_factory=VelocityLimits)
     heading: HeadingLimits = field(default_factory=HeadingLimits)
     setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
+    sources: SourceSettings = field(default_factory=SourceSettings)
+    arming: str = arming_knob()
+
+    @property
+    def of_replay(self) -> ControllerSettings:
+        """The settings of a replay, whose only source is its setpoint: it cannot be armed from outside.
+
+        It arms itself, also after faults that have passed: to start a replay with a motor is to ask for its motion.
+        """
+        return replace(self, arming=AUTOMATIC, sources=SourceSettings())
 
 
 class ControllerPose(NamedTuple):
@@ -55,13 +74,6 @@ class ControllerPose(NamedTuple):
         return self.heading_rad + self.yaw_rate_radps * (now_ns - self.stamp_ns) * S_PER_NS
 
 
-class TimedSetpoint(NamedTuple):
-    """A setpoint and the time of its arrival, by the clock that steps the law."""
-
-    arrival_ns: int
-    setpoint: Setpoint
-
-
 class ControlOutput(NamedTuple):
     """The result of one step."""
 
@@ -73,25 +85,46 @@ class ControlOutput(NamedTuple):
 class ControlLaw:
     """Heading controller, velocity limits and safety rules, stepped by the caller.
 
-    It stops, with the deceleration of the limits, for every reason in omnid.core.control.safety_rules. A stop voids
-    all setpoints that arrived before it: only a later one moves the wheels again. Not thread-safe.
+    It stops, with the deceleration of the limits, for every reason in omnid.core.control.safety_rules. Each of them
+    voids all setpoints that arrived before it: only a later one moves the wheels again, and after a stop or a fault
+    only while armed (omnid.core.control.arming). A heading is one in odom as it is when the setpoint arrives: a jump of
+    the pose, when odometry closes a gap, voids it, since its sender has not seen the corrected pose. Not thread-safe.
     """
 
     def __init__(self, settings: ControllerSettings, start_ns: int) -> None:
         """start_ns: setpoints that arrived until then are void."""
         self._settings = settings
-        self._heading_controller, self._goal = HeadingController(settings.heading), HeadingGoal()
+        self._heading_controller = HeadingController(settings.heading)
+        self._goal = HeadingGoal(settings.heading, settings.limits)
         self._void_ns = start_ns  # setpoints that arrived until then are void
-        self._stop_ns = 0  # of the last request to stop
-        self._ending = False
-        self.pose: ControllerPose | None = None
-        self.command: TimedSetpoint | None = None
+        self._ending = self._pose_jumped = False
+        self._pose: ControllerPose | None = None
+        self.arming = Arming(settings.arming)
+        self.commands = CommandSelector(settings.sources)
         self.motion = STOP  # that the base follows now: the next step continues from it
         self.reason = IDLE  # of the last step
 
+    @property
+    def pose(self) -> ControllerPose | None:
+        """The newest pose."""
+        return self._pose
+
+    def set_pose(self, pose: ControllerPose) -> None:
+        """Replace the pose."""
+        self._pose_jumped |= self._pose is not None and self._jumps(self._pose, pose)
+        self._pose = pose
+
+    def set_command(self, command: TimedSetpoint) -> None:
+        """Offer a setpoint."""
+        self.commands.offer(command)
+
     def stop(self, asked_ns: int) -> None:
-        """Stop the wheels at the next step; all setpoints that arrived until then are void."""
-        self._stop_ns = max(self._stop_ns, asked_ns)
+        """Stop the wheels at the next step, until a request to arm that arrives later."""
+        self.arming.stop(asked_ns)
+
+    def arm(self, request: ArmRequest) -> None:
+        """Ask to arm; the next step answers (arming.answer)."""
+        self.arming.request(request)
 
     def end(self) -> None:
         """Stop the wheels for good."""
@@ -100,35 +133,57 @@ class ControlLaw:
     def step(self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False,
              motor_stopped: bool = False) -> ControlOutput:
         """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
-        self.reason = stop_reason(self._inputs(now_ns, late_s, motor_failed, motor_stopped), self._settings.deadlines)
+        inputs = self._inputs(now_ns, late_s, motor_failed, motor_stopped)
+        deadlines = self._settings.deadlines
+        accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
+        if accepted is not None:
+            self._void_ns = max(self._void_ns, accepted.arrival_ns)
+        self.reason = stop_reason(replace(inputs, stop_asked=self.arming.stop_asked, armed=self.arming.armed,
+                                          command_age_s=self._command_age_s(now_ns)), deadlines)
+        self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
-        pose, command = self.pose, self.command
+        pose, command = self._pose, self.commands.current
         if self.reason or pose is None or command is None:
-            motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
+            self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
         else:
-            measured_rad = pose.heading_at(now_ns)
-            wanted = self._heading_controller.step(command.setpoint, measured_rad, dt_s, self.motion)
-            motion = self._settings.limits.step(wanted, self.motion, dt_s)
-            heading_rad = self._goal.towards(command.setpoint, measured_rad, motion.yaw_rate_radps * dt_s)
-        self.motion = motion
-        return ControlOutput(motion, heading_rad, self.reason)
+            heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), dt_s)
+        return ControlOutput(self.motion, heading_rad, self.reason)
 
-    def motor_heading(self, counted_rad: float, now_ns: int) -> None:
-        """Take the heading that the motor controller reported after a step, in its own count; NaN if it knows none."""
-        good = self.pose if self.reason in REASONS_WITH_GOOD_POSE else None
-        self._goal.update(counted_rad, good.heading_at(now_ns) if good else None)
+    def motor_heading(self, counted_rad: float, rate_radps: float) -> None:
+        """Take the heading, in its own count, and the yaw rate that the motor controller reported; NaN if unknown."""
+        self._goal.update(counted_rad, rate_radps)
+
+    def _drive(self, setpoint: Setpoint, heading_rad: float, dt_s: float) -> float:
+        """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
+        wanted = self._heading_controller.step(setpoint, heading_rad, dt_s, self.motion)
+        self.motion = self._settings.limits.step(wanted, self.motion, dt_s)
+        turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
+        error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
+        return self._goal.towards(turn_rad, error_rad)
+
+    def _jumps(self, before: ControllerPose, pose: ControllerPose) -> bool:
+        """True if the heading has changed by more than the base can have turned since the last pose."""
+        passed_s = abs(pose.stamp_ns - before.stamp_ns) * S_PER_NS
+        reach_rad = JUMP_RAD + self._settings.limits.yaw_acceleration_radps2 * passed_s**2 / 2
+        return abs(wrap_angle(pose.heading_rad - before.heading_at(pose.stamp_ns))) > reach_rad
+
+    def _command_age_s(self, now_ns: int) -> float:
+        """Return the age of the setpoint; inf where there is none, or a void one."""
+        command = self.commands.current
+        if command is None or command.arrival_ns <= self._void_ns:
+            return math.inf
+        return (now_ns - command.arrival_ns) * S_PER_NS
 
     def _inputs(self, now_ns: int, late_s: float, motor_failed: bool, motor_stopped: bool) -> SafetyInputs:
-        pose, command = self.pose, self.command
-        valid = command is not None and command.arrival_ns > self._void_ns
+        pose = self._pose
         return SafetyInputs(
             pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS,
             pose_state="" if pose is None else pose.state,
-            command_age_s=(now_ns - command.arrival_ns) * S_PER_NS if command is not None and valid else math.inf,
+            pose_jumped=self._pose_jumped,
+            command_age_s=math.inf,
             late_s=late_s,
             motor_failed=motor_failed,
             motor_stopped=motor_stopped,
-            stop_asked=self._stop_ns > self._void_ns,
             ending=self._ending,
         )

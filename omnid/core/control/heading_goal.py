@@ -5,50 +5,64 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from omnid.core.control.heading_controller import Setpoint, wrap_angle
+from omnid.core.control.heading_controller import HeadingLimits, wrap_angle
+from omnid.core.control.velocity_limits import VelocityLimits
 
-LEAD_RAD: Final = 0.5  # limit of the lead of the goal over the heading, while the base turns at a rate
+REACTION_S: Final = 0.15  # between the heading that the motor controller reported and its turn to the next goal
+OVERSPEED: Final = 1.1  # times the yaw rate's limit, reported: the goal is the present heading until it is slower
+
+
+def longest_lead_rad(heading: HeadingLimits, velocity: VelocityLimits) -> float:
+    """Return the limit of the lead of the goal over the heading.
+
+    It is the angle that the base turns at the highest rate within the reaction time, and then until it has braked. A
+    motor controller turns the faster, the larger the lead is, by a gain that is not known here.
+    """
+    rate_radps = min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
+    acceleration_radps2 = min(heading.yaw_acceleration_radps2, velocity.yaw_acceleration_radps2)
+    return min(math.pi / 2, rate_radps * REACTION_S + rate_radps**2 / (2 * acceleration_radps2))
 
 
 class HeadingGoal:
-    """Convert headings in odom for a motor controller whose own headings start anywhere, and drift.
+    """Integrate yaw rates, which are within the limits, to headings in the motor controller's own count.
 
-    A yaw rate becomes a heading that turns at that rate, so that the base follows it without drift.
+    The count starts anywhere, and drifts. No heading in odom is converted to it: the pose decides about the yaw rate
+    only, so that a pose that jumps does not move the goal by more than the limits allow in a tick.
     """
 
-    def __init__(self) -> None:
-        self._turning_rad: float | None = None  # in odom: the goal of a turn at a rate
-        self._offset_rad = 0.0  # from headings in odom to those of the motor controller
-        self._counted_rad = 0.0  # the motor controller's heading, as last reported
+    def __init__(self, heading: HeadingLimits, velocity: VelocityLimits) -> None:
+        self._longest_rad = longest_lead_rad(heading, velocity)
+        self._highest_radps = OVERSPEED * min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
+        self._goal_rad: float | None = None  # of the last tick, while the base turns or drives
+        self._counted_rad = self._rate_radps = 0.0  # as last reported
 
-    def update(self, counted_rad: float, heading_rad: float | None) -> None:
-        """Take the heading that the motor controller reported and the one in odom at that time.
+    def update(self, counted_rad: float, rate_radps: float) -> None:
+        """Take the heading and the yaw rate that the motor controller reported; NaN where it knows none."""
+        if math.isfinite(counted_rad):
+            self._counted_rad = counted_rad
+        self._rate_radps = rate_radps if math.isfinite(rate_radps) else 0.0
 
-        counted_rad: NaN where it knows none. heading_rad: None where the pose cannot be trusted.
+    def towards(self, turn_rad: float, error_rad: float | None = None) -> float:
+        """Return the goal after a turn since the last call; the present heading where a number is not finite.
+
+        error_rad: angle to the wanted heading, which the goal does not pass; None where a yaw rate is wanted.
         """
-        if not math.isfinite(counted_rad):
-            return
-        self._counted_rad = counted_rad
-        if heading_rad is not None and math.isfinite(heading_rad):
-            self._offset_rad = wrap_angle(counted_rad - heading_rad)
-
-    def towards(self, setpoint: Setpoint, heading_rad: float, turn_rad: float) -> float:
-        """Return the goal for a setpoint, in the motor controller's count.
-
-        heading_rad: measured, in odom. turn_rad: of a turn at a rate, since the last call. The present heading is the
-        goal where a number is not finite.
-        """
-        if not all(map(math.isfinite, (setpoint.heading_rad or 0.0, heading_rad, turn_rad))):
+        if not math.isfinite(turn_rad) or (error_rad is not None and not math.isfinite(error_rad)):
             return self.stay()
-        if setpoint.heading_rad is not None:
-            self._turning_rad = None
-            return wrap_angle(setpoint.heading_rad + self._offset_rad)
-        before_rad = heading_rad if self._turning_rad is None else self._turning_rad
-        ahead_rad = wrap_angle(before_rad + turn_rad - heading_rad)
-        self._turning_rad = heading_rad + max(-LEAD_RAD, min(LEAD_RAD, ahead_rad))
-        return wrap_angle(self._turning_rad + self._offset_rad)
+        before_rad = self._counted_rad if self._goal_rad is None else self._goal_rad
+        lead_rad = _clamp(wrap_angle(before_rad + turn_rad - self._counted_rad), self._longest_rad)
+        if error_rad is not None and abs(error_rad) < self._longest_rad:
+            lead_rad = min(max(lead_rad, min(error_rad, 0.0)), max(error_rad, 0.0))
+        if abs(self._rate_radps) > self._highest_radps and self._rate_radps * lead_rad > 0:
+            lead_rad = 0.0
+        self._goal_rad = wrap_angle(self._counted_rad + lead_rad)
+        return self._goal_rad
 
     def stay(self) -> float:
         """Return the present heading as the goal, while the base slows down."""
-        self._turning_rad = None
+        self._goal_rad = None
         return self._counted_rad
+
+
+def _clamp(value: float, magnitude: float) -> float:
+    return max(-magnitude, min(magnitude, value))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from omnid.settings import knob
 from omnid.tracking_state import TrackingState
@@ -27,10 +28,20 @@ class SafetyInputs:
     pose_state: str  # tracking | degraded | lost
     command_age_s: float  # of a setpoint that arrived after the last stop
     late_s: float = 0.0
+    pose_jumped: bool = False  # the heading differs from the one before by more than the base can turn
     motor_failed: bool = False  # at the last tick
     motor_stopped: bool = False  # by the motor controller itself, before the last tick
-    stop_asked: bool = False
+    stop_asked: bool = False  # and not released by cmd/arm
+    armed: bool = True
     ending: bool = False
+
+
+class Rule(NamedTuple):
+    """One reason to stop the wheels."""
+
+    reason: str  # in a few words
+    disarms: bool  # a fault: with controller.arming = "manual" the wheels stay stopped after it until cmd/arm
+    holds: Callable[[SafetyInputs, Deadlines], bool]
 
 
 ENDS: Final = "the run ends"
@@ -40,24 +51,29 @@ STOPPED: Final = "the motor controller had stopped by itself"
 OVERLOADED: Final = "the host is overloaded"
 POSE_STALE: Final = "the pose is stale"
 POSE_LOST: Final = "the pose is lost"
+POSE_JUMPED: Final = "the heading of the pose has jumped"
+NOT_ARMED: Final = "not armed"
 IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
 
+# The first rule that holds is reported. A NaN is a reason, and so is an age as far below 0 as it may be above: no pose
+# comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode.
+RULES: Final = (
+    Rule(ENDS, False, lambda now, _: now.ending),
+    Rule(ASKED, False, lambda now, _: now.stop_asked),
+    Rule(FAILED, True, lambda now, _: now.motor_failed),
+    Rule(STOPPED, True, lambda now, _: now.motor_stopped),
+    Rule(OVERLOADED, True, lambda now, deadlines: not now.late_s <= deadlines.tick_s),
+    Rule(POSE_STALE, True, lambda now, deadlines: not abs(now.pose_age_s) <= deadlines.pose_s),
+    Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
+    Rule(POSE_JUMPED, True, lambda now, _: now.pose_jumped),
+    Rule(NOT_ARMED, False, lambda now, _: not now.armed),
+    Rule(IDLE, False, lambda now, _: now.command_age_s == float("inf")),
+    Rule(COMMAND_STALE, False, lambda now, deadlines: not abs(now.command_age_s) <= deadlines.command_s),
+)
+FAULTS: Final = tuple(rule for rule in RULES if rule.disarms)
 
-def stop_reason(now: SafetyInputs, deadlines: Deadlines) -> str:
-    """Return the reason why the wheels must stop, in a few words; empty where they may turn.
 
-    A NaN is a reason, and so is an age as far below 0 as it may be above: no pose comes from the future.
-    """
-    reasons = (
-        (now.ending, ENDS),
-        (now.stop_asked, ASKED),
-        (now.motor_failed, FAILED),
-        (now.motor_stopped, STOPPED),
-        (not now.late_s <= deadlines.tick_s, OVERLOADED),
-        (not abs(now.pose_age_s) <= deadlines.pose_s, POSE_STALE),
-        (now.pose_state == TrackingState.LOST, POSE_LOST),
-        (now.command_age_s == float("inf"), IDLE),
-        (not abs(now.command_age_s) <= deadlines.command_s, COMMAND_STALE),
-    )
-    return next((reason for holds, reason in reasons if holds), "")
+def stop_reason(now: SafetyInputs, deadlines: Deadlines, rules: Iterable[Rule] = RULES) -> str:
+    """Return the reason of the first rule that holds; empty where the wheels may turn."""
+    return next((rule.reason for rule in rules if rule.holds(now, deadlines)), "")

@@ -21,6 +21,8 @@ from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control import safety_rules
+from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
@@ -37,10 +39,11 @@ AHEAD = Setpoint(0.4, None, 0.0)
 DECELERATION_MPS2 = 0.8
 
 
-def start_message(port: object) -> ControllerStart:
+def start_message(port: object, arming: str = AUTOMATIC) -> ControllerStart:
     limits = VelocityLimits(deceleration_mps2=DECELERATION_MPS2)
     motor = MotorSettings(port=str(port), rate_hz=10.0, watchdog_ms=5000)
-    return ControllerStart(motor, ControllerSettings(DEADLINES, limits), RealtimeSettings(lock_memory=False))
+    settings = ControllerSettings(DEADLINES, limits, arming=arming)
+    return ControllerStart(motor, settings, RealtimeSettings(lock_memory=False))
 
 
 def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
@@ -50,13 +53,13 @@ def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
 class Robot:
     """A link, and a thread that reads the commands to the wheels."""
 
-    def __init__(self, base: Base) -> None:
+    def __init__(self, base: Base, arming: str = AUTOMATIC) -> None:
         self.base = base
         self.commands: list[VelocityCommand] = []
         self.lines: list[str] = []
         self.error: OmnidError | None = None
         self.stats = StageStats("motor")
-        self.link = ControllerLink(start_message(base.port), self.stats, self.lines.append)
+        self.link = ControllerLink(start_message(base.port, arming), self.stats, self.lines.append)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
@@ -70,7 +73,7 @@ class Robot:
 
     def _sent(self) -> bool:
         self.link.send_pose(pose())
-        self.link.send_setpoint(AHEAD, time.monotonic_ns())
+        self.link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
         return True
 
     def joined(self) -> None:
@@ -84,10 +87,10 @@ class Robot:
             self.error = error
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with contextlib.closing(Base(tmp_path)) as base:
-        robot = Robot(base)
+@contextlib.contextmanager
+def started(folder: Path, arming: str = AUTOMATIC) -> Iterator[Robot]:
+    with contextlib.closing(Base(folder)) as base:
+        robot = Robot(base, arming)
         try:
             yield robot
         finally:
@@ -96,6 +99,12 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
             robot.link.end()
             robot.joined()
             robot.link.close()
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with started(tmp_path) as robot:
+        yield robot
 
 
 def slowed_down(base: Base) -> None:
@@ -114,7 +123,7 @@ def test_poses_and_setpoints_turn_the_wheels_and_each_tick_is_counted(robot: Rob
     robot.link.stop()
     wait_until(lambda: not robot.base.drives, "the stop")
     wait_until(lambda: statistics.state.stops[safety_rules.ASKED] == 1, "its count")
-    assert "the wheels stop: a stop was asked for" in robot.lines
+    assert any(line.startswith("the wheels stop: a stop was asked for; ") for line in robot.lines)
     robot.link.end()
     robot.joined()
     assert robot.commands[-1].velocity_mps == 0.0 and max(command.velocity_mps for command in robot.commands) > 0.38
@@ -158,7 +167,7 @@ def test_a_stop_arrives_although_the_channel_was_full(robot: Robot) -> None:
     robot.drive()
     os.kill(robot.pid, signal.SIGSTOP)
     while not robot.link._channel.lost:
-        robot.link.send_setpoint(AHEAD, time.monotonic_ns())
+        robot.link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
     robot.link.stop()
     assert robot.link._channel.lost >= 2, "its own message was lost"
     os.kill(robot.pid, signal.SIGCONT)
@@ -174,13 +183,39 @@ def _sends_pose(robot: Robot) -> bool:
     return robot.link._channel.lost == lost
 
 
+def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_request(tmp_path: Path) -> None:
+    """The process misses the stop itself, then receives a request that is older and one that is younger than it."""
+    with started(tmp_path, MANUAL) as robot:
+        state = robot.link.statistics
+        wait_until(lambda: _sends_pose(robot) and state.state.sent > 2, "the first reports")
+        wait_until(lambda: _sends_pose(robot) and state.state.reason == safety_rules.NOT_ARMED, "a pose that counts")
+        arm(robot)
+        wait_until(lambda: state.state.armed, "the arming")
+        robot.drive()
+        early = ArmRequest(time.monotonic_ns(), 1)
+        send, robot.link._channel.send = robot.link._channel.send, lambda _: None  # type: ignore[method-assign]
+        robot.link.stop()
+        robot.link._channel.send = send  # type: ignore[method-assign]
+        robot.link.arm(early)
+        wait_until(lambda: not robot.base.drives, "the stop")
+        wait_until(lambda: state.state.arm_answer.stamp_ns == 1, "the answer")
+        assert not state.state.armed and state.state.disarmed_by == safety_rules.ASKED
+        arm(robot)
+        wait_until(lambda: state.state.armed, "the release")
+        robot.drive()
+
+
+def arm(robot: Robot) -> None:
+    robot.link.arm(ArmRequest(time.monotonic_ns(), 2))
+
+
 OWNER = """
 import sys, time
-from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, pose, start_message
+from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, TimedSetpoint, pose, start_message
 link = ControllerLink(start_message(sys.argv[1]), StageStats("motor"), print)
 while True:
     link.send_pose(pose())
-    link.send_setpoint(AHEAD, time.monotonic_ns())
+    link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
     time.sleep(0.05)
 """
 

@@ -18,7 +18,9 @@ from drivers.motor import MotorStatus, VelocityCommand
 from omnid.config import PairConfig
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics
-from omnid.core.control.control_law import ControllerSettings, TimedSetpoint
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
@@ -27,6 +29,7 @@ from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
+from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name
@@ -60,9 +63,7 @@ class Daemon:
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings(), 0.05)
         self.controller_statistics = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(
-            lambda setpoint, arrival_ns: self.controller.set_command(TimedSetpoint(arrival_ns, setpoint)),
-            lambda: self.controller.stop(time.monotonic_ns()), 0.5)
+        self.commands = CommandReceiver(self, 0.5)
         self.report = StatusCollector(
             StatusSources(
                 self.telemetry,
@@ -75,6 +76,15 @@ class Daemon:
                 frozenset({"motor"}),
             )
         )
+
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        self.controller.set_command(command)
+
+    def stop(self) -> None:
+        self.controller.stop(time.monotonic_ns())
+
+    def arm(self, request: ArmRequest) -> None:
+        self.controller.arm(request)
 
     def collected(self) -> dict[str, DiagnosticStatus]:
         """Return all entries by short name, after encoding them."""
@@ -178,16 +188,33 @@ def test_a_stage_has_wall_time_and_processor_time(daemon: Daemon) -> None:
 
 def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
     daemon.pose()
+    daemon.tick()
+    status = daemon.collected()["wheels"]
+    assert (status.level, status.message) == (OK, "not armed since the start")
+    assert status.values["armed"] == "0" and "omnid arm" in status.values["remedy"]
+    request = codec.header_cdr(time.time_ns())
+    daemon.commands.receive("cmd/arm", request)
+    daemon.tick()
+    status = daemon.collected()["wheels"]
+    assert (status.level, status.message) == (OK, "no command")
+    assert (status.values["armed"], status.values["disarmed_by"], status.values["remedy"]) == ("1", "", "")
+    assert status.values["arm_stamp_ns"] == str(codec.stamp_from_cdr(request)) and status.values["arm_refusal"] == ""
     daemon.controller.set_command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
     daemon.tick()
     status = daemon.collected()["wheels"]
-    assert (status.level, status.message) == (OK, "driving") and status.values["sent"] == "1"
+    assert (status.level, status.message) == (OK, "driving") and status.values["sent"] == "3"
+    assert status.values["source"] == "operator"
     assert "capture_to_wheel_p50_ms" in status.values and "tick_late_p99_ms" in status.values
     daemon.pose("lost")
     daemon.tick()
     status = daemon.collected()["wheels"]
     assert (status.level, status.message) == (WARN, "the pose is lost")
     assert status.values["stopped, the pose is lost"] == "1"
+    assert (status.values["disarmed_by"], status.values["source"]) == ("the pose is lost", "")
+    daemon.pose()
+    daemon.tick()
+    status = daemon.collected()["wheels"]
+    assert (status.level, status.message) == (WARN, "not armed: the pose is lost")
     daemon.motor.fault = 7
     daemon.tick()
     status = daemon.collected()["wheels"]

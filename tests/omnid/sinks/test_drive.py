@@ -12,6 +12,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.statistics import ControllerStatistics
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
@@ -34,8 +35,8 @@ class Link:
     def send_pose(self, pose: ControllerPose) -> None:
         self.poses.append(pose)
 
-    def send_setpoint(self, setpoint: Setpoint, arrival_ns: int) -> None:
-        self.setpoints.append((setpoint, arrival_ns))
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        self.setpoints.append((command.setpoint, command.arrival_ns))
 
     def receive_waiting(self) -> None:
         """Nothing waits."""

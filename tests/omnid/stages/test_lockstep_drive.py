@@ -52,7 +52,7 @@ def test_starts_from_a_stop_and_keeps_the_limits() -> None:
 def test_turns_towards_the_heading() -> None:
     command = driven(LockstepDrive(settings(heading_deg=90.0), PERIOD_S, np.eye(4)), 20)[-1]
     assert command.yaw_rate_radps > 0.5 and command.velocity_mps == pytest.approx(0.3)
-    assert command.heading_rad == pytest.approx(math.pi / 2)
+    assert 0.0 < command.heading_rad < math.pi / 2, "for a motor controller that holds headings: ahead, not at once"
 
 
 def test_slows_down_where_the_pose_is_lost_and_drives_on_once_it_is_found() -> None:

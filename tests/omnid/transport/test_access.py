@@ -79,24 +79,27 @@ def test_refuses_connections_without_a_valid_certificate(credentials: Path, name
 def commands_to(config: BusConfig) -> Iterator[list[str]]:
     received: list[str] = []
     with contextlib.closing(Bus(config)) as bus:
-        bus.subscribe_commands(lambda key, _: received.append(key))
+        bus.subscribe_commands(lambda key, *_: received.append(key), {})
         yield received
 
 
 @needs_openssl
-def test_accepts_commands_of_named_certificates_only(credentials: Path) -> None:
+def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials: Path) -> None:
     config = robot(credentials, command_names=("driver",))
     with (commands_to(config) as received, Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest,
           Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver):
         refused, accepted = guest.driver(), driver.driver()
+        wait_until(lambda: refused.stop() is None and bool(received))
+        wait_until(lambda: accepted.arm() > 0 and "cmd/arm" in received)
+        time.sleep(0.3)
+        count = received.count("cmd/arm")
         for _ in range(5):
-            refused.stop()
-        wait_until(lambda: accepted.stop() is None and bool(received))
-        time.sleep(0.2)
-        count = len(received)
-        refused.twist(1.0, 0.0)
-        time.sleep(0.2)
-        assert set(received) == {"cmd/stop"} and len(received) == count
+            refused.twist(1.0, 0.0)
+            refused.heading(1.0, 0.0)
+            refused.arm()
+        guest.driver("planner").twist(1.0, 0.0)
+        time.sleep(0.3)
+        assert set(received) == {"cmd/stop", "cmd/arm"} and received.count("cmd/arm") == count
         assert guest.alive, "a client without the permission to drive can still subscribe"
 
 
@@ -116,9 +119,11 @@ def test_users_need_their_password_and_the_permission_to_drive(tmp_path: Path) -
         time.sleep(0.2)
         count = len(received)
         for _ in range(5):
-            drivers[0].stop()
+            drivers[0].twist(0.1, 0.0)
+            drivers[0].arm()
         time.sleep(0.3)
         assert len(received) == count
+        wait_until(lambda: drivers[0].stop() is None and "cmd/stop" in received)
         with pytest.raises(Unreachable):
             connected("eve")
         with pytest.raises(Unreachable):

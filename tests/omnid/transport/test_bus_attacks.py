@@ -45,7 +45,7 @@ def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:
         intruder.declare_subscriber("omnid/odom", lambda _: received.set())
         bus = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,)))))
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, _: commands.append(key))
+        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
         # A third peer that keeps zenoh's defaults shows that the introduction has taken place.
         other = stack.enter_context(session(listen__endpoints=[control]))
         viewer = stack.enter_context(session(listen__endpoints=[], connect__endpoints=[here, there, control]))
@@ -94,7 +94,7 @@ def test_does_not_collect_large_messages() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, _: commands.append(key))
+        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
         before_mb, halt, most_mb = resident_mb(), threading.Event(), [0]
 
         def watch() -> None:

@@ -10,6 +10,8 @@ import time
 import numpy as np
 import pytest
 
+from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
@@ -24,14 +26,23 @@ class AcceptedCommands:
         self.setpoints: list[Setpoint] = []
         self.arrivals_ns: list[int] = []
         self.stops = 0
-        self.receiver = CommandReceiver(self._add, self._stop, STALE_S, synchronised=synchronised)
+        self.arms: list[ArmRequest] = []
+        self.commands: list[TimedSetpoint] = []
+        self.receiver = CommandReceiver(self, STALE_S, synchronised=synchronised)
 
-    def _add(self, setpoint: Setpoint, arrival_ns: int) -> None:
-        self.setpoints.append(setpoint)
-        self.arrivals_ns.append(arrival_ns)
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        """Keep a setpoint."""
+        self.commands.append(command)
+        self.setpoints.append(command.setpoint)
+        self.arrivals_ns.append(command.arrival_ns)
 
-    def _stop(self) -> None:
+    def stop(self) -> None:
+        """Count a stop."""
         self.stops += 1
+
+    def arm(self, request: ArmRequest) -> None:
+        """Keep a request."""
+        self.arms.append(request)
 
 
 @pytest.fixture
@@ -192,3 +203,72 @@ def test_refuses_messages_of_another_type(accepted: AcceptedCommands) -> None:
     accepted.receiver.receive("cmd/twist", codec.heading_cdr(now_ns(), 0.1, 0.2))
     accepted.receiver.receive("cmd/twist", codec.pose_stamped_cdr(now_ns(), np.eye(4)))
     assert accepted.setpoints == [] and sum(accepted.receiver.refused.values()) == 2
+
+
+def arm(later_s: float = 0.0) -> bytes:
+    return codec.header_cdr(now_ns(later_s))
+
+
+def test_a_request_to_arm_is_validated_like_commands(accepted: AcceptedCommands) -> None:
+    before_ns, receiver = time.monotonic_ns(), accepted.receiver
+    receiver.receive("cmd/arm", payload := arm())
+    assert [request.stamp_ns for request in accepted.arms] == [codec.stamp_from_cdr(payload)]
+    assert before_ns <= accepted.arms[0].arrival_ns <= time.monotonic_ns() and receiver.arms == 1
+    for bad in (b"", arm(-1.0), arm(5.0), b"\xff" * 40, bytes(LONGEST_PAYLOAD + 1), codec.header_cdr(0)):
+        receiver.receive("cmd/arm", bad)
+    assert len(accepted.arms) == 1
+    assert receiver.refused == {"malformed": 2, "too old": 2, "stamp in the future": 1, "too long": 1}
+
+
+def test_a_request_that_was_sent_before_the_stop_and_comes_after_it_is_refused(accepted: AcceptedCommands) -> None:
+    early = arm()
+    accepted.receiver.receive("cmd/stop", b"")
+    accepted.receiver.receive("cmd/arm", early)
+    assert accepted.arms == [] and accepted.receiver.refused == {OLDER_THAN_STOP: 1}
+    accepted.receiver.receive("cmd/arm", arm())
+    assert len(accepted.arms) == 1
+
+
+def test_arming_lets_the_stamps_of_another_clock_begin_again() -> None:
+    """A stamp far in the future would lock its topic until the restart."""
+    accepted = AcceptedCommands(synchronised=False)
+    receiver = accepted.receiver
+    receiver.receive("cmd/twist", codec.twist_stamped_cdr(2**31 * 10**9 - 1, "base_link", 0.3, 0.0))
+    for payload in stream(10**12):
+        receiver.receive("cmd/twist", payload)
+    assert len(accepted.setpoints) == 1 and receiver.refused == {"stamp does not rise": 5}
+    receiver.receive("cmd/arm", codec.header_cdr(10**12))
+    for payload in stream(10**12):
+        receiver.receive("cmd/twist", payload)
+    assert len(accepted.setpoints) == 6 and len(accepted.arms) == 1
+
+
+def test_a_recorded_request_to_arm_of_another_clock_is_refused() -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    for stamp_ns in (10**15, 10**12, 10**12, 10**15):
+        accepted.receiver.receive("cmd/arm", codec.header_cdr(stamp_ns))
+    assert [request.stamp_ns for request in accepted.arms] == [10**15, 10**12], "also of a clock that began again"
+    assert accepted.receiver.refused == {"stamp was used before": 2}
+
+
+def test_the_topic_names_the_source(accepted: AcceptedCommands) -> None:
+    for key in ("cmd/twist", "cmd/operator/twist", "cmd/planner/twist", "cmd/autopilot/twist", "cmd/planner/stop"):
+        accepted.receiver.receive(key, twist(), "somebody")
+    assert [(command.source, command.sender) for command in accepted.commands] == [
+        ("operator", "somebody"), ("operator", "somebody"), ("planner", "somebody")]
+    assert accepted.receiver.refused == {"unknown topic": 2} and accepted.stops == 0
+
+
+def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
+    accepted: AcceptedCommands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop that arrives while the command is decoded voids it."""
+    decoded_ns: list[int] = []
+
+    def decode(payload: bytes) -> codec.TwistRecord:
+        decoded_ns.append(time.monotonic_ns())
+        return codec.twist_from_cdr(payload)
+
+    monkeypatch.setattr("omnid.transport.commands.twist_from_cdr", decode)
+    accepted.receiver.receive("cmd/twist", twist())
+    assert accepted.arrivals_ns[0] < decoded_ns[0]

@@ -20,6 +20,7 @@ from omnid.client import Pose, Robot
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.topics import command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
 ODOMETRY_KEY = ("0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
@@ -37,7 +38,10 @@ TOPICS = {
     "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage", "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",
+    "/omnid/cmd/arm": "std_msgs/msg/Header", "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
+    "/omnid/cmd/planner/heading": "geometry_msgs/msg/Vector3Stamped",
 }
+COMMANDS = command_topics(("planner",))
 
 
 @contextlib.contextmanager
@@ -108,7 +112,7 @@ def tokens(endpoint: str, pattern: str, expected: int) -> set[str]:
 def test_all_topics_are_announced_to_rmw_zenoh() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.subscribe_commands(lambda key, payload: None)
+        bus.subscribe_commands(lambda *_: None, COMMANDS)
         found = [token.split("/") for token in tokens(endpoint, "@ros2_lv/3/**", len(TOPICS) + 1)]
     announced = {parts[9].replace("%", "/"): (parts[5], parts[10]) for parts in found if parts[5] != "NN"}
     assert announced == {topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema))
@@ -121,17 +125,18 @@ def test_receives_a_twist_from_ros() -> None:
     endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.subscribe_commands(lambda key, payload: received.append((key, payload)))
+        bus.subscribe_commands(lambda *message: received.append(message), COMMANDS)
         with client(endpoint) as session:
-            message = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1)
-            wait_until(lambda: session.put(key, message) is None and bool(received))
-    assert received[0] == ("cmd/twist", message)
+            message, gid = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1), bytes(range(16))
+            attachment = ros2.attachment(1, 5, gid)
+            wait_until(lambda: session.put(key, message, attachment=attachment) is None and bool(received))
+    assert received[0] == ("cmd/twist", message, gid.hex())
 
 
 def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="ros2dds"))) as bus, client(endpoint) as session:
-        bus.subscribe_commands(lambda key, payload: None)
+        bus.subscribe_commands(lambda *_: None, COMMANDS)
         found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
         odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
         wait_until(lambda: bus.publish("odom", odometry(1)) is None and bus.publish("/tf", b"tf") is None
@@ -184,7 +189,7 @@ def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
         stack.enter_context(script(ROUTER, endpoint))
         config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh", retry_s=0.5)
         bus = stack.enter_context(contextlib.closing(Bus(config)))
-        bus.subscribe_commands(lambda key, payload: None)
+        bus.subscribe_commands(lambda *_: None, COMMANDS)
         wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})
         (tmp_path / "Odometry.msg").write_text("std_msgs/Header header\nstring child_frame_id\n"
                                                "geometry_msgs/PoseWithCovariance pose\n"

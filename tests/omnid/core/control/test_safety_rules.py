@@ -21,6 +21,8 @@ CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are repor
     safety_rules.OVERLOADED: {"late_s": 0.26},
     safety_rules.POSE_STALE: {"pose_age_s": 0.51},
     safety_rules.POSE_LOST: {"pose_state": "lost"},
+    safety_rules.POSE_JUMPED: {"pose_jumped": True},
+    safety_rules.NOT_ARMED: {"armed": False},
     safety_rules.COMMAND_STALE: {"command_age_s": 0.41},
 }
 
@@ -66,3 +68,18 @@ def test_stops_where_a_stamp_is_in_the_future(name: str) -> None:
     """A camera with wrong stamps must not give a pose that never goes stale."""
     assert reason_for(**{name: -0.001}) == ""
     assert reason_for(**{name: -10.0}) != "" and reason_for(**{name: -math.inf}) != ""
+
+
+def test_the_table_has_every_reason_once() -> None:
+    reasons = [rule.reason for rule in safety_rules.RULES]
+    assert reasons == [*list(CAUSES)[:-1], safety_rules.IDLE, safety_rules.COMMAND_STALE]
+
+
+def test_only_faults_disarm() -> None:
+    """Faults of the robot, not the wishes of its operator."""
+    kept = {safety_rules.ENDS, safety_rules.ASKED, safety_rules.NOT_ARMED, safety_rules.IDLE,
+            safety_rules.COMMAND_STALE}
+    assert {rule.reason for rule in safety_rules.RULES if not rule.disarms} == kept
+    for reason in CAUSES.keys() - kept:
+        everything = replace(GOOD, armed=False, **CAUSES[reason])  # type: ignore[arg-type]
+        assert stop_reason(everything, DEADLINES, safety_rules.FAULTS) == reason

@@ -1,0 +1,91 @@
+"""A controller on a bench: a motor driver that keeps its commands, and a clock that is set by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from drivers.errors import DriverError
+from drivers.motor import MotorStatus, VelocityCommand
+from omnid.controller.controller import Controller
+from omnid.controller.statistics import ControllerStatistics
+from omnid.core.control.arming import AUTOMATIC, ArmRequest
+from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
+from omnid.core.control.control_law import ControllerPose, ControllerSettings
+from omnid.core.control.heading_controller import HeadingLimits, Setpoint
+from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.engine.telemetry import StageStats
+
+PERIOD_S = 0.05
+PERIOD_NS = 50_000_000
+LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
+                       yaw_acceleration_radps2=4.0)
+SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0))
+UNATTENDED = replace(SETTINGS, arming=AUTOMATIC)
+AHEAD = Setpoint(0.3, None, 0.0)
+
+
+class Wheels:
+    """A motor driver that keeps its commands; `silent` and `expired`: behaviour at the next command."""
+
+    def __init__(self) -> None:
+        self.commands: list[VelocityCommand] = []
+        self.silent = self.expired = self.closed = False
+        self.heading_rad = math.nan
+
+    def send(self, command: VelocityCommand) -> MotorStatus:
+        """Keep the command."""
+        if self.silent:
+            raise DriverError("motor on /dev/x gave no answer")
+        self.commands.append(command)
+        return MotorStatus(0.0, self.heading_rad, 0.0, self.expired, 0, math.nan)
+
+    def close(self) -> None:
+        """Note that it was closed."""
+        self.closed = True
+
+
+class Bench:
+    """A controller on a clock that is set by hand."""
+
+    def __init__(self, settings: ControllerSettings = SETTINGS) -> None:
+        self.now_ns = 10**12
+        self.unattended = settings.arming == AUTOMATIC
+        self.wheels = Wheels()
+        self.lines: list[str] = []
+        self.controller = Controller(self.wheels, settings, PERIOD_S, self.lines.append, clock_ns=lambda: self.now_ns)
+        self.statistics = ControllerStatistics(StageStats("motor"))
+
+    @property
+    def last(self) -> VelocityCommand:
+        return self.wheels.commands[-1]
+
+    def send_pose(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
+            age_s: float = 0.0) -> None:
+        self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
+
+    def send_setpoint(self, setpoint: Setpoint = AHEAD, source: str = OPERATOR, sender: str = "") -> None:
+        self.now_ns += 1
+        self.controller.set_command(TimedSetpoint(self.now_ns, setpoint, source, sender))
+
+    def stop(self) -> None:
+        self.controller.stop(self.now_ns)
+
+    def arm(self) -> None:
+        self.now_ns += 1
+        self.controller.arm(ArmRequest(self.now_ns, self.now_ns))
+
+    def tick(self, late_s: float = 0.0) -> None:
+        self.now_ns += PERIOD_NS + round(late_s * 1e9)
+        self.statistics.add(self.controller.tick())
+
+    def drive(self, ticks: int = 20, setpoint: Setpoint = AHEAD) -> None:
+        if not self.unattended:
+            self.send_pose()
+            self.arm()
+            self.tick()
+        for _ in range(ticks):
+            self.send_pose()
+            self.send_setpoint(setpoint)
+            self.tick()

@@ -1,0 +1,194 @@
+"""Arming: stops and faults keep the wheels stopped until a request to arm that came after them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from drivers.motor import is_stop
+from omnid.core.control import safety_rules
+from omnid.core.control.arming import OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
+from tests.omnid.controller.bench import UNATTENDED, Bench
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def driving(bench: Bench) -> Bench:
+    bench.drive()
+    assert bench.last.velocity_mps == 0.3 and bench.controller.state.armed
+    return bench
+
+
+def expect_stand(bench: Bench, ticks: int = 60) -> None:
+    """Expect that poses and commands at every tick move nothing, after the ramp."""
+    for tick in range(ticks):
+        bench.send_pose()
+        bench.send_setpoint()
+        bench.tick()
+        assert tick < 10 or is_stop(bench.last)
+
+
+def fail(bench: Bench) -> None:
+    bench.wheels.silent = True
+    bench.tick()
+    bench.wheels.silent = False
+
+
+def stop_itself(bench: Bench) -> None:
+    bench.wheels.expired = True
+    bench.tick()
+    bench.wheels.expired = False
+
+
+def jump(bench: Bench) -> None:
+    bench.send_pose(1.5)
+    bench.tick()
+    bench.controller.set_pose(bench.controller._law.pose._replace(heading_rad=0.0, yaw_rate_radps=0.0))  # type: ignore
+
+
+FAULTS: dict[str, Callable[[Bench], None]] = {
+    safety_rules.FAILED: fail,
+    safety_rules.STOPPED: stop_itself,
+    safety_rules.OVERLOADED: lambda bench: bench.tick(late_s=0.26),
+    safety_rules.POSE_STALE: lambda bench: (bench.send_pose(age_s=1.0), bench.tick())[0],
+    safety_rules.POSE_LOST: lambda bench: (bench.send_pose(state="lost"), bench.tick())[0],
+    safety_rules.POSE_JUMPED: jump,
+}
+
+
+def test_every_fault_of_the_table_is_tested() -> None:
+    assert set(FAULTS) == {rule.reason for rule in safety_rules.FAULTS}
+
+
+def test_is_disarmed_at_the_start(bench: Bench) -> None:
+    expect_stand(bench)
+    assert bench.controller.state.reason == safety_rules.NOT_ARMED
+    assert bench.controller.state.disarmed_by == STARTED and bench.controller.state.needs_request
+    bench.drive()
+    assert bench.last.velocity_mps == 0.3 and bench.controller.state.disarmed_by == ""
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_a_fault_that_has_passed_keeps_the_wheels_stopped(driving: Bench, reason: str) -> None:
+    FAULTS[reason](driving)
+    expect_stand(driving)
+    state = driving.controller.state
+    assert state.stops == {reason: 1} and state.disarmed_by == reason and state.needs_request
+    assert f"the wheels stop: {reason}; they stay stopped until cmd/arm (`omnid arm`)" in driving.lines
+    driving.drive()
+    assert driving.last.velocity_mps == 0.3
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_without_an_operator_a_fault_that_has_passed_is_over(reason: str) -> None:
+    bench = Bench(UNATTENDED)
+    bench.drive()
+    FAULTS[reason](bench)
+    bench.drive(40)
+    assert bench.last.velocity_mps == 0.3 and bench.controller.state.stops == {reason: 1}
+    assert not any("cmd/arm" in line for line in bench.lines)
+
+
+@pytest.mark.parametrize("settings", ["manual", "automatic"])
+def test_a_stop_latches_in_both_modes(settings: str) -> None:
+    bench = Bench(UNATTENDED) if settings == "automatic" else Bench()
+    bench.drive()
+    bench.stop()
+    expect_stand(bench)
+    assert bench.controller.state.reason == safety_rules.ASKED and bench.controller.state.needs_request
+    bench.arm()
+    bench.drive()
+    assert bench.last.velocity_mps == 0.3
+
+
+def test_a_released_stick_does_not_disarm(driving: Bench) -> None:
+    for _ in range(40):
+        driving.send_pose()
+        driving.tick()
+    assert is_stop(driving.last) and driving.controller.state.armed
+    driving.send_setpoint()
+    driving.tick()
+    assert driving.last.velocity_mps > 0.0
+
+
+def test_a_request_that_arrived_before_the_stop_releases_nothing(driving: Bench) -> None:
+    """In either order of their delivery, and at the same instant."""
+    early = ArmRequest(driving.now_ns, 1)
+    driving.now_ns += 1000
+    driving.stop()
+    driving.controller.arm(early)
+    expect_stand(driving)
+    assert driving.controller.state.arm_answer.refusal == OLDER_THAN_STOP
+    driving.now_ns += 1
+    driving.controller.arm(ArmRequest(driving.now_ns, 2))
+    driving.now_ns += 1
+    driving.stop()
+    expect_stand(driving)
+    driving.controller.stop(driving.now_ns)
+    driving.controller.arm(ArmRequest(driving.now_ns, 3))
+    expect_stand(driving)
+    assert driving.controller.state.arm_answer == (3, OLDER_THAN_STOP)
+    assert driving.lines.count(f"arming is refused: {OLDER_THAN_STOP}") == 1, "a repeated refusal is one line"
+
+
+def test_a_stop_that_is_repeated_after_its_release_changes_nothing(driving: Bench) -> None:
+    """Every message to the process carries the newest stop."""
+    asked_ns = driving.now_ns
+    driving.stop()
+    driving.tick()
+    driving.drive()
+    driving.controller.stop(asked_ns)
+    driving.tick()
+    assert driving.last.velocity_mps == 0.3 and driving.controller.state.armed
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_refuses_to_arm_while_a_fault_holds(bench: Bench, reason: str) -> None:
+    bench.send_pose()
+    bench.tick()
+    if reason in (safety_rules.FAILED, safety_rules.STOPPED):  # known after the answer of the motor controller
+        FAULTS[reason](bench)
+        bench.send_pose()
+        bench.arm()
+        bench.tick()
+    else:
+        bench.arm()
+        FAULTS[reason](bench)
+    assert bench.controller.state.arm_answer.refusal == reason and not bench.controller.state.armed
+    expect_stand(bench)
+
+
+def test_refuses_a_request_that_was_handled_late(bench: Bench) -> None:
+    """The process got no processor for seconds."""
+    bench.arm()
+    bench.now_ns += 10**9
+    bench.send_pose()
+    bench.controller._due_ns = 0  # the tick itself is in time
+    bench.tick()
+    assert bench.controller.state.arm_answer.refusal == TOO_LATE
+    expect_stand(bench)
+
+
+def test_commands_from_before_the_arming_are_void(bench: Bench) -> None:
+    bench.send_setpoint()
+    bench.send_pose()
+    bench.arm()
+    bench.tick()
+    assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.IDLE
+    bench.send_setpoint()
+    bench.tick()
+    assert bench.last.velocity_mps > 0.0
+
+
+def test_to_arm_twice_changes_nothing(driving: Bench) -> None:
+    before = driving.last.velocity_mps
+    driving.arm()
+    driving.send_pose()
+    driving.send_setpoint()
+    driving.tick()
+    assert driving.last.velocity_mps == before == 0.3

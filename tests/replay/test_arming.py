@@ -1,0 +1,63 @@
+"""`omnid arm` and `omnid stop` from a second process: a robot in front of a sender that never pauses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from omnid.core.control.safety_rules import FAILED
+from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
+
+MANUAL = ("--set", "controller.arming=manual")
+WATCH_S = 1.0  # during which nothing may move
+
+
+def omnid(daemon: Daemon, command: str, *words: str) -> tuple[int, str]:
+    """Run a command on this robot; return the exit code and its output."""
+    line = [sys.executable, "-m", "omnid", command, "--connect", f"tcp/127.0.0.1:{daemon.port}", *words]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stdout + done.stderr
+
+
+def expect_stand(operator: Operator, base: Base) -> None:
+    """Expect that the wheels come to a stop and that the operator, who sends at 20 Hz, does not move them."""
+    wait_until(lambda: not base.drives, "the stop")
+    since_s, before = time.monotonic(), int(operator.values("wheels")["commands"])
+    time.sleep(WATCH_S)
+    wait_until(lambda: int(operator.values("wheels")["commands"]) > before + 5, "commands")
+    assert not base.line.moved_since(since_s)
+
+
+def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, scene: Path) -> None:
+    with robot(scene, tmp_path, *MANUAL) as (daemon, operator, base):
+        operator.drive(0.3)
+        expect_stand(operator, base)
+        assert operator.message("wheels") == "not armed since the start"
+        assert omnid(daemon, "arm") == (0, "omnid is armed: it obeys commands from now on\n")
+        wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
+        assert omnid(daemon, "stop") == (0, "omnid stops: its wheels stay stopped until `omnid arm`\n")
+        expect_stand(operator, base)
+        assert omnid(daemon, "arm")[0] == 0
+        wait_until(lambda: base.drives, "motion after the release")
+        base.unplug()
+        wait_until(lambda: operator.message("wheels") == FAILED, "the fault")
+        code, text = omnid(daemon, "arm")
+        assert (code, text) == (1, f"omnid refuses: {FAILED}\n")
+        base.plug_in()
+        wait_until(lambda: operator.message("wheels") == f"not armed: {FAILED}", "the end of the fault")
+        expect_stand(operator, base)
+        assert omnid(daemon, "arm")[0] == 0
+        wait_until(lambda: base.drives, "motion after the fault")
+        code, err = daemon.end()
+        assert code == 0 and f"the wheels stop: {FAILED}; they stay stopped until cmd/arm (`omnid arm`)" in err
+
+
+def test_without_a_robot_the_error_says_what_to_do(scene: Path) -> None:
+    for command in ("arm", "stop"):
+        line = [sys.executable, "-m", "omnid", command, "--connect", f"tcp/127.0.0.1:{free_port()}"]
+        done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr.startswith("omnid: bus cannot reach ") and done.stderr.count("\n") == 1
