@@ -76,6 +76,8 @@ class PairConfig:
     """Synchronisation of the cameras."""
 
     tolerance_ms: float = knob(10.0, "largest difference between the stamps of a pair, ms", low=0, high=1000)
+    repeated_images: str = knob("drop", "images with all pixels as before, which a frozen camera delivers; 'use' only "
+                                "for simulators without noise", choices=("drop", "use"))
 
 
 @dataclass(frozen=True, slots=True)

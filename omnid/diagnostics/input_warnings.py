@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 from omnid.config import PairConfig
 from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.stages.repeated_images import FROZEN_IMAGES
 from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
+
+REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
+                   "use": "they were used, as pair.repeated_images says"}
 
 
 def input_warnings(
@@ -24,6 +29,10 @@ def input_warnings(
         closest_ms = pairing.closest_miss_ms or 0.0
         yield (f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
                f"pair.tolerance_ms is {config.tolerance_ms:g}; if no images are missing, synchronise the cameras")
+    for camera, images in pairing.repeated.items():
+        if images.longest >= FROZEN_IMAGES:
+            yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
+                   f"{images.longest} in a row; {REPEATED[config.repeated_images]}")
     if stereo.exchanged:
         yield ("the images match better the other way round: is --lower the lower camera, and is the rig that of "
                "these cameras?")

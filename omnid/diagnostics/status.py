@@ -110,6 +110,9 @@ class StatusCollector:
             return f"no images of the {' and the '.join(missing)} camera"
         if broken_hz > 0:
             return f"images cannot be decoded; the first: {pair.fault}"
+        if pair.frozen:
+            return f"the images of the {' and the '.join(pair.frozen)} camera are frozen: all pixels are as before; " \
+                   "check the camera and its driver"
         if rate_hz == 0:
             return "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
         if abs(pair.skew.drift_ns) > MAX_SKEW_DRIFT_NS:

@@ -52,7 +52,7 @@ class RunReport:
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""
         drops = {name: self._reader.counts[name] for name in READER_DROPS}
-        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith("unpaired")}
+        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith(("unpaired", "repeated"))}
         drops["broken"] += self._pairing.counts["broken"]
         drops["queue"] = self._session.dropped_messages()
         return drops

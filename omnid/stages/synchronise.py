@@ -10,6 +10,7 @@ from drivers.frame import Camera, Frame
 from omnid.config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.decoder import Decoder, Image
+from omnid.stages.repeated_images import RepeatedImages
 
 MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
 SKEW_GAIN = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
@@ -105,12 +106,17 @@ class Synchronise:
     that of its own: the first is a case of the second. Images are decoded once they have a partner, so that a camera
     without the other one costs no time. A frame that cannot be decoded counts as `broken` and is treated as if it
     had never come; one that never finds a partner is not decoded and counts as unpaired.
+
+    A pair with an image that repeats an earlier one of its camera is no new evidence: it is counted and not returned,
+    unless pair.repeated_images is "use".
     """
 
     def __init__(self, rig: Rig, config: PairConfig) -> None:
         self._decode = Decoder(rig)
         self._matcher = FrameMatcher(round(config.tolerance_ms * 1e6))
         self._pairs = 0
+        self._use_repeated = config.repeated_images == "use"
+        self.repeated: dict[Camera, RepeatedImages] = {"lower": RepeatedImages(), "upper": RepeatedImages()}
         self.skew = Skew()
         self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
 
@@ -132,13 +138,19 @@ class Synchronise:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pairs made, frames of either camera without a partner, images that could not be decoded."""
+        """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
         unpaired = self._matcher.unpaired
         return {"pairs": self._pairs, "unpaired_lower": unpaired["lower"], "unpaired_upper": unpaired["upper"],
-                "broken": self._decode.broken}
+                "broken": self._decode.broken, "repeated_lower": self.repeated["lower"].count,
+                "repeated_upper": self.repeated["upper"].count}
+
+    @property
+    def frozen(self) -> list[Camera]:
+        """The cameras whose newest images are repeated ones."""
+        return [camera for camera, images in self.repeated.items() if images.frozen]
 
     def process(self, frame: Frame) -> FramePair | None:
-        """Return the pair that this frame completes; None where the frame waits or is broken."""
+        """Return the pair that this frame completes; None where the frame waits, is broken or shows nothing new."""
         self.newest_ns[frame.camera] = frame.stamp_ns
         image: Image | None = None
         while (partner := self._matcher.partner(frame)) is not None:
@@ -158,10 +170,13 @@ class Synchronise:
         self._matcher.drain()
         return ()
 
-    def _joined(self, pair: dict[Camera, tuple[Frame, Image]]) -> FramePair:
+    def _joined(self, pair: dict[Camera, tuple[Frame, Image]]) -> FramePair | None:
         (lower, lower_image), (upper, upper_image) = pair["lower"], pair["upper"]
         self._matcher.join(lower, upper)
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
+        repeated = [self.repeated[camera].add(image) for camera, (_, image) in pair.items()]
+        if any(repeated) and not self._use_repeated:
+            return None
         seq = self._pairs
         self._pairs += 1
         return FramePair(seq, lower.stamp_ns, lower_image, upper_image)

@@ -30,7 +30,7 @@ def rig() -> Rig:
 
 @pytest.fixture
 def pair(rig: Rig) -> Synchronise:
-    return Synchronise(rig, PairConfig(tolerance_ms=10.0))
+    return Synchronise(rig, PairConfig(tolerance_ms=10.0, repeated_images="use"))
 
 
 def shot(camera: Camera, index: int, skew_ns: int = 0, data: bytes = JPEG) -> Frame:
