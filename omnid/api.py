@@ -29,6 +29,7 @@ from omnid.settings import dump, parse
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.odometry import OdometryStage
+from omnid.stages.rig_gate import RigGate
 from omnid.stages.stereo import Stereo
 
 FilePath: TypeAlias = str | PathLike[str]
@@ -97,7 +98,8 @@ class Odometry:
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
             self._dewarp = Dewarp(place, settings.panorama)
-            self._stereo = Stereo(place, settings.stereo_settings())
+            gate = RigGate(place.cylinder, settings.stereo.rig_check)
+            self._stereo = Stereo(place, settings.stereo_settings(), gate)
             self._odometry = OdometryStage(place, settings.odometry)
         self.rig = place.rig  # with the masks that were found
         self._pairs = 0
@@ -113,7 +115,8 @@ class Odometry:
         `depth.panoramas.lower.panorama` and `.upper.panorama` (H, W) uint8.
 
         Raises OmnidError for an image of another type or size than the rig's, and for a stamp that is not later than
-        the previous one; such a pair changes nothing.
+        the previous one; such a pair changes nothing. Also raises it where one of the first pairs shows that the images
+        cannot be of this rig, unless stereo.rig_check says otherwise.
         """
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))

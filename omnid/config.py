@@ -97,6 +97,8 @@ class StereoConfig:
 
     min_range_m: float = knob(0.65, "distance of the nearest points from the rig's axis, m", low=0.01, high=100)
     noise_px: float = knob(0.5, "sigma of a disparity, px: sets the weight of a point in the map", low=0.01, high=10)
+    rig_check: str = knob("refuse", "if the first images contradict the rig: end with an error, warn only, or do not "
+                          "check", choices=("refuse", "warn", "off"))
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 

@@ -47,6 +47,7 @@ class StereoDepth:
     pixels: Array  # (N, 2) column, row of the matched pixels
     points: Array  # (N, 3) m, in the rig frame
     variance_m2: Array  # (N,) along the ray, where it is largest
+    rig_fits: bool = True  # False: the images contradict the rig, so that no result of them is better than degraded
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -117,7 +117,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame "
         "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.odometry "
-        "omnid.core.odometry.paper omnid.core.places omnid.core.stereo omnid.errors omnid.messages "
+        "omnid.core.odometry.paper omnid.core.places omnid.core.rig omnid.core.stereo omnid.errors omnid.messages "
         "omnid.tracking_state",
     "omnid.tracking_state": "",
     "omnid.transport":

@@ -31,6 +31,7 @@ from omnid.messages import OdometryUpdate
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.odometry import OdometryStage
+from omnid.stages.rig_gate import RigGate
 from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
@@ -232,15 +233,15 @@ def _keyframes(updates: Iterator[OdometryUpdate], apart: int) -> Iterator[Odomet
 def _updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> Iterator[OdometryUpdate]:
     """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
     pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
-    stereo, odometry = Stereo(place, config.stereo), OdometryStage(place, config.odometry)
+    gate = RigGate(place.cylinder, "warn")
+    stereo, odometry = Stereo(place, config.stereo, gate), OdometryStage(place, config.odometry)
     states: Counter[TrackingState] = Counter()
     for pair in filter(None, map(pairing.process, reader.frames())):
         update = odometry.process(stereo.process(dewarp.process(pair)))
         states[update.state] += 1
         yield update
-    if stereo.exchanged:
-        raise OmnidError(f"{log}: the images match better the other way round: is --lower the lower camera, and is the "
-                         "rig that of these cameras?")
+    if gate.exchanged:
+        raise OmnidError(f"{log}: {gate.warning}")
     if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
         raise OmnidError(f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
                          "rig; start from one that is nearer to the truth, or take a drive where there is more to see")

@@ -8,7 +8,7 @@ from typing import Final
 from omnid.config import PairConfig
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.stages.repeated_images import FROZEN_IMAGES
-from omnid.stages.stereo import Stereo
+from omnid.stages.rig_gate import RigGate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -17,7 +17,7 @@ REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise
 
 
 def input_warnings(
-    pairing: Synchronise, stereo: Stereo, statistics: RunStatistics, config: PairConfig
+    pairing: Synchronise, rig_gate: RigGate, statistics: RunStatistics, config: PairConfig
 ) -> Iterator[str]:
     """Return one line for each problem of the input."""
     counts = pairing.counts
@@ -33,9 +33,8 @@ def input_warnings(
         if images.longest >= FROZEN_IMAGES:
             yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
                    f"{images.longest} in a row; {REPEATED[config.repeated_images]}")
-    if stereo.exchanged:
-        yield ("the images match better the other way round: is --lower the lower camera, and is the rig that of "
-               "these cameras?")
+    if rig_gate.warning:
+        yield rig_gate.warning
     lost = statistics.states[TrackingState.LOST]
     if lost > statistics.poses / 2:
         yield (f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "

@@ -9,21 +9,24 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.rig.rig_check import Matches, RigCondition, RigFinding, judge, match, together
+from omnid.core.rig.rig_check import BROKEN_DEG, Matches, RigCondition, RigFinding, judge, match, together
 from omnid.messages import Panoramas
+from omnid.stages.rig_gate import RigGate
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
-from omnid.transport.status_names import RIG
+from omnid.transport.status_names import RIG, RIG_AT_START
 
 Array = NDArray[np.float64]
 
 VIEWS = 16  # views that are kept, and new views after which the rig is checked again
 MIN_PLACES = 6  # fewer different views are not enough for a check
+RECENT_VIEWS = 3  # views that show alone that the rig is broken: a mirror was knocked
 MIN_CORRELATION = 0.8  # of the thumbnails of two views of one place: some 15 cm of a corridor
 THUMBNAIL = (128, 24)  # columns, rows
 LEVELS: dict[RigCondition, int] = {"good": OK, "unknown": OK, "drifted": WARN, "broken": ERROR}
@@ -62,6 +65,11 @@ class RigMonitor:
         """The newest finding; None before the first."""
         return self._found[0] if self._found else None
 
+    @property
+    def contradicted(self) -> bool:
+        """True if the newest finding is that the rig is broken."""
+        return self.finding is not None and self.finding.condition == "broken"
+
     def process(self, panoramas: Panoramas) -> None:
         """Use a pair if it is due, and check the rig when there are enough new views."""
         self._newest_ns = panoramas.stamp_ns
@@ -70,6 +78,7 @@ class RigMonitor:
         self._used_ns = panoramas.stamp_ns
         if self._add_view(panoramas):
             self._new += 1
+            self._look_at_recent(panoramas.stamp_ns)
         if self._new >= VIEWS and len(self._views) >= MIN_PLACES:
             self._found = judge(together(view.matches for view in self._views), self._cylinder), panoramas.stamp_ns
             self._new = 0
@@ -85,6 +94,14 @@ class RigMonitor:
         self._views.append(_View(thumbnail, match(panoramas.lower, panoramas.upper, panoramas.visible)))
         return True
 
+    def _look_at_recent(self, stamp_ns: int) -> None:
+        """Report a rig that the newest views contradict at once, without waiting for all VIEWS."""
+        if len(self._views) < RECENT_VIEWS:
+            return
+        finding = judge(together(view.matches for view in islice(reversed(self._views), RECENT_VIEWS)), self._cylinder)
+        if finding.misfit_deg > BROKEN_DEG:
+            self._found = finding, stamp_ns
+
     def status(self) -> DiagnosticStatus:
         """Return the newest finding as a status; age_s is the time since then, by the stamps."""
         values = {"new_views": str(self._new), "needed_views": str(VIEWS)}
@@ -96,6 +113,17 @@ class RigMonitor:
                    "matches": str(finding.matches), "tried": str(finding.tried),
                    "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
         return DiagnosticStatus(RIG, LEVELS[finding.condition], ADVICE[finding.condition], values)
+
+
+def start_status(gate: RigGate) -> DiagnosticStatus:
+    """Return what the first images say about the rig."""
+    finding = gate.finding
+    if finding is None:
+        return DiagnosticStatus(RIG_AT_START, OK, "not checked yet", {})
+    values = {"condition": finding.condition, "turn_deg": f"{finding.straight.turn_deg:.3f}",
+              "matches": str(finding.straight.matches), "exchanged_matches": str(finding.exchanged_matches)}
+    level = ERROR if gate.contradicted else WARN if gate.warning else OK
+    return DiagnosticStatus(RIG_AT_START, level, gate.warning or "good", values)
 
 
 def _thumbnail(panoramas: Panoramas) -> Array:

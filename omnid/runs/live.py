@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
@@ -19,7 +20,7 @@ from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.diagnostics.latency import Latency
-from omnid.diagnostics.rig_monitor import RigMonitor
+from omnid.diagnostics.rig_monitor import RigMonitor, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
@@ -36,6 +37,7 @@ from omnid.sinks.drive import LiveDrive
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry
+from omnid.stages.rig_gate import never
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
@@ -124,9 +126,10 @@ class LiveRun:
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
-                      rig_monitor=rig_monitor, map_every_s=config.live.cloud_s, recorder=recorder,
+                      rig_monitor=rig_monitor, rig_broken=_broken(rig_monitor),
+                      map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
-        wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
+        stages = wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
         commands = self._commands(session, bus, controller, recorder) if controller else None
         sources = StatusSources(
             graph.telemetry,
@@ -137,7 +140,7 @@ class LiveRun:
             controller.statistics if controller else None,
             commands,
             TICKERS,
-            tuple(part.status for part in (bus, recorder, rig_monitor) if part),
+            (partial(start_status, stages.rig_gate), *(part.status for part in (bus, recorder, rig_monitor) if part)),
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
 
@@ -171,6 +174,11 @@ class LiveRun:
 
         bus.subscribe_commands(receive, topics)
         return commands
+
+
+def _broken(monitor: RigMonitor | None) -> Callable[[], bool]:
+    """Return a function that is True while the monitor finds the rig broken."""
+    return never if monitor is None else lambda: monitor.contradicted
 
 
 def _status_on_bus(bus: Bus) -> StatusPublisher:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping
 from omnid.stages.odometry import OdometryStage
+from omnid.stages.rig_gate import RigGate, never
 from omnid.stages.stereo import Stereo
 
 
@@ -31,6 +33,7 @@ class Sinks:
     live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
     replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
     rig_monitor: Sink[Panoramas] | None = None
+    rig_broken: Callable[[], bool] = never  # what the rig monitor has found
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     recorded_frames: tuple[Stream[Frame], ...] = ()
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
@@ -39,13 +42,14 @@ class Sinks:
 class WiredStages(NamedTuple):
     """The stages that are asked for counts and warnings at the end of a run."""
 
-    stereo: Stereo
+    rig_gate: RigGate
     mapping: Mapping | None
 
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
-    stereo = Stereo(geometry, config.stereo_settings())
+    rig_gate = RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
+    stereo = Stereo(geometry, config.stereo_settings(), rig_gate)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
@@ -66,7 +70,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(stereo, mapping)
+    return WiredStages(rig_gate, mapping)
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

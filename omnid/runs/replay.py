@@ -37,6 +37,7 @@ from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs
 from omnid.sinks.pose_collector import PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.geometry import Geometry
+from omnid.stages.rig_gate import RigContradictedError
 from omnid.stages.synchronise import Synchronise
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
@@ -120,7 +121,7 @@ class _Replay:
                 with session.signals(self._on_signal):
                     graph.run()
             except (OmnidError, DriverError) as error:
-                if not session.statistics.poses:
+                if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
                 raise RunFailedError(str(error), self._result(session, result)) from error
             return self._result(session, result)

@@ -17,6 +17,7 @@ from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import DiagnosticStatus
 
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
+PAIRING_DROPS: Final = ("unpaired", "repeated")  # begin the names of its counts
 BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
 
 
@@ -42,7 +43,7 @@ class RunReport:
         yield from self._reader.warnings
         statistics = self._session.statistics
         if statistics.poses or not self._session.signal:
-            yield from input_warnings(self._pairing, self._stages.stereo, statistics, self._session.config.pair)
+            yield from input_warnings(self._pairing, self._stages.rig_gate, statistics, self._session.config.pair)
 
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
@@ -52,7 +53,7 @@ class RunReport:
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""
         drops = {name: self._reader.counts[name] for name in READER_DROPS}
-        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith(("unpaired", "repeated"))}
+        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith(PAIRING_DROPS)}
         drops["broken"] += self._pairing.counts["broken"]
         drops["queue"] = self._session.dropped_messages()
         return drops

@@ -15,6 +15,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.geometry import Geometry
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
@@ -47,12 +48,18 @@ class OdometryStage:
         velocity = self._to_rig @ estimate.velocity
         return OdometryUpdate(
             depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity, self._in_rig(estimate.velocity_covariance),
-            estimate.state, estimate.resets, estimate.inliers, estimate.tracked, depth, estimate.features,
+            _state(estimate.state, depth), estimate.resets, estimate.inliers, estimate.tracked, depth,
+            estimate.features,
         )
 
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""
         return np.asarray(self._to_rig @ covariance @ self._to_rig.T)
+
+
+def _state(state: TrackingState, depth: StereoDepth) -> TrackingState:
+    """Return the state of a pose, which is at best DEGRADED where the images contradict the rig."""
+    return TrackingState.DEGRADED if state is TrackingState.TRACKING and not depth.rig_fits else state
 
 
 def in_axes(T_a_b: Array, covariance: Array) -> Array:

@@ -15,11 +15,10 @@ from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import Panoramas, StereoDepth
 from omnid.stages.geometry import Geometry
+from omnid.stages.rig_gate import RigGate
 
 Array = NDArray[np.float64]
 
-EXCHANGE_PAIRS = 2  # first pairs that are also matched with the cameras exchanged
-MIN_EXCHANGED_POINTS = 200  # of these pairs, for the warning
 DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
 SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 
@@ -27,26 +26,19 @@ SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 class Stereo:
     """Computes disparities and points of the edges of the lower panorama."""
 
-    def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
+    def __init__(self, geometry: Geometry, config: StereoConfig, rig_gate: RigGate | None = None) -> None:
+        """rig_gate: sees all panoramas first, and raises OmnidError where they contradict the rig."""
         self._geometry, self._config = geometry, config
         self._T_rig_rect = geometry.T_rig_rect
         self._matcher: Matcher | None = None
-        self._compared = self._points = self._exchanged_points = 0
-
-    @property
-    def exchanged(self) -> bool:
-        """True if more points of the first pairs match with the cameras exchanged: they are likely confused.
-
-        With a disparity of the wrong sign there is no true match, but repeated textures give false ones. In rendered
-        rooms, exchanging gives 0.1 to 0.8 times as many points with a right rig, 1.1 to 3.6 times with a wrong one.
-        """
-        return self._exchanged_points > max(MIN_EXCHANGED_POINTS, self._points)
+        self._rig_gate = rig_gate
 
     def process(self, panoramas: Panoramas) -> StereoDepth:
         """Return disparities and their points in the rig frame."""
+        gate = self._rig_gate
+        if gate is not None:
+            gate.process(panoramas)
         columns, rows, found = self._match(panoramas)
-        if self._compared < EXCHANGE_PAIRS:
-            self._match_exchanged(panoramas, len(found))
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = found
         views = np.column_stack([columns, rows, rows + found]).astype(float)
@@ -55,7 +47,8 @@ class Stereo:
         variance_m2 = self._variance_m2(points[kept])
         points = se3.apply(self._T_rig_rect, points[kept])
         return StereoDepth(
-            panoramas.seq, panoramas.stamp_ns, panoramas, disparity, views[kept, :2], points, variance_m2
+            panoramas.seq, panoramas.stamp_ns, panoramas, disparity, views[kept, :2], points, variance_m2,
+            rig_fits=gate is None or not gate.doubtful,
         )
 
     def _match(self, panoramas: Panoramas) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
@@ -67,11 +60,6 @@ class Stereo:
         pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
-
-    def _match_exchanged(self, panoramas: Panoramas, points: int) -> None:
-        self._compared += 1
-        self._points += points
-        self._exchanged_points += len(self._match(replace(panoramas, lower=panoramas.upper, upper=panoramas.lower))[0])
 
     def _variance_m2(self, points: Array) -> Array:
         """Return variances (N,) along the rays to points (N, 3) in the rectified frame.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,45 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
 from tests.replay.command import Command
 from tests.replay.edited import dark, images, save
+from tests.simulation.rigs import with_upper_rotated
+
+EXCHANGED = ("--lower", UPPER, "--upper", LOWER)
 
 
-def test_warns_of_exchanged_cameras(omnid: Command, scene: Path) -> None:
+def test_refuses_exchanged_cameras(omnid: Command, scene: Path) -> None:
     right = omnid.replay(scene / "log.mcap", rig=scene / "rig.toml")
-    wrong = omnid.replay(scene / "log.mcap", "--lower", UPPER, "--upper", LOWER, rig=scene / "rig.toml")
     assert right.code == 0 and right.err == ""
-    assert "the other way round" in wrong.err and "--lower" in wrong.err
+    for words in ((), ("--inline",)):
+        wrong = omnid.replay(scene / "log.mcap", *EXCHANGED, *words, rig=scene / "rig.toml")
+        assert wrong.code == 2 and wrong.out == "" and wrong.err.count("\n") == 1
+        assert "the other way round" in wrong.err and "--lower" in wrong.err
+
+
+def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    for turn_deg in ((3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (0.0, 0.0, 3.0)):
+        write_rig(tmp_path / "rig.toml", with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg))
+        err = omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet")
+        assert "turned by 3.0 deg" in err or "turned by 2.9 deg" in err
+        assert "omnid calibrate check" in err
+
+
+def test_a_refused_rig_may_be_a_warning(omnid: Command, scene: Path) -> None:
+    words = (*EXCHANGED, "--set", "stereo.rig_check=warn", "--inline")
+    wrong = omnid.replay(scene / "log.mcap", *words, rig=scene / "rig.toml")
+    assert wrong.code < 2 and "warning: the images match better the other way round" in wrong.err
+    states = re.search(r"states +tracking ([0-9.]+)%", wrong.out)
+    assert states and float(states[1]) < 20, "only the pairs before the decision may count as tracking"
+
+
+def test_a_rig_that_cannot_be_checked_is_a_warning(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """Darkness decides nothing; light later does."""
+    taken = images(scene / "log.mcap")
+    assert "could not be checked" in omnid.replay(save(tmp_path / "a.mcap", map(dark, taken)),
+                                                  rig=scene / "rig.toml").err
+    later = save(tmp_path / "b.mcap", (dark(p) if p.pair < PAIRS // 2 else p for p in taken))
+    assert "could not be checked" not in omnid.replay(later, rig=scene / "rig.toml").err
+    wrong = omnid.replay(later, *EXCHANGED, rig=scene / "rig.toml")
+    assert wrong.code == 2 and wrong.err.count("\n") == 1 and "the other way round" in wrong.err
 
 
 def test_the_topics_of_an_inverted_rig_are_used(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -80,6 +80,11 @@ class RigFinding:
         return float(np.rad2deg(np.linalg.norm(self.drift.turn))) if self.drift else float("nan")
 
     @property
+    def misfit_deg(self) -> float:
+        """Rotation, or part of the shift, less SIGMAS standard deviations, in degrees; 0 where it is unknown."""
+        return 0.0 if self.drift is None else _misfit_deg(self.drift)
+
+    @property
     def summary(self) -> str:
         """Summary in one line."""
         if self.drift is None:
@@ -172,12 +177,16 @@ def _condition(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) 
         return "broken"
     if drift is None:
         return "unknown"
-    turn, shift = np.rad2deg(np.linalg.norm(drift.turn)), np.rad2deg(np.linalg.norm(drift.shift))
-    unsure = np.rad2deg(SIGMAS * np.array([np.linalg.norm(drift.turn_sigma), np.linalg.norm(drift.shift_sigma)]))
-    worst = max(max(0.0, turn - unsure[0]), SHIFT_WEIGHT * max(0.0, shift - unsure[1]))
+    worst = _misfit_deg(drift)
     if worst > BROKEN_DEG:
         return "broken"
     return "drifted" if worst > DRIFTED_DEG or left_px > DRIFTED_PX else "good"
+
+
+def _misfit_deg(drift: RigDrift) -> float:
+    turn, shift = np.rad2deg(np.linalg.norm(drift.turn)), np.rad2deg(np.linalg.norm(drift.shift))
+    unsure = np.rad2deg(SIGMAS * np.array([np.linalg.norm(drift.turn_sigma), np.linalg.norm(drift.shift_sigma)]))
+    return float(max(max(0.0, turn - unsure[0]), SHIFT_WEIGHT * max(0.0, shift - unsure[1])))
 
 
 def _by_azimuth(lower: Array, aside: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
