@@ -2,7 +2,7 @@
 
     upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
     lower cut       halves of JPEGs           both frozen     the same image again and again
-    both ok         no fault
+    lower glitch    every fourth image is the one before      both ok         no fault
     clock 3600      the system clock is that many seconds ahead
 """
 
@@ -36,7 +36,8 @@ class FaultyCamera(LogCamera):
         super().__init__(images, camera, clock)
         self._camera, self._faults = camera, faults
         first = gray((images.lower if camera == "lower" else images.upper)[0][1])
-        self._black = cv2.imencode(".jpg", np.zeros_like(first))[1].tobytes()
+        self._size, self._dark = first.shape, np.random.default_rng(len(camera))
+        self._frames_since_repeated = 0
         self._last = b""  # image without a fault
         self._rng = random.Random(1)
 
@@ -54,9 +55,14 @@ class FaultyCamera(LogCamera):
             case "cut":
                 return data[: len(data) // 2]
             case "black":
-                return self._black
+                noise = self._dark.integers(0, 4, self._size, np.uint8)
+                return cv2.imencode(".jpg", noise)[1].tobytes()
             case "frozen":
                 return self._last
+            case "glitch":
+                self._frames_since_repeated = (self._frames_since_repeated + 1) % 4
+                if not self._frames_since_repeated:
+                    return self._last
         self._last = data
         return data
 

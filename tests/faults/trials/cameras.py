@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from omnid.transport.status_names import STOPPED_PREFIX
 from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
-from tests.replay.live import wait_until
+from tests.replay.live import Operator, wait_until
 
 
 def camera_fault(setting: Setting, line: str, part: str, word: str) -> Outcome:
@@ -52,3 +53,33 @@ def cut(setting: Setting) -> Outcome:
 def black(setting: Setting) -> Outcome:
     """The light goes off."""
     return camera_fault(setting, "both black", "odometry", "lost")
+
+
+@trial("upper camera frozen")
+def upper_frozen(setting: Setting) -> Outcome:
+    """One camera delivers the same image with new stamps."""
+    return camera_fault(setting, "upper frozen", "pairing", "images of the upper camera are frozen")
+
+
+@trial("both cameras frozen")
+def both_frozen(setting: Setting) -> Outcome:
+    """Both cameras deliver the same image with new stamps."""
+    return camera_fault(setting, "both frozen", "pairing", "images of the lower and the upper camera are frozen")
+
+
+@trial("every fourth image repeated")
+def repeated_now_and_then(setting: Setting) -> Outcome:
+    """A driver that hands out a buffer twice is counted, and the robot drives on."""
+    with driving(setting, module=FAULTY_DAEMON) as (daemon, operator, base):
+        before = stops(operator)
+        daemon.write_line("upper glitch")
+        wait_until(lambda: int(operator.values("pairing").get("repeated_upper", "0")) >= 8, "eight repeated images")
+        assert base.drives and stops(operator) == before, operator.values("wheels")
+        status = f"pairing: {operator.message('pairing')}, repeated_upper counted"
+    return Outcome("alive", "drove on as commanded", status)
+
+
+def stops(operator: Operator) -> int:
+    """Return how often the wheels had to stop."""
+    values = operator.values("wheels")
+    return sum(int(count) for name, count in values.items() if name.startswith(STOPPED_PREFIX))
