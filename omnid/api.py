@@ -25,7 +25,8 @@ from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
-from omnid.settings import dump, parse
+from omnid.settings import parse
+from omnid.settings_dump import dump
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.odometry import OdometryStage

@@ -18,6 +18,7 @@ from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
 from omnid.errors import OmnidError
 from omnid.settings import changed, knob, load
+from omnid.settings_migration import load_renamed
 from omnid.transport.bus_config import BusConfig
 
 
@@ -224,6 +225,17 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
     """
     return load(Config, path, overrides, renamed=RENAMED)
 
+
+def migrated_config(path: str | PathLike[str]) -> tuple[Config, list[str]]:
+    """Return the configuration of a file of an earlier version, and a line for each key that was renamed."""
+    return load_renamed(Config, path, RENAMED)
+
+
+# The settings that a new robot needs, in `omnid config --minimal`.
+FIRST_SETTINGS: Final = ("cameras.rig", "cameras.lower", "cameras.upper", "cameras.width_px", "cameras.height_px",
+                         "cameras.rate_hz", "controller.limits.velocity_mps", "controller.limits.yaw_rate_radps",
+                         "motor.port", "motor.protocol", "motor.drive.track_m", "bus.robot", "bus.listen",
+                         "record.enabled", "record.folder")
 
 # Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
 USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({

@@ -16,7 +16,6 @@ A renamed or removed key is refused with its new name: `load(..., renamed={"ster
 from __future__ import annotations
 
 import difflib
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -146,21 +145,32 @@ def parse(
     try:
         table = _table_of(data)
         for path, value in changes:
-            _insert(table, path, value)
+            insert(table, path, value)
         return cast("T", _built(root(), table, (), keys))
     except OmnidError as error:
         raise OmnidError(f"{origin}: {error}") from None
 
 
-def dump(settings: object) -> str:
-    """Return commented TOML with the description, range and default of every knob; `load` reads the same object."""
-    return "\n".join(_dumped(settings, type(settings)(), ())).strip("\n") + "\n"
+def read_table(path: str | PathLike[str]) -> dict[str, Any]:
+    """Return the table of a TOML file; OmnidError where it cannot be read."""
+    try:
+        return _table_of(_bytes_of(path))
+    except OmnidError as error:
+        raise OmnidError(f"{path}: {error}") from None
+
+
+def from_table(root: type[T], table: dict[str, Any], origin: str, renamed: Mapping[str, str]) -> T:
+    """Return the settings of a table that was read from `origin`; the rest is as in `load`."""
+    try:
+        return cast("T", _built(root(), table, (), _Keys(tuple(_paths(root)), renamed)))
+    except OmnidError as error:
+        raise OmnidError(f"{origin}: {error}") from None
 
 
 def changed(settings: object) -> list[str]:
     """Return the dotted paths of the knobs that differ from their defaults."""
     default = type(settings)()
-    return [path for path in knob_paths(type(settings)) if _at(settings, path) != _at(default, path)]
+    return [path for path in knob_paths(type(settings)) if value_at(settings, path) != value_at(default, path)]
 
 
 def knob_paths(root: type) -> list[str]:
@@ -168,7 +178,8 @@ def knob_paths(root: type) -> list[str]:
     return [".".join(path) for path in _paths(root)]
 
 
-def _at(settings: object, path: str) -> object:
+def value_at(settings: object, path: str) -> object:
+    """Return the value at a dotted path."""
     return reduce(getattr, path.split("."), settings)
 
 
@@ -221,17 +232,18 @@ def _entry_at(root: type, path: _Path, keys: _Keys) -> tuple[Any, Knob]:
     for depth, name in enumerate(path):
         if not is_dataclass(kind):
             raise OmnidError(f"{_dotted(path[:depth])} is a key, not a section: it has no {_dotted(path[depth:])}")
-        entries = {entry.name: (hint, entry) for entry, hint in _entries(kind)}
+        entries = {entry.name: (hint, entry) for entry, hint in fields_of(kind)}
         if name not in entries:
             raise keys.moved(path) or keys.unknown(path[: depth + 1])
         kind, entry = entries[name]
     if is_dataclass(kind):
         first = next(_paths(cast("type", kind), path))
         raise OmnidError(f"{_dotted(path)} is a section: name one of its keys, such as {_dotted(first)}")
-    return kind, _knob_of(entry)
+    return kind, knob_of(entry)
 
 
-def _insert(table: dict[str, Any], path: _Path, value: object) -> None:
+def insert(table: dict[str, Any], path: _Path, value: object) -> None:
+    """Set a value in nested tables; OmnidError where a section would replace a value."""
     for depth, name in enumerate(path[:-1]):
         inner = table.setdefault(name, {})
         _require_section(inner, path[: depth + 1])
@@ -240,7 +252,7 @@ def _insert(table: dict[str, Any], path: _Path, value: object) -> None:
 
 
 def _built(default: object, table: dict[str, Any], path: _Path, keys: _Keys) -> object:
-    entries = _entries(type(default))
+    entries = fields_of(type(default))
     for name in table.keys() - {entry.name for entry, _ in entries}:
         raise keys.moved(_first_leaf(table[name], (*path, name))) or keys.unknown((*path, name))
     values: dict[str, object] = {}
@@ -251,14 +263,14 @@ def _built(default: object, table: dict[str, Any], path: _Path, keys: _Keys) -> 
             _require_section(inner, here)
             values[entry.name] = _built(value, inner, here, keys)
         else:
-            values[entry.name] = _checked(kind, _knob_of(entry), table.get(entry.name, value), here)
+            values[entry.name] = _checked(kind, knob_of(entry), table.get(entry.name, value), here)
     return type(default)(**values)
 
 
 def _checked(kind: Any, entry: Knob, value: object, path: _Path) -> object:
     fitted = _fitted(kind, entry, value)
     if fitted is _MISFIT:
-        raise OmnidError(f"{_dotted(path)}: expected {_described(kind, entry)}, found {_shown(value)}")
+        raise OmnidError(f"{_dotted(path)}: expected {described(kind, entry)}, found {_shown(value)}")
     return fitted
 
 
@@ -297,7 +309,7 @@ def _first_leaf(value: object, path: _Path) -> _Path:
 
 def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:
     """Yield the paths of all knobs."""
-    for entry, kind in _entries(cls):
+    for entry, kind in fields_of(cls):
         here = (*path, entry.name)
         if is_dataclass(kind):
             yield from _paths(cast("type", kind), here)
@@ -305,18 +317,21 @@ def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:
             yield here
 
 
-def _entries(cls: Any) -> list[tuple[Field[Any], Any]]:
+def fields_of(cls: Any) -> list[tuple[Field[Any], Any]]:
+    """Return the fields of a dataclass of settings with their types: knobs, and sections, which are dataclasses."""
     hints = get_type_hints(cls)
     return [(entry, hints[entry.name]) for entry in fields(cls)]
 
 
-def _knob_of(entry: Field[Any]) -> Knob:
+def knob_of(entry: Field[Any]) -> Knob:
+    """Return the description of a field that is no section."""
     if "knob" not in entry.metadata:
         raise TypeError(f"'{entry.name}' is neither a knob(...) nor a section, that is a dataclass")
     return cast("Knob", entry.metadata["knob"])
 
 
-def _described(kind: Any, entry: Knob) -> str:
+def described(kind: Any, entry: Knob) -> str:
+    """Return type and range of a knob in words."""
     if get_origin(kind) is not tuple:
         return _KINDS[kind][0] + entry.bounds
     kinds = get_args(kind)
@@ -337,27 +352,3 @@ def _shown(value: object) -> str:
 
 def _dotted(path: Sequence[str]) -> str:
     return ".".join(part if re.fullmatch(r"[\w-]{1,80}", part) else _shown(part) for part in path)
-
-
-def _dumped(settings: Any, default: Any, path: _Path) -> Iterator[str]:
-    if path:
-        yield from ("", f"[{'.'.join(path)}]")
-    for entry, kind in _entries(type(settings)):
-        if not is_dataclass(kind):
-            about = _knob_of(entry)
-            yield f"# {about.doc}"
-            yield f"# {_described(kind, about)}; default {_toml(getattr(default, entry.name))}"
-            yield f"{entry.name} = {_toml(getattr(settings, entry.name))}"
-    for entry, kind in _entries(type(settings)):
-        if is_dataclass(kind):
-            yield from _dumped(getattr(settings, entry.name), getattr(default, entry.name), (*path, entry.name))
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml(element) for element in value) + "]"
-    if isinstance(value, str):  # JSON's escapes are TOML's, except that TOML wants DEL escaped as well
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)

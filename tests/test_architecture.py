@@ -57,7 +57,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.__main__": "omnid.cli",
     "omnid.api":
         "calib.errors calib.models calib.rig calib.rig_file drivers.errors drivers.frame omnid.config "
-        "omnid.errors omnid.messages omnid.runs omnid.settings omnid.stages",
+        "omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig calib.se3 "
         "drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig omnid.core.stereo "
@@ -69,10 +69,10 @@ ARROWS: Mapping[str, str] = {
         "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
         "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
-        "omnid.recordings omnid.report omnid.runs omnid.settings omnid.sinks omnid.viewer",
+        "omnid.recordings omnid.report omnid.runs omnid.settings omnid.settings_dump omnid.sinks omnid.viewer",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
-        "omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.transport",
+        "omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration omnid.transport",
     "omnid.controller":
         "drivers.errors drivers.motor drivers.motors drivers.motors.protocols drivers.motors.simulated "
         "omnid.core.control omnid.engine omnid.errors omnid.settings",
@@ -101,15 +101,17 @@ ARROWS: Mapping[str, str] = {
         "omnid.tracking_state omnid.transport",
     "omnid.report":
         "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
-        "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings "
+        "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
     "omnid.runs":
         "calib.rig calib.rig_file drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
         "drivers.motor omnid.config omnid.controller omnid.core.mapping omnid.diagnostics omnid.engine "
-        "omnid.errors omnid.formats omnid.messages omnid.settings omnid.sinks omnid.stages "
+        "omnid.errors omnid.formats omnid.messages omnid.settings_dump omnid.sinks omnid.stages "
         "omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.settings": "calib.bounded_toml omnid.errors",
+    "omnid.settings_dump": "omnid.settings",
+    "omnid.settings_migration": "omnid.settings",
     "omnid.sinks":
         "drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
         "omnid.core.control omnid.core.mapping omnid.diagnostics omnid.errors omnid.formats omnid.messages "

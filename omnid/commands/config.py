@@ -1,14 +1,32 @@
-"""`omnid config`: print all settings with their defaults, as a file to start from."""
+"""`omnid config`: print settings as a file to start from, check a file, or rewrite one of an earlier version."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from omnid.config import Config
+
+EXAMPLES = """examples:
+  omnid config --minimal > omnid.toml         the settings that a new robot needs, the rest as installed
+  omnid config check omnid.toml               errors, and what differs from the defaults
+  omnid config migrate omnid.toml > new.toml  keys of an earlier version under their new names
+"""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `config` to the command line."""
-    parser = subparsers.add_parser("config", help="print all settings with their defaults, as TOML")
+    parser = subparsers.add_parser("config", help="print, check or migrate settings",
+                                   description="Print all settings with their defaults as TOML; check or migrate a "
+                                   "file.", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", nargs="?", choices=("print", "check", "migrate"), default="print",
+                        help="default: print")
+    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="of check and migrate")
+    parser.add_argument("--minimal", action="store_true", help="print only what differs from the defaults, and what "
+                        "a new robot needs; all other defaults stay those of the installed version")
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -22,9 +40,34 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the settings."""
-    from omnid.config import load_config
-    from omnid.settings import dump
+    """Print, check or migrate settings."""
+    from omnid.config import FIRST_SETTINGS, load_config, migrated_config
+    from omnid.errors import OmnidError
+    from omnid.settings_dump import dump, dump_minimal
 
-    print(dump(load_config(args.config, args.overrides)), end="")
+    if (args.action == "print") != (args.file is None):
+        raise OmnidError(f"omnid config {args.action}: " + ("name the file" if args.file is None else
+                         f"takes no file: `omnid config --config {args.file}` prints its settings"))
+    if args.action == "migrate":
+        config, renamed = migrated_config(args.file)
+        print(dump_minimal(config, ()), end="")
+        for line in renamed:
+            print(f"omnid: {line}", file=sys.stderr)
+        print("omnid: comments and settings with their default value are left out", file=sys.stderr)
+        return 0
+    config = load_config(args.file or args.config, args.overrides)
+    if args.action == "check":
+        print("\n".join(_differences(config, str(args.file))))
+    else:
+        print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
     return 0
+
+
+def _differences(config: Config, name: str) -> list[str]:
+    """Return a line about the file, and one for each setting that differs from its default."""
+    from omnid.config import Config
+    from omnid.settings import changed, value_at
+
+    paths = changed(config)
+    lines = [f"{path} = {value_at(config, path)!r}, default {value_at(Config(), path)!r}" for path in paths]
+    return [f"{name}: good; {len(paths)} settings differ from their defaults", *lines]

@@ -30,7 +30,7 @@ from drivers.logs.mcap_recovery import recover
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
-from omnid.settings import dump
+from omnid.settings_dump import dump
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
 from tests.faults.mutation import mutated
 from tests.simulation import build, write_log

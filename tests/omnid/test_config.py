@@ -9,7 +9,8 @@ import pytest
 
 from omnid.config import RENAMED, USED_ONLY_BY, Config, load_config, unused_settings
 from omnid.errors import OmnidError
-from omnid.settings import dump, knob_paths
+from omnid.settings import knob_paths
+from omnid.settings_dump import dump
 
 SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
 

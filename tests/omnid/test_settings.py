@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.settings import dump, knob, load, parse
+from omnid.settings import knob, load, parse
+from omnid.settings_dump import dump
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,55 @@
+"""`omnid config`: files to start from, to check, and of an earlier version."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from omnid.config import FIRST_SETTINGS, Config, load_config
+from omnid.settings import knob_paths
+from tests.replay.command import Command
+
+
+@pytest.fixture
+def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(capsys)
+
+
+def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    file.write_text(omnid("config", "--minimal").out)
+    assert load_config(file) == Config()
+    assert set(FIRST_SETTINGS) <= set(knob_paths(Config))
+    text = file.read_text()
+    assert "# lower = " in text and "[motor.drive]" in text and len(text.splitlines()) < 60
+    changed = omnid("config", "--minimal", "--set", "bus.robot=rover", "--set", "stereo.noise_px=0.7").out
+    file.write_text(changed)
+    assert load_config(file) == load_config(None, ["bus.robot=rover", "stereo.noise_px=0.7"])
+    assert '\nrobot = "rover"\n' in changed
+
+
+def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    file.write_text("[bus]\nrobot = 'rover'\n")
+    assert omnid("config", "check", file).out == (
+        f"{file}: good; 1 settings differ from their defaults\nbus.robot = 'rover', default 'omnid'\n")
+    file.write_text("[bus]\nrobots = 'rover'\n")
+    assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
+
+
+def test_migrate_moves_renamed_keys(omnid: Command, tmp_path: Path) -> None:
+    old, new = tmp_path / "old.toml", tmp_path / "new.toml"
+    old.write_text("[guidance]\nvelocity_mps = 0.3\n[guidance.limits]\ngain_hz = 2.0\n[service]\nhung_s = 5.0\n"
+                   "[bus]\nrobot = 'rover'\n")
+    done = omnid("config", "migrate", old)
+    new.write_text(done.out)
+    assert load_config(new) == load_config(None, ["controller.setpoint.velocity_mps=0.3", "bus.robot=rover",
+                                                  "controller.heading.gain_hz=2", "service.stall_timeout_s=5"])
+    assert "service.hung_s is now called service.stall_timeout_s" in done.err and "guidance.limits" in done.err
+    assert omnid("config", "migrate", new).out == done.out, "a file of this version stays as it is"
+
+
+@pytest.mark.parametrize("words", [("check",), ("migrate",), ("print", "x.toml"), ("check", "none.toml")])
+def test_refuses_a_missing_or_superfluous_file(omnid: Command, words: tuple[str, ...]) -> None:
+    assert omnid.refused("config", *words)
