@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig
 from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.stereo.photometry import brightened, gain_of, mean_level, noise_sigma
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
 
+NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
 MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 
 
@@ -27,6 +29,8 @@ class Dewarp:
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
+        self._noise_grey: dict[str, float] = {}  # of each camera before its gain
+        self._pairs = 0
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(
                 f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
@@ -35,11 +39,21 @@ class Dewarp:
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
-        lower, upper = self._panorama(pair.lower, self._lower), self._panorama(pair.upper, self._upper)
+        measured = self._pairs % NOISE_PAIRS == 0
+        self._pairs += 1
+        lower = self._panorama(pair.lower, self._lower, "lower", measured)
+        upper = self._panorama(pair.upper, self._upper, "upper", measured)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible)
 
-    def _panorama(self, image: NDArray[np.uint8], maps: Maps) -> PaddedPanorama:
-        return PaddedPanorama(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8), self._pad_px)
+    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool) -> PaddedPanorama:
+        """Return a panorama, brightened if it is dim; measured: measure the noise of this camera again."""
+        remapped = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
+        inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
+        if measured:
+            self._noise_grey[camera] = noise_sigma(inner, self._visible)
+        level = mean_level(inner, self._visible)
+        gain = gain_of(level)
+        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * self._noise_grey[camera], gain, level)
 
 
 def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:

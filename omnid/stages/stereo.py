@@ -57,7 +57,7 @@ class Stereo:
         if self._matcher is None:
             self._matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
-        pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid)
+        pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
 

@@ -16,6 +16,7 @@ MAX_CELLS = 4096  # more cells than a row of any panorama has: one index for row
 BLOCK_PX = 5  # window over which the gradients of a corner are summed
 APART_PX = 9  # side of the square in which a corner is the maximum
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
+NOISE_RESPONSE = 2.5e-5  # that noise of one grey level reaches in one pixel of a hundred: it grows with its square
 CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
@@ -28,8 +29,9 @@ def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
     """
     response = cv2.cornerMinEigenVal(lower.image, BLOCK_PX)
     peaks = cv2.dilate(response, np.ones((APART_PX, APART_PX), np.uint8))
+    least = max(MIN_RESPONSE, NOISE_RESPONSE * lower.noise_grey**2)
     inner = slice(lower.pad_px, lower.pad_px + lower.width)
-    is_peak = (response[:, inner] >= peaks[:, inner]) & (response[:, inner] > MIN_RESPONSE) & usable
+    is_peak = (response[:, inner] >= peaks[:, inner]) & (response[:, inner] > least) & usable
     rows, columns = np.nonzero(is_peak)
     strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
     rows, columns = rows[strongest], columns[strongest]

@@ -12,6 +12,7 @@ from calib import se3
 from omnid.core.odometry.corners import rows_in_upper
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap, Tracks
+from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import GaussNewtonResult, StereoModel, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -39,6 +40,7 @@ class CoarsePose:
     T_curr_odom: Array
     landmarks: Indices  # (M,) rows of the local map
     disparity: Array  # (M,) px in this frame, NaN: not found in the upper panorama
+    variance: Array  # (M,) px^2 of the disparity by noise
     tracks: Tracks
 
 
@@ -58,16 +60,16 @@ class FrameToMap:
         """
         if len(tracks.landmarks) < MIN_LANDMARKS:
             return None
-        views = self._views(frame, tracks)
+        views, variance = self._views(frame, tracks)
         T_guess_odom = se3.inverse(T_odom_guess)
         in_guess = se3.apply(T_guess_odom, self._map.store.table.points[tracks.landmarks])
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
-        landmarks, views = tracks.landmarks[is_inlier], views[is_inlier]
+        landmarks, views, variance = tracks.landmarks[is_inlier], views[is_inlier], variance[is_inlier]
         solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model)
         if solution is None:
             return None
         disparity = (views[:, 2] - views[:, 1])[kept]
-        return CoarsePose(solution.T, landmarks[kept], disparity, tracks)
+        return CoarsePose(solution.T, landmarks[kept], disparity, variance[kept], tracks)
 
     def refine(self, frame: StereoFrame, coarse: CoarsePose) -> PoseEstimate | None:
         """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
@@ -78,12 +80,13 @@ class FrameToMap:
         """
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
         landmarks, _ = self._map.visible(T_odom_curr)
-        pixels, aligned = self._map.align(frame.lower, T_odom_curr, landmarks)
-        landmarks, pixels = landmarks[aligned], pixels[aligned]
-        disparity = np.full(len(self._map), np.nan)
-        disparity[coarse.landmarks] = coarse.disparity
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks)
+        landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
+        disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
+        disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
-        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model)
+        noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
+        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise)
         if solution is None:
             return None
         # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
@@ -110,14 +113,19 @@ class FrameToMap:
                 break
         return best
 
-    def _views(self, frame: StereoFrame, tracks: Tracks) -> Array:
-        """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there."""
+    def _views(self, frame: StereoFrame, tracks: Tracks) -> tuple[Array, Array]:
+        """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
+
+        Also returns the variances (M,) [px^2] of these rows by noise.
+        """
+        pair = frame.lower, frame.upper
         rows = tracks.pixels[:, 1] + tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        found = rows_in_upper((frame.lower, frame.upper), tracks.pixels, rows, self._stereo_klt)
-        return np.column_stack([tracks.pixels, found])
+        rows = rows_in_upper(pair, tracks.pixels, rows, self._stereo_klt)
+        rows, variance = align_rows(pair, tracks.pixels, rows)
+        return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
-        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel
+        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in ROUNDS, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
@@ -126,7 +134,9 @@ class FrameToMap:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
-            solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model)
+            of_views = None if noise is None else noise[kept]
+            solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
+                                    of_views)
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

@@ -99,15 +99,17 @@ class LandmarkStore:
     def __len__(self) -> int:
         return len(self.table.id)
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array) -> None:
+    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None) -> None:
         """Add a keyframe with new landmarks, observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
 
+        noise: covariance (N, 3, 3) [px^2] of the views beside that of the model; None: none.
         Views that cannot be triangulated are left out. The oldest keyframe beyond the bound leaves.
         """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
         views, slopes, points = views[finite], slopes[finite], points[finite]
-        covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px)
+        covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px,
+                                      None if noise is None else noise[finite])
         count = len(points)
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
-from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, warped_templates
+from omnid.core.odometry.patch_alignment import AlignedPatches, affine_warps, align, warped_templates
+from omnid.core.odometry.patch_fit import CELL_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import view
@@ -47,9 +48,9 @@ class LocalMap:
         self.store.clear()
         self._last = None
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array) -> None:
-        """Add a keyframe at the last panorama with new landmarks: views (N, 3) [px], slopes (N, 2) of the disparity."""
-        self.store.add_keyframe(keyframe, views, slopes)
+    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None) -> None:
+        """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
+        self.store.add_keyframe(keyframe, views, slopes, noise)
         self._last = keyframe.lower
 
     def update_tracked(self, lower: PaddedPanorama, landmarks: Indices, pixels: Array) -> None:
@@ -81,10 +82,10 @@ class LocalMap:
         rows = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices) -> tuple[Array, Flags]:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
-        Returns the pixels (M, 2), and flags (M,) of the patches that moved little from their prediction.
+        A patch is found where it has texture and moved little from its prediction.
         """
         table, keyframes = self.store.table, self.store.keyframes
         T_rect_odom = se3.inverse(T_odom_rect)
@@ -100,4 +101,4 @@ class LocalMap:
             own = np.flatnonzero(anchors == seq)
             pixels = table.views[landmarks[own], :2]
             templates[own] = warped_templates(keyframes[seq].lower, pixels, warps[own], predicted[own])
-        return align(templates, lower, predicted)
+        return align(templates, lower, predicted, anchors)

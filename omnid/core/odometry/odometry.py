@@ -21,7 +21,7 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.patch_alignment import disparity_slopes
+from omnid.core.odometry.patch_alignment import align_rows, disparity_slopes, view_noise
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -215,16 +215,18 @@ class VisualOdometry:
     def _add_keyframe(self, frame: StereoFrame, usable: Flags, known: Array) -> Array:
         """Add a keyframe with new landmarks between the known ones (N, 2); return the pixels (M, 2) of the new ones.
 
-        They are located by SAD (eq. 8), and then by KLT to a fraction of a pixel.
+        They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
         """
         free = clear_around(usable, known, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._limits.features - len(known))
         guess = points[:, 1] + nearby_disparity(frame.disparity, points)
-        rows = rows_in_upper((frame.lower, frame.upper), points, guess, self._stereo_klt)
+        pair = frame.lower, frame.upper
+        rows, variance = align_rows(pair, points, rows_in_upper(pair, points, guess, self._stereo_klt))
         located = np.isfinite(rows)
         keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._covariance)
         slopes = disparity_slopes(frame.disparity, points[located], (rows - points[:, 1])[located])
-        self._map.add_keyframe(keyframe, np.column_stack([points, rows])[located], slopes)
+        noise = view_noise(np.zeros((len(points), 2, 2)), variance)
+        self._map.add_keyframe(keyframe, np.column_stack([points, rows])[located], slopes, noise[located])
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames_since_keyframe = 0

@@ -1,31 +1,31 @@
 """Alignment of landmarks' patches, warped to the new viewpoint, to hundredths of a pixel.
 
 Plain Lucas-Kanade shifts a window but does not warp it, and errs by tenths of a pixel as soon as the camera has moved
-some decimetres. Here each keyframe patch is warped by the affine map that pose, depth and local slope predict; all
-patches lie side by side in one image, so that a single call aligns them.
+some decimetres. Here each keyframe patch is warped by the affine map that pose, depth and local slope predict, and
+`patch_fit` finds the remaining shift together with a gain and an offset.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.patch_fit import CELL_PX, PatchFit, fit_patches
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import MIN_EIGENVALUE, PaddedPanorama
+from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
+Indices = NDArray[np.intp]
 
-CELL_PX = 24  # holds the window, the largest shift and the gradient's border
-WINDOW_PX = 13
-MAX_SHIFT_PX = 2.0  # a patch that has to move farther was predicted wrongly
-ITERATIONS, CONVERGED_PX = 20, 0.003  # of Lucas-Kanade
-CELLS_PER_ROW = 32  # of the image in which the patches lie side by side
 HALF_BASE_PX = 4.0  # half the base of the difference quotients that give the warp
+CROSS_PX = 1.0  # largest horizontal difference of a patch in the two panoramas
 MAX_STRETCH, MIN_AREA = 2.0, 0.25  # of a warp: largest element and smallest determinant
 SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the disparity is measured
 SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface
@@ -71,20 +71,53 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
     return np.where(sane[:, None, None], warps, np.eye(2))
 
 
-def align(templates: Image, current: PaddedPanorama, predicted: Array) -> tuple[Array, NDArray[np.bool_]]:
+@dataclass(frozen=True, slots=True)
+class AlignedPatches:
+    """Where N patches were found in a panorama."""
+
+    pixels: Array  # (N, 2)
+    covariance: Array  # (N, 2, 2) px^2 that the noise leaves
+    found: NDArray[np.bool_]  # (N,) textured, and near the prediction
+
+    @staticmethod
+    def of(fit: PatchFit, predicted: Array) -> AlignedPatches:
+        """Return the pixels of patches that were cut at predicted (N, 2)."""
+        return AlignedPatches(predicted + fit.shift, fit.covariance, fit.fits)
+
+
+def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices) -> AlignedPatches:
     """Align patches (N, CELL, CELL), centred on predicted (N, 2), with the current panorama.
 
-    Returns their pixels (N, 2), and flags (N,) of those that moved less than MAX_SHIFT_PX.
+    groups (N,): patches that come from one image have one number.
     """
     cells = _cut(current, np.rint(predicted))
-    centres = _centres(len(predicted))
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        _atlas(templates), _atlas(cells), centres, centres.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=0,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, CONVERGED_PX),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE)
-    shift = (there - centres)[:, 0].astype(float)
-    close = (found.ravel() > 0) & (np.abs(shift).max(axis=1, initial=0.0) < MAX_SHIFT_PX)
-    return predicted + shift, close
+    return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
+
+
+def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, rows: Array) -> tuple[Array, Array]:
+    """Align patches of the lower panorama at points (N, 2) with the upper one near rows (N,), NaN where unknown.
+
+    Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by the noise. Gain and offset of
+    the two cameras may differ.
+    """
+    known = np.flatnonzero(np.isfinite(rows))
+    predicted = np.column_stack([points[known, 0], rows[known]])
+    offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
+    found = align(_sample(pair[0], points[known], offsets), pair[1], predicted, np.zeros(len(known), np.intp))
+    fits = found.found & (np.abs(found.pixels[:, 0] - points[known, 0]) < CROSS_PX)
+    aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
+    aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
+    return aligned, variance
+
+
+def view_noise(covariance: Array, row_variance: Array) -> Array:
+    """Return covariances (N, 3, 3) [px^2] of views whose upper row is the lower row plus a disparity.
+
+    covariance (N, 2, 2) of the pixels in the lower panorama, row_variance (N,) of the disparities.
+    """
+    noise = covariance[:, [0, 1, 1]][:, :, [0, 1, 1]]
+    noise[:, 2, 2] += row_variance
+    return noise
 
 
 def warped_templates(keyframe: PaddedPanorama, pixels: Array, warps: Array, predicted: Array) -> Image:
@@ -110,19 +143,3 @@ def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
     rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
     patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
-
-
-def _atlas(patches: Image) -> Image:
-    """Return one image of patches, laid out in rows of CELLS_PER_ROW."""
-    rows = -(-len(patches) // CELLS_PER_ROW)
-    filled = np.zeros((rows * CELLS_PER_ROW, CELL_PX, CELL_PX), np.uint8)
-    filled[: len(patches)] = patches
-    grid = filled.reshape(rows, CELLS_PER_ROW, CELL_PX, CELL_PX)
-    return np.ascontiguousarray(grid.transpose(0, 2, 1, 3)).reshape(rows * CELL_PX, CELLS_PER_ROW * CELL_PX)
-
-
-def _centres(count: int) -> Floats:
-    """Return the centres (N, 1, 2) of the cells in the atlas."""
-    number = np.arange(count)
-    corner = np.column_stack([number % CELLS_PER_ROW, number // CELLS_PER_ROW]) * CELL_PX
-    return np.ascontiguousarray((corner + CELL_PX // 2)[:, None], np.float32)

@@ -74,13 +74,15 @@ def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Ge
     return best, consensus
 
 
-def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel) -> Array:
+def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
+              noise: Array | None = None) -> Array:
     """Return W (N, 3, 3) with W S W^T = I for the covariance S of each view's error: corner and landmark noise.
 
+    noise: covariance (N, 3, 3) [px^2] of the views beside sigma_px; None: none.
     A view without the upper row (NaN) gets a row of zeros there.
     """
     J = view_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m) @ T[:3, :3]
-    S = J @ covariance @ np.swapaxes(J, -1, -2) + model.sigma_px**2 * np.eye(3)
+    S = J @ covariance @ np.swapaxes(J, -1, -2) + model.sigma_px**2 * np.eye(3) + (0.0 if noise is None else noise)
     lower_only = np.isnan(views[:, 2])
     S[lower_only, 2, :], S[lower_only, :, 2] = 0.0, 0.0
     S[lower_only, 2, 2] = 1.0
@@ -99,13 +101,14 @@ class GaussNewtonResult:
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 steps: int = GAUSS_NEWTON_STEPS) -> GaussNewtonResult:
+                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
-    corner and landmark. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is biased short.
+    corner and landmark; noise as in `whitening`. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is
+    biased short.
     """
-    W = whitening(landmarks, covariance, views, T, model)
+    W = whitening(landmarks, covariance, views, T, model, noise)
     clean = np.where(np.isnan(views), 0.0, views)
     for _ in range(steps):
         H, g, _ = _normal_equations(landmarks, clean, T, W, model)

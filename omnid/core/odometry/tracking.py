@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +25,9 @@ class PaddedPanorama:
 
     image: Image  # (H, W + 2 pad) uint8
     pad_px: int
+    noise_grey: float = 1.0  # standard deviation of the noise, grey levels
+    gain: float = 1.0  # by which the image was multiplied because it was dim
+    level_grey: float = math.nan  # mean of the visible part before that
 
     @property
     def width(self) -> int:

@@ -16,7 +16,8 @@ from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
-from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.patch_alignment import affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.patch_fit import CELL_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import triangulate, view
@@ -155,9 +156,8 @@ class DriveLandmarks:
         for a in known:
             at = np.flatnonzero(anchors == a)
             templates[at] = warped_templates(self._keyframes[a].lower, self._views[index[at], :2], warps[at], near[at])
-        pixels, fits = align(templates, current.upper if upper else current.lower, near)
-        pixels[:, 0] %= self._model.cylinder.width
-        return pixels, fits
+        aligned = align(templates, current.upper if upper else current.lower, near, anchors)
+        return aligned.pixels % [self._model.cylinder.width, np.inf], aligned.found
 
 
 def _is_set(flags: Flags, pixels: Array) -> Flags:

@@ -29,6 +29,7 @@ METHODS = ("sad", "enhanced", "semiglobal")
 REACH_PX = 3  # searched about the prior, which comes from half the resolution and is rounded
 MIN_DISPARITY_PX = 0.5  # a smaller one is a point at infinity, within the noise
 LEFT_RIGHT_PX = 1  # largest disagreement of the disparities that both panoramas choose
+EDGE_NOISE = 6.0  # Sobel response that noise of one grey level reaches in one pixel of a hundred
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +73,15 @@ class Matcher:
         self._matching = matching
         self._search: CandidateSearch = SEARCHES[matching.method](shape, matching)
 
-    def match(self, lower: Image, upper: Image, valid: Flags) -> Matches:
-        """Return the matches of panoramas (H, W) uint8, padded at the seam, among the valid pixels (H, W)."""
-        lower, upper = smooth(lower, self._matching.sigma_px), smooth(upper, self._matching.sigma_px)
-        pixels = edge_pixels(lower, valid, self._matching.edge_threshold, self._matching.max_points)
+    def match(self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0) -> Matches:
+        """Return the matches of panoramas (H, W) uint8, padded at the seam, among the valid pixels (H, W).
+
+        noise_grey: standard deviation of the noise; where it is large, the threshold of the edges follows it.
+        """
+        m = self._matching
+        lower, upper = smooth(lower, m.sigma_px), smooth(upper, m.sigma_px)
+        least = max(m.edge_threshold, round(EDGE_NOISE * noise_grey))
+        pixels = edge_pixels(lower, valid, least, m.max_points)
         return self._search.search(lower, upper, pixels)
 
 

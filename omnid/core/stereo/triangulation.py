@@ -58,7 +58,12 @@ def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array
     return J
 
 
-def point_covariance(points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float) -> Array:
-    """Return covariances (N, 3, 3) [m^2] of points triangulated from view coordinates of sigma_px each."""
+def point_covariance(points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float,
+                     noise: Array | None = None) -> Array:
+    """Return covariances (N, 3, 3) [m^2] of points triangulated from views of sigma_px in each coordinate.
+
+    noise: covariance (N, 3, 3) [px^2] of the views beside it; None: none.
+    """
     J = np.linalg.inv(view_jacobian(points, cylinder, baseline_m))
-    return np.asarray(sigma_px**2 * J @ np.swapaxes(J, -1, -2))
+    of_views = sigma_px**2 * np.eye(3) + (0.0 if noise is None else noise)
+    return np.asarray(J @ of_views @ np.swapaxes(J, -1, -2))

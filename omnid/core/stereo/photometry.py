@@ -1,0 +1,62 @@
+"""Brightness and noise of panoramas: dim images are made brighter, and the noise is measured that thresholds follow.
+
+Two images are only compared at the same brightness. The exposure of a camera changes from image to image and differs
+between the two cameras; in the dark both are dim. So an image below a level is multiplied up to it. Above it nothing is
+changed: what is left of gain and offset, `core/odometry/patch_fit.py` finds for each patch.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
+MAX_GAIN = 8.0  # of 8 bit images: more only magnifies their steps
+# Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
+FINE_PX, COARSE_PX = 0.8, 1.6
+BLOCK_PX = 8
+SMOOTHEST_PERCENT = 5.0
+# Noise of a panorama by that measure: simulated with white noise of 1.5 to 13 grey levels, JPEG, remapped bilinearly.
+NOISE_SCALE = 6.1
+BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
+MIN_BLOCKS = 20  # fewer visible ones tell nothing
+UNKNOWN_NOISE = 1.0  # grey levels
+
+
+def mean_level(panorama: Image, visible: Flags) -> float:
+    """Return the mean grey level of a panorama (H, W) where it is visible (H, W)."""
+    return float(cv2.mean(panorama, visible.view(np.uint8))[0])
+
+
+def gain_of(level: float) -> float:
+    """Return the factor that brings a panorama of that mean level to TARGET_LEVEL; 1 for a brighter one."""
+    return float(np.clip(TARGET_LEVEL / max(level, 1.0), 1.0, MAX_GAIN))
+
+
+def brightened(panorama: Image, gain: float) -> Image:
+    """Return the panorama multiplied by a gain; values above 255 are cut."""
+    return panorama if gain == 1.0 else np.asarray(cv2.convertScaleAbs(panorama, alpha=gain), np.uint8)
+
+
+def noise_sigma(panorama: Image, visible: Flags) -> float:
+    """Return the standard deviation of the noise [grey levels] of a panorama (H, W) where it is visible (H, W)."""
+    means = []
+    for top in np.linspace(0, max(0, len(panorama) - BAND_ROWS), BANDS).astype(int).tolist():
+        band = panorama[top : top + BAND_ROWS].astype(np.float32)
+        difference = cv2.GaussianBlur(band, (0, 0), FINE_PX) - cv2.GaussianBlur(band, (0, 0), COARSE_PX)
+        shown = visible[top : top + BAND_ROWS].astype(np.float32)
+        magnitude, share = _blocks(np.abs(difference)), _blocks(shown)
+        means.append(magnitude[share == 1])
+    found = np.concatenate(means)
+    return UNKNOWN_NOISE if len(found) < MIN_BLOCKS else NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT))
+
+
+def _blocks(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the means of whole blocks of BLOCK_PX."""
+    rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
+    whole = image[: rows * BLOCK_PX, : columns * BLOCK_PX]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
