@@ -27,6 +27,7 @@ class PoseEstimate:
     inliers: int
     landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) rows of the local map
     views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them in this frame, NaN: not in upper
+    variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
 
     @property

@@ -95,7 +95,7 @@ class FrameToMap:
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
         inliers = min(len(coarse.landmarks), len(landmarks))
         return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, tracks.visible,
-                            len(tracks.landmarks), inliers, landmarks, views, rejected)
+                            len(tracks.landmarks), inliers, landmarks, views, variance[landmarks], rejected)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float]) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.

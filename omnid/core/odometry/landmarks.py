@@ -21,11 +21,14 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
-from omnid.core.stereo.triangulation import point_covariance, triangulate
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view, view_jacobian
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+
+CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
+OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +146,37 @@ class LandmarkStore:
         points, spread = self.table.points.copy(), self.table.covariance.copy()
         points[own], spread[own] = _in_odom(keyframe, self.table.anchor_points[own], self.table.anchor_covariance[own])
         self.table = replace(self.table, points=points, covariance=spread)
+
+    def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
+        """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
+
+        variance (M,) [px^2] of the disparities; NaN disparities are ignored. A Kalman update of each point in its
+        anchor's frame, by the disparity alone: that depends on the depth, and hardly on the error of the pose. The
+        errors of one texture are alike from frame to frame, so each counts as CORRELATED_FRAMES times as uncertain.
+        """
+        known = np.isfinite(disparity)
+        rows, disparity = rows[known], disparity[known]
+        T_rect_odom = se3.inverse(T_odom_rect)
+        anchors = self.table.anchor[rows]
+        T_curr_anchor = np.array(
+            [T_rect_odom @ self.keyframes[seq].T_odom_rect for seq in anchors.tolist()]).reshape(-1, 4, 4)
+        points = self.table.anchor_points[rows]
+        seen = se3.apply(T_curr_anchor, points[:, None])[:, 0]
+        predicted = view(seen, self._model.cylinder, self._model.baseline_m)
+        J = view_jacobian(seen, self._model.cylinder, self._model.baseline_m)
+        H = np.einsum("ni,nij->nj", J[:, 2] - J[:, 1], T_curr_anchor[:, :3, :3])
+        P = self.table.anchor_covariance[rows]
+        PH = np.einsum("nij,nj->ni", P, H)
+        R = CORRELATED_FRAMES * (variance[known] + 2 * self._model.sigma_px**2)
+        S = np.einsum("ni,ni->n", H, PH) + R
+        innovation = disparity - (predicted[:, 2] - predicted[:, 1])
+        gain = np.where(innovation**2 < OUTLIER_SQUARED * S, 1 / S, 0.0)
+        corrected, spread = self.table.anchor_points.copy(), self.table.anchor_covariance.copy()
+        corrected[rows] = points + PH * (gain * innovation)[:, None]
+        spread[rows] = P - gain[:, None, None] * PH[:, :, None] * PH[:, None, :]
+        self.table = replace(self.table, anchor_points=corrected, anchor_covariance=spread)
+        for seq in np.unique(anchors).tolist():
+            self.move_keyframe(seq, self.keyframes[seq].T_odom_rect, self.keyframes[seq].covariance)
 
     def update_tracked(self, rows: Indices, pixels: Array) -> None:
         """Record the inliers (rows of the table) of an accepted frame with their pixels (M, 2).

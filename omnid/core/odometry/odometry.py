@@ -200,6 +200,8 @@ class VisualOdometry:
         """Remove lost landmarks and add a keyframe where too few are left; return the pixels (N, 2) of new ones."""
         limits, store, inliers = self._limits, self._map.store, len(estimate.landmarks)
         ids = store.table.id[estimate.landmarks]
+        disparity = estimate.views[:, 2] - estimate.views[:, 1]
+        store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
             return self._add_keyframe(frame, usable, np.zeros((0, 2)))

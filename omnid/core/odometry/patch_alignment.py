@@ -73,7 +73,7 @@ def affine_warps(views: Array, slopes: Array, T_curr_ref: Array, model: StereoMo
 
 @dataclass(frozen=True, slots=True)
 class AlignedPatches:
-    """Where N patches were found in a panorama."""
+    """Positions of N patches in a panorama."""
 
     pixels: Array  # (N, 2)
     covariance: Array  # (N, 2, 2) px^2 that the noise leaves
@@ -139,6 +139,8 @@ def _cell_offsets() -> Floats:
 
 def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
     """Return patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), also across the seam."""
+    if not len(centres):
+        return np.zeros((0, CELL_PX, CELL_PX), np.uint8)
     columns = (centres[:, :1] % image.width + image.pad_px).astype(np.float32) + offsets[..., 0]
     rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
     patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

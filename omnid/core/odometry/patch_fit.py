@@ -56,7 +56,7 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
     count = len(templates)
     t = templates.astype(np.float32)
     gx, gy = _gradients(t)
-    window = t[:, _INNER, _INNER].reshape(count, -1)
+    window = t[:, _INNER, _INNER].reshape(-1, WINDOW_PX**2)
     M = np.stack([-gx, -gy, window], axis=1)
     M -= M.mean(axis=2, keepdims=True)
     normal = (M @ np.swapaxes(M, 1, 2)).astype(float)
@@ -100,7 +100,7 @@ def _gradients(t: Floats) -> tuple[Floats, Floats]:
     down = side * (a[:, :-2] + a[:, 2:]) + middle * a[:, 1:-1]
     across = side * (a[:, :, :-2] + a[:, :, 2:]) + middle * a[:, :, 1:-1]
     gx, gy = down[:, :, 2:] - down[:, :, :-2], across[:, 2:] - across[:, :-2]
-    return gx.reshape(len(t), -1).astype(np.float32), gy.reshape(len(t), -1).astype(np.float32)
+    return gx.reshape(-1, WINDOW_PX**2).astype(np.float32), gy.reshape(-1, WINDOW_PX**2).astype(np.float32)
 
 
 def _common_gains(energy: Array, cells: Image, groups: Indices) -> Array:
@@ -108,7 +108,7 @@ def _common_gains(energy: Array, cells: Image, groups: Indices) -> Array:
 
     A regression would be too low, because the template has noise; the ratio of contrasts holds that of both.
     """
-    current = cells[:, _INNER, _INNER].reshape(len(cells), -1).astype(np.float32)
+    current = cells[:, _INNER, _INNER].reshape(-1, WINDOW_PX**2).astype(np.float32)
     ratio = np.sqrt(current.var(axis=1) * current.shape[1] / np.maximum(energy, 1.0))
     gain = np.ones(len(cells))
     for group in np.unique(groups).tolist():
@@ -128,7 +128,7 @@ def _shifted(cells: Floats, shift: Array) -> Floats:
     block = cells.reshape(-1)[index].reshape(-1, WINDOW_PX + 1, WINDOW_PX + 1)
     rows = block[:, :-1] + fy * (block[:, 1:] - block[:, :-1])
     windows = rows[:, :, :-1] + fx * (rows[:, :, 1:] - rows[:, :, :-1])
-    return np.asarray(windows.reshape(len(cells), -1), np.float32)
+    return np.asarray(windows.reshape(-1, WINDOW_PX**2), np.float32)
 
 
 def _covariance(inverse: Array, residual: Array, gain: Array) -> Array:

@@ -125,6 +125,22 @@ def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Fr
     assert shares[0] > visible.mean() > shares[1]
 
 
+def test_a_dim_image_is_brightened_and_its_noise_is_known(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    pair = run_pairs(rig_geometry, frames)[0][0]
+    dewarp = Dewarp(rig_geometry, Config().panorama)
+    bright = dewarp.process(pair)
+    noise = np.random.default_rng(1).normal(0, 5, pair.lower.shape)
+    dim = np.clip(np.rint(0.25 * pair.lower + 5 + noise), 0, 255).astype(np.uint8)
+    dark = Dewarp(rig_geometry, Config().panorama).process(replace(pair, lower=dim))
+    assert bright.lower.gain == bright.upper.gain == dark.upper.gain == 1
+    np.testing.assert_array_equal(bright.upper.image, dark.upper.image)
+    shown = dark.lower.panorama[dark.visible]
+    assert dark.lower.gain > 1.5 and abs(shown.mean() - 80) < 2
+    assert dark.lower.level_grey < 50 < bright.lower.level_grey
+    assert 2.0 < dark.lower.noise_grey / dark.lower.gain < 6.0  # interpolation makes it less than 5
+    assert bright.lower.noise_grey < 3.0
+
+
 def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geometry, frames: list[Frame]) -> None:
     """Half a pixel of disparity moves a point by about its standard deviation."""
     depth = depth_of(rig_geometry, frames)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
-from omnid.core.odometry.tracking import KltSettings
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 ALL = np.ones((120, 480), bool)
@@ -93,3 +93,18 @@ def test_refuses_a_match_in_another_column_or_above_the_point() -> None:
     )
     above = wrapped(np.roll(lower, -6, axis=0))
     assert np.isnan(rows_in_upper((wrapped(lower), above), points, points[:, 1] - 6, KltSettings(levels=1))).all()
+
+
+def test_noise_is_no_corner() -> None:
+    """The threshold follows the noise that the panorama is said to have."""
+    noise = np.random.default_rng(2).normal(100, 12, (120, 480))
+    image = np.clip(noise, 0, 255).astype(np.uint8)
+    image[40:60, 200:230] = 220  # an object
+    usable = np.zeros(image.shape, bool)
+    usable[10:110] = True
+    quiet = wrapped(image)
+    noisy = PaddedPanorama(quiet.image, quiet.pad_px, noise_grey=12.0)
+    found = corners(noisy, usable, 1000)
+    assert len(corners(quiet, usable, 1000)) > 300 > 5 * len(found)
+    of_object = np.array([[200.0, 40], [229, 40], [200, 59], [229, 59]])
+    assert np.linalg.norm(of_object[:, None] - found[None], axis=2).min(axis=1).max() < 4

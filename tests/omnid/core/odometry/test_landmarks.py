@@ -12,7 +12,7 @@ from omnid.core.odometry.corners import corners
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
-from omnid.core.stereo.triangulation import point_covariance, triangulate
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]
@@ -83,6 +83,33 @@ def test_moving_a_keyframe_moves_its_landmarks_and_no_others(store: LandmarkStor
     np.testing.assert_allclose(store.table.points, before.points, atol=1e-12)
     with pytest.raises(KeyError):
         store.move_keyframe(7, POSE, np.eye(6))
+
+
+def test_disparities_of_later_frames_correct_the_depths_of_their_landmarks(store: LandmarkStore) -> None:
+    """Depths that are wrong by two sigma come right with the frames, and their covariance says so."""
+    truth = views(60)
+    wrong = truth + np.array([0.0, 0.0, 0.4])
+    noise = np.zeros((len(truth), 3, 3))
+    noise[:, 2, 2] = 0.3**2
+    add(store, keyframe(1), views(30, seed=1))
+    store.add_keyframe(keyframe(2), wrong, np.zeros((len(truth), 2)), noise)
+    rows = np.flatnonzero(store.table.anchor == 2)
+    before = store.table
+    T_odom_rect = POSE @ se3.exp([0.1, -0.05, 0.01, 0, 0, 0.3])
+    points = se3.apply(POSE, triangulate(truth, MODEL.cylinder, MODEL.baseline_m))
+    seen = view(se3.apply(se3.inverse(T_odom_rect), points), MODEL.cylinder, MODEL.baseline_m)
+    disparity = seen[:, 2] - seen[:, 1]
+    disparity[0] = np.nan  # not measured
+    disparity[1] += 5.0  # an outlier
+    for _ in range(40):
+        store.update_depths(rows, disparity, np.full(len(rows), 0.3**2), T_odom_rect)
+    error = [np.linalg.norm(table.points[rows] - points, axis=1) for table in (before, store.table)]
+    assert (error[1][2:] < 0.25 * error[0][2:]).all()
+    np.testing.assert_allclose(store.table.points[rows[:2]], before.points[rows[:2]], atol=1e-12)
+    spread = [np.trace(table.covariance[rows], axis1=1, axis2=2) for table in (before, store.table)]
+    assert (spread[1][2:] < 0.3 * spread[0][2:]).all()
+    others = before.anchor == 1
+    np.testing.assert_array_equal(store.table.points[others], before.points[others])
 
 
 def test_all_observations_of_a_landmark_are_kept_by_keyframe(store: LandmarkStore) -> None:

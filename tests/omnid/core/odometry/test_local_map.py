@@ -50,12 +50,13 @@ def test_tracks_a_sample_to_compare_guesses(local_map: LocalMap) -> None:
 
 def test_patches_are_aligned_to_hundredths_of_a_pixel_where_the_pose_is_known(local_map: LocalMap) -> None:
     every = np.arange(len(local_map))
-    pixels, aligned = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every)
+    patches = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every)
+    pixels, aligned = patches.pixels, patches.found
     assert aligned.mean() > 0.95
     error = pixels[aligned] - local_map.store.table.views[aligned, :2] - (TURN_PX + 0.4, 0)
     assert np.abs(MODEL.cylinder.wrap(error[:, 0])).max() < 0.05 and np.abs(error[:, 1]).max() < 0.05
-    _, aligned = local_map.align(wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED, every)
-    assert aligned.mean() < 0.2
+    far = local_map.align(wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED, every)
+    assert far.found.mean() < 0.2
 
 
 def test_each_landmark_is_aligned_with_its_own_keyframe() -> None:
@@ -70,8 +71,8 @@ def test_each_landmark_is_aligned_with_its_own_keyframe() -> None:
     seen = np.column_stack([points, points[:, 1] + 8])
     local_map.add_keyframe(keyframe(2, image=other), seen, np.zeros((len(seen), 2)))
     for image, seq in ((wrapped(texture(1)), 1), (other, 2)):
-        pixels, aligned = local_map.align(image, POSE, np.arange(len(local_map)))
-        close = aligned & (np.abs(pixels - local_map.store.table.views[:, :2]).max(axis=1) < 0.1)
+        aligned = local_map.align(image, POSE, np.arange(len(local_map)))
+        close = aligned.found & (np.abs(aligned.pixels - local_map.store.table.views[:, :2]).max(axis=1) < 0.1)
         assert local_map.store.anchor_shares(np.flatnonzero(close))[seq] > 0.8
         assert close.sum() > 30
 

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.patch_alignment import CELL_PX, affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.patch_alignment import (
+    affine_warps,
+    align,
+    align_rows,
+    disparity_slopes,
+    view_noise,
+    warped_templates,
+)
+from omnid.core.odometry.patch_fit import CELL_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import view
@@ -95,9 +103,9 @@ def test_a_warped_patch_is_located_to_hundredths_where_a_rigid_one_errs() -> Non
     for name, applied in (("warped", warp), ("rigid", np.eye(2))):
         templates = warped_templates(before, pixels, np.broadcast_to(applied, (6, 2, 2)), predicted)
         assert templates.shape == (6, CELL_PX, CELL_PX)
-        found, close = align(templates, after, predicted)
-        assert close.all()
-        errors[name] = np.abs(found - truth).max()
+        aligned = align(templates, after, predicted, np.zeros(6, np.intp))
+        assert aligned.found.all()
+        errors[name] = np.abs(aligned.pixels - truth).max()
     assert errors["warped"] < 0.06 and errors["rigid"] > 3 * errors["warped"]
 
 
@@ -105,5 +113,22 @@ def test_patches_far_from_where_they_were_predicted_are_refused() -> None:
     image = wrapped(texture(3))
     pixels = np.array([[100.0, 50.0], [200.0, 60.0]])
     templates = warped_templates(image, pixels, np.broadcast_to(np.eye(2), (2, 2, 2)), pixels + 5.0)
-    _, close = align(templates, image, pixels + 5.0)
-    assert not close.any()
+    assert not align(templates, image, pixels + 5.0, np.zeros(2, np.intp)).found.any()
+
+
+def test_rows_in_the_upper_panorama_are_found_where_its_exposure_differs() -> None:
+    lower = texture(5)
+    upper = np.clip(np.roll(lower, 7, axis=0) * 0.6 + 20, 0, 255).astype(np.uint8)
+    points = np.array([[60.0, 40.0], [200.0, 60.0], [330.0, 52.0], [410.0, 70.0]])
+    guess = points[:, 1] + [7.6, 6.5, 7.3, np.nan]
+    rows, variance = align_rows((wrapped(lower), wrapped(upper)), points, guess)
+    np.testing.assert_allclose(rows[:3], points[:3, 1] + 7, atol=0.02)
+    assert np.isnan(rows[3]) and (variance[:3] > 0).all()
+    aside = wrapped(np.roll(upper, 2, axis=1))
+    assert np.isnan(align_rows((wrapped(lower), aside), points, guess)[0]).all()
+
+
+def test_the_noise_of_the_upper_row_is_that_of_the_lower_row_and_of_the_disparity() -> None:
+    of_pixels = np.array([[[0.04, 0.01], [0.01, 0.09]]])
+    noise = view_noise(of_pixels, np.array([0.25]))
+    np.testing.assert_allclose(noise[0], [[0.04, 0.01, 0.01], [0.01, 0.09, 0.09], [0.01, 0.09, 0.34]])

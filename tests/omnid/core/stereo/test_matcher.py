@@ -217,3 +217,12 @@ def test_matches_a_panorama_with_fewer_rows_than_disparities(method: str) -> Non
     pixels, disparity = matched(method, lower, np.roll(lower, 6, axis=0), np.ones(lower.shape, bool))
     inside = (pixels // 240 > 8) & (pixels // 240 < DISPARITIES - 16)
     assert inside.sum() > 100 and np.mean(np.abs(disparity[inside] - 6) < 0.6) > 0.95
+
+
+def test_noise_is_no_edge() -> None:
+    """The threshold of the edges follows the noise that the panorama is said to have."""
+    rng = np.random.default_rng(6)
+    wall = np.clip(rng.normal(90, 12, SHAPE), 0, 255).astype(np.uint8)
+    matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES, max_difference=60.0))
+    pixels = [len(matcher.match(wall, np.roll(wall, 6, axis=0), middle(), noise_grey)[0]) for noise_grey in (0.0, 12.0)]
+    assert pixels[0] > 100 and pixels[1] < 0.1 * pixels[0]

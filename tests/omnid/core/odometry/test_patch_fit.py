@@ -1,0 +1,79 @@
+"""Shift, gain and offset between patches, and the covariance of the shift."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.odometry.patch_fit import CELL_PX, PatchFit, fit_patches
+
+Array = NDArray[np.float64]
+SHIFT = np.array([0.7, -0.45])  # of the current patches, px
+ONE_IMAGE = np.zeros(400, np.intp)
+
+
+def patches(count: int, shift: Array, *, gain: float = 1.0, offset: float = 0.0, contrast: float = 30.0,
+            noise: float = 0.0) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return templates (N, CELL, CELL) of a random texture, and cells in which it lies at a shift."""
+    rng = np.random.default_rng(4)
+    side = CELL_PX + 16
+    spectrum = np.fft.rfft2(rng.standard_normal((count, side, side)))
+    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None]
+    spectrum *= np.exp(-2 * (np.pi * 2.0) ** 2 * (fx**2 + fy**2))  # a blur of 2 px
+    moved = spectrum * np.exp(-2j * np.pi * (fx * shift[0] + fy * shift[1]))
+    both = [np.fft.irfft2(s, (side, side))[:, 8:-8, 8:-8] for s in (spectrum, moved)]
+    scale = contrast / both[0].std()
+    images = 120 + scale * both[0], gain * (120 + scale * both[1]) + offset
+    noisy = [image + noise * rng.standard_normal(image.shape) for image in images]
+    templates, cells = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in noisy)
+    return templates, cells
+
+
+def error(fit: PatchFit) -> Array:
+    return fit.shift[fit.fits] - SHIFT
+
+
+def test_a_shift_is_found_to_hundredths_under_another_gain_and_offset() -> None:
+    for gain, offset in ((1.0, 0.0), (0.7, 10.0), (1.3, -30.0)):
+        fit = fit_patches(*patches(400, SHIFT, gain=gain, offset=offset), ONE_IMAGE, 1.0)
+        assert fit.fits.mean() > 0.95
+        assert np.sqrt((error(fit) ** 2).mean()) < 0.02
+        assert np.abs(error(fit).mean(axis=0)).max() < 0.01
+
+
+def test_patches_of_two_images_have_two_gains() -> None:
+    bright, dim = patches(400, SHIFT), patches(400, SHIFT, gain=0.5)
+    templates, cells = (np.concatenate([a[:200], b[200:]]) for a, b in zip(bright, dim, strict=True))
+    fit = fit_patches(templates, cells, np.repeat([3, 8], 200), 1.0)
+    assert fit.fits.mean() > 0.95 and np.sqrt((error(fit) ** 2).mean()) < 0.02
+
+
+def test_the_covariance_is_that_of_the_errors() -> None:
+    """Pixels of a panorama have correlated noise: NOISE_CORRELATION times the variance of independent ones."""
+    rng = np.random.default_rng(9)
+    templates, cells = patches(400, SHIFT, contrast=15.0)
+    for sigma in (3.0, 9.0):
+        noise = rng.standard_normal((2, 400, CELL_PX + 8, CELL_PX + 8)).astype(np.float32)
+        smooth = np.array([[cv2.GaussianBlur(cell, (0, 0), 0.5) for cell in image] for image in noise])
+        smooth = smooth[:, :, 4:-4, 4:-4] * sigma / smooth.std()
+        noisy = [np.clip(np.rint(image + n), 0, 255).astype(np.uint8)
+                 for image, n in zip((templates, cells), smooth, strict=True)]
+        fit = fit_patches(noisy[0], noisy[1], ONE_IMAGE, sigma)
+        squared = np.einsum("ni,nij,nj->n", error(fit), np.linalg.inv(fit.covariance[fit.fits]), error(fit))
+        assert fit.fits.mean() > 0.8
+        assert 0.5 < np.sqrt(np.median(squared) / 1.386) < 1.5  # the median of chi^2 with two degrees is 1.386
+
+
+def test_flat_patches_and_edges_without_an_end_do_not_fit() -> None:
+    ramp = np.broadcast_to(np.linspace(20, 200, CELL_PX).astype(np.uint8), (5, CELL_PX, CELL_PX))
+    flat = np.full((5, CELL_PX, CELL_PX), 90, np.uint8)
+    for image in (ramp, flat):
+        fit = fit_patches(image, image, np.zeros(5, np.intp), 1.0)
+        assert not fit.fits.any() and np.isfinite(fit.covariance).all()
+
+
+def test_no_patches() -> None:
+    none = np.zeros((0, CELL_PX, CELL_PX), np.uint8)
+    fit = fit_patches(none, none, np.zeros(0, np.intp), 1.0)
+    assert fit.shift.shape == (0, 2) and fit.covariance.shape == (0, 2, 2) and fit.fits.shape == (0,)
