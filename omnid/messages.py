@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,17 +38,57 @@ class Panoramas:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StereoDepth:
-    """Disparities of the lower panorama and their points."""
+class DensePoints:
+    """Disparities of a lower panorama and their points."""
 
-    seq: int
-    stamp_ns: int
-    panoramas: Panoramas
     disparity: NDArray[np.float32]  # (H, W) px > 0, NaN unknown
     pixels: Array  # (N, 2) column, row of the matched pixels
     points: Array  # (N, 3) m, in the rig frame
     variance_m2: Array  # (N,) along the ray, where it is largest
-    rig_fits: bool = True  # False: the images contradict the rig, so that no result of them is better than degraded
+
+
+class StereoDepth:
+    """Panoramas of a pair, and their dense depth, which is computed when it is first read.
+
+    Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map.
+    Any thread may read. Two threads that read at the same time may both compute it, with the same result.
+    rig_fits is False if the images contradict the rig, so that no result of them is better than degraded.
+    """
+
+    __slots__ = ("_compute", "_dense", "panoramas", "rig_fits", "seq", "stamp_ns")
+
+    def __init__(self, panoramas: Panoramas, compute: Callable[[Panoramas], DensePoints], *, rig_fits: bool = True
+                 ) -> None:
+        self.seq, self.stamp_ns, self.panoramas = panoramas.seq, panoramas.stamp_ns, panoramas
+        self.rig_fits = rig_fits
+        self._compute = compute
+        self._dense: DensePoints | None = None
+
+    def dense(self) -> DensePoints:
+        """Return the dense depth; compute it the first time."""
+        if self._dense is None:
+            self._dense = self._compute(self.panoramas)
+        return self._dense
+
+    @property
+    def disparity(self) -> NDArray[np.float32]:
+        """Disparities (H, W) [px] > 0 of the lower panorama, NaN: unknown."""
+        return self.dense().disparity
+
+    @property
+    def pixels(self) -> Array:
+        """Column and row (N, 2) of the matched pixels."""
+        return self.dense().pixels
+
+    @property
+    def points(self) -> Array:
+        """Points (N, 3) [m] in the rig frame."""
+        return self.dense().points
+
+    @property
+    def variance_m2(self) -> Array:
+        """Variances (N,) of the points along the ray, where they are largest."""
+        return self.dense().variance_m2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,9 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from omnid.engine.telemetry import StageStats
 
 T = TypeVar("T")
+In = TypeVar("In")
+Mid = TypeVar("Mid")
+Out = TypeVar("Out")
 T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
 In_contra = TypeVar("In_contra", contravariant=True)
@@ -31,6 +34,18 @@ class Stage(Protocol[In_contra, Out_co]):
 
     def process(self, message: In_contra, /) -> Out_co | None:
         """Return the result of the message, None without one."""
+
+
+class Chain(Generic[In, Mid, Out]):
+    """Two stages as one: the second takes each result of the first, in the same thread. Neither may have `finish`."""
+
+    def __init__(self, first: Stage[In, Mid], second: Stage[Mid, Out]) -> None:
+        self._first, self._second = first, second
+
+    def process(self, message: In, /) -> Out | None:
+        """Return the result of both stages, None without one."""
+        between = self._first.process(message)
+        return None if between is None else self._second.process(between)
 
 
 class Sink(Protocol[In_contra]):

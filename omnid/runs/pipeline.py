@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas
 from omnid.sinks.drive import LiveDrive, ReplayDrive
@@ -53,8 +54,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
-    depths = graph.stage("stereo", stereo, panoramas)
-    odometry = graph.stage("odometry", OdometryStage(geometry, config.odometry), depths)
+    odometry = graph.stage("odometry", Chain(stereo, OdometryStage(geometry, config.odometry)), panoramas)
     outgoing: dict[str, Stream[Outgoing]] = {
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
     mapping = Mapping(config.mapping, sinks.map_every_s) if sinks.maps or sinks.recorder or sinks.bus else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,11 @@ Array = NDArray[np.float64]
 
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
+
+
+SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2  # less motion shows the same points again
+STANDING_NS = 1_000_000_000  # between two pairs of the same view that enter the map
+STAMP_JITTER_NS = 5_000_000  # so that a period of the cameras that divides that of the map does divide it
 
 
 class ThinnedPath:
@@ -53,7 +60,9 @@ class Mapping:
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
         self._path = ThinnedPath(config.path_poses)
         self._newest: tuple[int, int] | None = None
-        self._frames = 0
+        self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0
+        self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
+        self._frames = 0  # that entered the map
 
     @property
     def counts(self) -> dict[str, int]:
@@ -63,9 +72,10 @@ class Mapping:
     def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
         """Add the points of a pair; return the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
-        self._frames += 1
         self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
-        if odometry.state == TrackingState.TRACKING:
+        if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
+            self._mapped = odometry.stamp_ns, odometry.T_odom_rig
+            self._frames += 1
             depth = odometry.depth
             sure = depth.variance_m2 < self._config.max_sigma_m**2
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])
@@ -74,6 +84,18 @@ class Mapping:
             return None
         self._given_ns = odometry.stamp_ns
         return self._update(odometry.seq, odometry.stamp_ns)
+
+    def _is_due(self, odometry: OdometryUpdate) -> bool:
+        """True if a pair is to enter the map: so often, and sooner where the view has changed.
+
+        Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new.
+        """
+        if self._mapped is None or not self._min_gap_ns:
+            return True
+        since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
+        is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
+        wait_ns = max(self._min_gap_ns, STANDING_NS) if is_same_view else self._min_gap_ns
+        return since_ns >= wait_ns - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:
         """Return the final map, if there was a pair."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from omnid.config import StereoConfig
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import Panoramas, StereoDepth
+from omnid.messages import DensePoints, Panoramas, StereoDepth
 from omnid.stages.geometry import Geometry
 from omnid.stages.rig_gate import RigGate
 
@@ -30,14 +31,18 @@ class Stereo:
         """rig_gate: sees all panoramas first, and raises OmnidError where they contradict the rig."""
         self._geometry, self._config = geometry, config
         self._T_rig_rect = geometry.T_rig_rect
-        self._matcher: Matcher | None = None
+        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
         self._rig_gate = rig_gate
 
     def process(self, panoramas: Panoramas) -> StereoDepth:
-        """Return disparities and their points in the rig frame."""
+        """Return the depth of a pair, which is computed when it is first read."""
         gate = self._rig_gate
         if gate is not None:
             gate.process(panoramas)
+        return StereoDepth(panoramas, self.dense, rig_fits=gate is None or not gate.doubtful)
+
+    def dense(self, panoramas: Panoramas) -> DensePoints:
+        """Return disparities and their points in the rig frame. May be called in several threads at the same time."""
         columns, rows, found = self._match(panoramas)
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = found
@@ -46,18 +51,18 @@ class Stereo:
         kept = np.isfinite(points).all(axis=1)
         variance_m2 = self._variance_m2(points[kept])
         points = se3.apply(self._T_rig_rect, points[kept])
-        return StereoDepth(
-            panoramas.seq, panoramas.stamp_ns, panoramas, disparity, views[kept, :2], points, variance_m2,
-            rig_fits=gate is None or not gate.doubtful,
-        )
+        return DensePoints(disparity, views[kept, :2], points, variance_m2)
 
     def _match(self, panoramas: Panoramas) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
         """Return columns (N,), rows (N,) and disparities (N,) [px] of the matched pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
-        if self._matcher is None:
-            self._matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
-        pixels, disparity = self._matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey)
+        try:
+            matcher = self._idle.pop()
+        except IndexError:
+            matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
+        pixels, disparity = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey)
+        self._idle.append(matcher)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
 

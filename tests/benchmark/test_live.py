@@ -25,7 +25,7 @@ LATEST_MS = 20.0  # largest lateness of the motor's tick, 99.9th percentile
 MOTOR_HZ = 50.0
 PERIOD_S = 5.0  # between two samples of the soak test
 GROWTH_MB = 8.0  # allowed growth from the first half to the second: noise of the allocator
-STAGES = ("lower", "upper", "pair", "dewarp", "stereo", "odometry", "mapping", "bus", "bus-drive", "bus-map")
+STAGES = ("lower", "upper", "pair", "dewarp", "odometry", "mapping", "bus", "bus-drive", "bus-map")
 
 
 @contextmanager

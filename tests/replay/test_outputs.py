@@ -112,7 +112,7 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/tf": PAIRS, "/rover/drive": PAIRS,
                       "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 2}
     assert last.value(SUMMARY, "poses") == last.value(stage_name("odometry"), "processed") == str(PAIRS)
-    assert float(last.value(stage_name("stereo"), "work_p50_ms")) > 0.1
+    assert float(last.value(stage_name("odometry"), "work_p50_ms")) > 0.1
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"

@@ -70,7 +70,7 @@ def test_a_recording_holds_all_messages_rig_and_settings(
     assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
     assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
     parts = {status.name for message in of(messages, "/omnid/status") for status in message.content.status}
-    assert parts >= {ODOMETRY, WHEELS, camera_name("lower"), stage_name("stereo")}
+    assert parts >= {ODOMETRY, WHEELS, camera_name("lower"), stage_name("odometry")}
 
 
 def test_log_times_are_the_stamps(messages: list[Message]) -> None:

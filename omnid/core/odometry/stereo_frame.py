@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,13 +13,18 @@ from omnid.core.odometry.tracking import PaddedPanorama
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """Both panoramas, and the disparity image (H, W) float32 [px] of the lower one, NaN: unknown."""
+    """Both panoramas, and the disparity image of the lower one, which may be computed when it is first read."""
 
     seq: int
     lower: PaddedPanorama
     upper: PaddedPanorama
-    disparity: NDArray[np.float32]
+    disparities: NDArray[np.float32] | Callable[[], NDArray[np.float32]]  # the image, or the function that returns it
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
+
+    @property
+    def disparity(self) -> NDArray[np.float32]:
+        """Disparities (H, W) [px] of the lower panorama, NaN: unknown."""
+        return self.disparities() if callable(self.disparities) else self.disparities
 
 
 def _no_pixels() -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.core.stereo.sad import NO_MATCH, Costs, Indices, SadVolume, local_minima, subpixel
-from omnid.core.stereo.semiglobal import SemiGlobalPrior
+from omnid.core.stereo.semiglobal import SemiGlobalPrior, WarpedSad, refined
 from omnid.settings import knob
 
 Image = NDArray[np.uint8]
@@ -26,7 +26,6 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
 METHODS = ("sad", "enhanced", "semiglobal")
-REACH_PX = 3  # searched about the prior, which comes from half the resolution and is rounded
 MIN_DISPARITY_PX = 0.5  # a smaller one is a point at infinity, within the noise
 LEFT_RIGHT_PX = 1  # largest disagreement of the disparities that both panoramas choose
 EDGE_NOISE = 6.0  # Sobel response that noise of one grey level reaches in one pixel of a hundred
@@ -86,27 +85,26 @@ class Matcher:
 
 
 class SemiGlobalSearch:
-    """SAD within REACH_PX of a semi-global prior."""
+    """SAD near a semi-global prior."""
 
     def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._prior = SemiGlobalPrior(matching.disparities)
-        self._volume = SadVolume(shape, matching.disparities, matching.window_px)
+        self._sad = WarpedSad(shape, matching.window_px)
+        self._disparities = matching.disparities  # the prior may search more
         self._max_cost = matching.max_difference * matching.window_px**2
 
     def search(self, lower: Image, upper: Image, pixels: Indices) -> Matches:
-        """Return the pixels with a prior and a minimum of the SAD near it."""
-        prior = self._prior.disparity(lower, upper).reshape(-1)[pixels]
-        pixels, rounded = pixels[np.isfinite(prior)], np.rint(prior[np.isfinite(prior)]).astype(np.intp)
-        if not len(pixels):
-            return pixels, np.zeros(0, np.float32)
-        first, last = max(0, int(rounded.min()) - REACH_PX), int(rounded.max()) + REACH_PX
-        self._volume.fill(lower, upper, range(first, min(last + 1, len(self._volume.planes))))
-        costs = self._volume.around(pixels, rounded, REACH_PX)
+        """Return the pixels with a prior and a minimum of the SAD near it, whose match lies in the image."""
+        prior, known = self._prior.disparity(lower, upper)
+        pixels = pixels[known.reshape(-1)[pixels]]
+        costs = self._sad.costs(lower, upper, prior, pixels)
         is_minimum = local_minima(costs, int(self._max_cost))
         step = np.where(is_minimum, costs, NO_MATCH).argmin(axis=0)
-        disparity = rounded - REACH_PX + subpixel(costs, step)
-        kept = is_minimum.any(axis=0) & (disparity > MIN_DISPARITY_PX)
-        return pixels[kept], disparity[kept].astype(np.float32)
+        disparity = refined(prior, pixels, costs, step)
+        inside = pixels // lower.shape[1] + disparity < len(lower)
+        in_range = (disparity > MIN_DISPARITY_PX) & (disparity < self._disparities)
+        kept = is_minimum.any(axis=0) & in_range & inside
+        return pixels[kept], disparity[kept]
 
 
 class ColumnSearch:

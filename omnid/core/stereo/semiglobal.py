@@ -1,4 +1,4 @@
-"""Semi-global matching at half resolution: a prior for the disparity of every pixel.
+"""Semi-global matching at a quarter of the resolution, refined at full resolution by the SAD near it.
 
 Where a texture repeats, the window of a pixel cannot distinguish its candidates. The path costs of Hirschmueller 2008
 carry the answer from where it is unambiguous. OpenCV's StereoSGBM (8 paths) computes them on transposed panoramas; the
@@ -11,40 +11,89 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.stereo.sad import Costs, Indices, subpixel
+
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
-BLOCK_PX = 3  # side of StereoSGBM's matching window at half resolution
-SMALL_STEP_PENALTY = 50  # for a change of disparity by one: walls are smooth
+BLOCK_PX = 3  # side of StereoSGBM's matching window at the prior's resolution
+SMALL_STEP_PENALTY = 100  # for a change of disparity by one: walls are smooth
 LARGE_STEP_PENALTY = 3200  # for a larger change: depth edges are rare
 LEFT_RIGHT_PX = 1  # largest disagreement of the disparities of both panoramas
 PREFILTER_CAP = 31  # at which StereoSGBM cuts off the gradients it compares
 SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel
 STEP_ROWS = 16  # StereoSGBM searches a multiple of so many disparities
-SCALE = 2  # the prior is computed at half resolution
+SCALE = 4  # the prior is computed at a quarter of the resolution: 8 paths there cost as much as one pass of the SAD
+FILL_PX = 5  # at the prior's resolution: unknown pixels take the largest disparity so near: no holes
+REACH_PX = 3  # searched about the prior
 
 
 class SemiGlobalPrior:
-    """Computes disparities of the lower panorama from half-size images; keeps OpenCV's buffers."""
+    """Computes disparities of the lower panorama from small images; keeps OpenCV's buffers.
+
+    One thread may use it at a time.
+    """
 
     def __init__(self, disparities: int) -> None:
-        self._rows = STEP_ROWS * max(1, -(-disparities // (SCALE * STEP_ROWS)))  # searched at half resolution
+        self._rows = STEP_ROWS * max(1, -(-disparities // (SCALE * STEP_ROWS)))  # searched at the prior's resolution
         self._matcher = cv2.StereoSGBM.create(
             minDisparity=0, numDisparities=self._rows, blockSize=BLOCK_PX, P1=SMALL_STEP_PENALTY,
             P2=LARGE_STEP_PENALTY, disp12MaxDiff=LEFT_RIGHT_PX, preFilterCap=PREFILTER_CAP, uniquenessRatio=0,
             mode=cv2.STEREO_SGBM_MODE_HH)
 
-    def disparity(self, lower: Image, upper: Image) -> Floats:
-        """Return disparities (H, W) float32 [px at full size], good to about half a pixel; NaN where unknown."""
-        found = self._matcher.compute(self._transposed_half(lower), self._transposed_half(upper))
-        half = found[:, : self._rows - 1 : -1].T.astype(np.float32) * (SCALE / SUBPIXEL)
-        half[half <= 0] = np.nan
-        return np.asarray(cv2.resize(half, lower.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+    def disparity(self, lower: Image, upper: Image) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return disparities (H, W) float32 [px at full size], good to about a pixel, and flags of the known ones.
 
-    def _transposed_half(self, panorama: Image) -> Image:
-        """Return the panorama at half size, transposed and mirrored: its columns become rows, searched leftwards.
+        Unknown ones are those of known neighbours, or 0.
+        """
+        found = self._matcher.compute(self._transposed_small(lower), self._transposed_small(upper))
+        small = np.maximum(found[:, : self._rows - 1 : -1].T, 0)
+        near = cv2.dilate(small, np.ones((FILL_PX, FILL_PX), np.uint8))
+        filled = np.where(small > 0, small, near).astype(np.float32) * np.float32(SCALE / SUBPIXEL)
+        size = lower.shape[::-1]
+        known = cv2.resize((small > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        return np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32), known.view(bool)
+
+    def _transposed_small(self, panorama: Image) -> Image:
+        """Return the panorama at the prior's size, transposed and mirrored: columns become rows, searched leftwards.
 
         StereoSGBM skips as many pixels at the start of a row as it searches; the repeated border fills them.
         """
-        half = cv2.resize(panorama, None, fx=1 / SCALE, fy=1 / SCALE, interpolation=cv2.INTER_AREA)
-        return np.ascontiguousarray(cv2.copyMakeBorder(half, 0, self._rows, 0, 0, cv2.BORDER_REPLICATE).T[:, ::-1])
+        small = cv2.resize(panorama, None, fx=1 / SCALE, fy=1 / SCALE, interpolation=cv2.INTER_AREA)
+        return np.ascontiguousarray(cv2.copyMakeBorder(small, 0, self._rows, 0, 0, cv2.BORDER_REPLICATE).T[:, ::-1])
+
+
+class WarpedSad:
+    """SAD of pixels near a prior: the upper panorama is warped by the prior, so that a few shifts are compared at once.
+
+    With the warped panorama W(y) = upper(y + d(y)), a pixel whose SAD against W is least at the shift k has the
+    disparity k + d(y + k).
+    """
+
+    def __init__(self, shape: tuple[int, int], window_px: int) -> None:
+        self._window = (window_px, window_px)
+        self._columns, self._rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1]))
+
+    def costs(self, lower: Image, upper: Image, prior: Floats, pixels: Indices) -> Costs:
+        """Return the costs (2 REACH_PX + 1, N) of pixels (flat indices) of the lower panorama, by shift."""
+        height = len(lower)
+        warped = cv2.remap(upper, self._columns, self._rows + prior, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        padded = cv2.copyMakeBorder(warped, REACH_PX, REACH_PX, 0, 0, cv2.BORDER_REPLICATE)
+        costs = np.empty((2 * REACH_PX + 1, len(pixels)), np.uint16)
+        for shift, row in enumerate(costs):
+            difference = cv2.absdiff(lower, padded[shift : shift + height])
+            plane = cv2.boxFilter(difference, cv2.CV_16U, self._window, normalize=False,
+                                  borderType=cv2.BORDER_REPLICATE)
+            np.take(plane.reshape(-1), pixels, out=row, mode="clip")
+        return costs
+
+
+def refined(prior: Floats, pixels: Indices, costs: Costs, step: Indices) -> Floats:
+    """Return the disparities (N,) of pixels whose cost is least at a step (N,) of costs, to fractions of a pixel."""
+    height, width = prior.shape
+    shift = subpixel(costs, step) - REACH_PX
+    row = pixels // width + shift
+    above = np.clip(np.floor(row).astype(np.intp), 0, height - 2)
+    before, after = (prior.reshape(-1)[(above + k) * width + pixels % width] for k in (0, 1))
+    along = np.clip(row - above, 0, 1).astype(np.float32)
+    return np.asarray(shift + before + along * (after - before), np.float32)

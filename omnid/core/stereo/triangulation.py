@@ -10,6 +10,7 @@ from calib.panorama import Cylinder
 Array = NDArray[np.float64]
 
 PARALLEL_CROSS2 = 1e-14  # squared length of the cross product of two rays below which they count as parallel
+MIN_DISPARITY_RAD = 1e-7  # the same for the rays of a view, which have r = 1
 MIN_RADIUS_M = 1e-9  # from the axis: a point on it has no disparity
 MIN_RADIUS2_M2 = 1e-12  # the same, squared, in derivatives
 
@@ -33,10 +34,14 @@ def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Arr
 
 
 def triangulate(views: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Return points (N, 3) [m] in the rectified frame of views (N, 3) = (column, row in lower, row in upper) [px]."""
-    lower = cylinder.rays(views[:, :2])
-    upper = cylinder.rays(views[:, [0, 2]])
-    return common_perpendicular(lower, upper, np.array([0.0, 0.0, baseline_m]))
+    """Return points (N, 3) [m] in the rectified frame of views (N, 3) = (column, row in lower, row in upper) [px].
+
+    Both rays of a view lie in one plane through the axis, so that they meet: at r = f t / disparity. NaN for rays that
+    are parallel or diverge.
+    """
+    disparity = views[:, 2] - views[:, 1]
+    disparity = np.where(disparity > MIN_DISPARITY_RAD * cylinder.focal_px, disparity, np.nan)
+    return np.asarray(cylinder.rays(views[:, :2]) * (cylinder.focal_px * baseline_m / disparity)[:, None])
 
 
 def view(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:

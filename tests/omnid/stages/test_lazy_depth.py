@@ -1,0 +1,71 @@
+"""Dense depth is computed when it is first read, and for the pairs that enter the map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.config import MappingConfig
+from omnid.engine.flow import Chain
+from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
+from omnid.stages.mapping import Mapping
+from omnid.tracking_state import TrackingState
+from tests.omnid.core.scenery import wrapped
+
+MS = 1_000_000
+IMAGE = np.zeros((4, 100), np.uint8)
+
+
+class Counted:
+    """Depth of pairs, and how often it was computed for which."""
+
+    def __init__(self) -> None:
+        self.computed: list[int] = []
+
+    def __call__(self, panoramas: Panoramas) -> DensePoints:
+        self.computed.append(panoramas.seq)
+        points = np.array([[1.0, 2.0, 0.5]])
+        return DensePoints(np.full((4, 100), np.nan, np.float32), np.zeros((1, 2)), points, np.full(1, 1e-4))
+
+    def depth(self, seq: int, stamp_ns: int) -> StereoDepth:
+        panorama = wrapped(IMAGE)
+        return StereoDepth(Panoramas(seq, stamp_ns, panorama, panorama, IMAGE > 0), self)
+
+
+def test_depth_is_computed_once_and_only_where_it_is_read() -> None:
+    counted = Counted()
+    depth = counted.depth(3, 5 * MS)
+    assert (depth.seq, depth.stamp_ns, depth.panoramas.seq) == (3, 5 * MS, 3) and counted.computed == []
+    assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2) == 1 and depth.disparity.shape == (4, 100)
+    assert counted.computed == [3]
+
+
+@pytest.mark.parametrize(("rate_hz", "speed_mps", "expected"), [
+    (5.0, 1.0, 10),  # as often as the rate says, of 30 pairs a second for 2 s
+    (0.0, 0.0, 60),  # all
+    (5.0, 0.0, 2),  # at rest, once a second
+    (1000.0, 0.5, 30),  # as soon as the view has changed by 3 cm, which is every second pair
+])
+def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, speed_mps: float, expected: int
+                                                               ) -> None:
+    counted, mapping = Counted(), Mapping(MappingConfig(rate_hz=rate_hz))
+    for seq in range(60):
+        stamp_ns = round(seq * 1e9 / 30)
+        T = se3.transform(np.eye(3), np.array([speed_mps * stamp_ns * 1e-9, 0, 0]))
+        mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
+                                       50, 50, counted.depth(seq, stamp_ns)))
+    assert len(counted.computed) == expected
+    assert len(mapping.finish()[0].path_xy) == 61  # the path has every pose
+
+
+class Half:
+    """Passes on half of an even number."""
+
+    def process(self, number: int) -> int | None:
+        return None if number % 2 else number // 2
+
+
+def test_a_chain_passes_results_on_and_nothing_without_one() -> None:
+    chain = Chain(Half(), Half())
+    assert [chain.process(number) for number in (8, 6, 5)] == [2, None, None]
