@@ -145,9 +145,10 @@ class StatusCollector:
         values |= _times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel)
         values |= _times(status_names.TICK_LATE, controller.lateness)
         values[time_key(status_names.TICK_LATE, "p999")] = f"{1e3 * controller.lateness.p(0.999):.2f}"
+        values |= {f"{status_names.IGNORED_PREFIX}{reason}": str(count) for reason, count in state.refused.items()}
         values |= _arming(state)
         if commands is not None:
-            refused = dict(commands.refused) | dict(state.refused)  # a copy, for another thread adds to it
+            refused = dict(commands.refused)  # a copy, for another thread adds to it
             values |= {Key.COMMANDS: str(commands.accepted), Key.STOPS: str(commands.stops)}
             values |= {f"{status_names.REFUSED_PREFIX}{reason}": str(count) for reason, count in refused.items()}
         message = state.reason or "driving"

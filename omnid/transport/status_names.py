@@ -26,7 +26,8 @@ SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
 
 STOPPED_PREFIX: Final = "stopped, "  # begins the keys that count stops of the wheels, by reason
-REFUSED_PREFIX: Final = "refused, "  # begins the keys that count refused commands, by reason
+REFUSED_PREFIX: Final = "refused, "  # begins the keys that count commands that are not valid, by reason
+IGNORED_PREFIX: Final = "ignored, "  # begins the keys that count valid commands that may not drive, by reason
 
 DISARMED_BY_STOP: Final = ASKED  # the value of disarmed_by after a stop
 

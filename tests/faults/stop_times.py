@@ -77,7 +77,8 @@ def _images(line: str) -> Callable[[Robot], None]:
 
 
 CAUSES: Final[dict[str, Cause]] = {
-    "cmd/stop, the operator goes on sending": Cause(lambda robot: robot.operator.send("cmd/stop", b""), _nothing),
+    "cmd/stop, the operator goes on sending": Cause(lambda robot: robot.operator.send("cmd/stop", b""),
+                                                    lambda robot: robot.operator.arm()),
     "the operator sends no more": Cause(lambda robot: robot.operator.stop_sending(), _nothing),
     "the operator leaves the bus": Cause(lambda robot: robot.operator.close(), None),
     "no images of one camera": Cause(_images("upper mute"), _images("both ok")),

@@ -132,6 +132,10 @@ class Operator:
         """Send no more commands."""
         self._wish = None
 
+    def arm(self) -> None:
+        """Arm the robot."""
+        self.send("cmd/arm", codec.header_cdr(time.time_ns()))
+
     def send(self, key: str, payload: bytes) -> None:
         """Send a message once."""
         self._session.put(f"omnid/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)  # none is dropped

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from omnid.formats.tum import read_tum
-from omnid.transport import codec
 from tests.replay.command import Command
 from tests.replay.live import PATIENCE_S, ROOT, answers, free_port, robot, started, wait_until
 
@@ -42,7 +41,7 @@ def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, s
         wait_until(lambda: operator.values("wheels").get("stops") == "1", "the stop's count")
         operator.drive(0.2)
         wait_until(lambda: operator.message("wheels") == "a stop was asked for", "the stop in the status")
-        operator.send("cmd/arm", codec.header_cdr(time.time_ns()))
+        operator.arm()
         wait_until(lambda: base.line.base.velocity_mps > 0.15, "motion after the stop")
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, err
