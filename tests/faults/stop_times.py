@@ -1,7 +1,7 @@
 """Times from a cause to wheels at rest, judged at the motor controller's side of the serial line.
 
-Each stop begins at full motion and at a random moment of the period of images and commands. Causes that end the daemon
-start it again for each stop.
+Each stop begins at full motion and at a random moment of the period of images and commands, which go on. When a cause
+that disarms has ended, nothing may move before cmd/arm. Causes that end the daemon start it again for each stop.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from tests.replay.live import Base, Daemon, Operator, robot, wait_until
 
 SPEED_MPS: Final = 0.3
 POLL_S: Final = 0.002
-STILL_S: Final = 0.3  # wheels at rest must stay there for so long while the cause lasts
+STILL_S: Final = 0.3  # wheels at rest must stay there for so long, while the cause lasts and after it
+ARM_PERIOD_S: Final = 0.2
+MANUAL: Final = ("--set", "controller.arming=manual")
 PHASE_S: Final = 0.2  # span of the random moments
 
 
@@ -45,7 +47,8 @@ class Cause(NamedTuple):
     """A cause of a stop: `begin` brings it about, `end` undoes it where the daemon lives on."""
 
     begin: Callable[[Robot], None]
-    end: Callable[[Robot], None] | None  # None: the daemon does not survive it
+    end: Callable[[Robot], None] | None  # None: the robot does not survive it
+    disarms: bool = True
 
 
 def _nothing(_: Robot) -> None:
@@ -77,9 +80,8 @@ def _images(line: str) -> Callable[[Robot], None]:
 
 
 CAUSES: Final[dict[str, Cause]] = {
-    "cmd/stop, the operator goes on sending": Cause(lambda robot: robot.operator.send("cmd/stop", b""),
-                                                    lambda robot: robot.operator.arm()),
-    "the operator sends no more": Cause(lambda robot: robot.operator.stop_sending(), _nothing),
+    "cmd/stop, the operator goes on sending": Cause(lambda robot: robot.operator.send("cmd/stop", b""), _nothing),
+    "the operator sends no more": Cause(lambda robot: robot.operator.stop_sending(), _nothing, disarms=False),
     "the operator leaves the bus": Cause(lambda robot: robot.operator.close(), None),
     "no images of one camera": Cause(_images("upper mute"), _images("both ok")),
     "no images at all": Cause(_images("both mute"), _images("both ok")),
@@ -96,10 +98,24 @@ CAUSES: Final[dict[str, Cause]] = {
 }
 
 
+def begin_motion(robot: Robot) -> None:
+    """Have the operator drive, and arm until the wheels have reached the speed."""
+    base = robot.base
+    robot.operator.drive(SPEED_MPS)
+
+    def moves() -> bool:
+        if not base.drives:
+            robot.operator.arm()
+            time.sleep(ARM_PERIOD_S)
+        return base.line.base.velocity_mps > 0.9 * SPEED_MPS
+
+    wait_until(moves, "motion")
+
+
 def measured(robot: Robot, cause: Cause, rng: random.Random) -> StopTime:
     """Drive, bring the cause about, and return the times until the wheels rest."""
     base = robot.base
-    wait_until(lambda: base.line.base.velocity_mps > 0.9 * SPEED_MPS, "motion")
+    begin_motion(robot)
     time.sleep(rng.uniform(0.0, PHASE_S))
     begin_s = time.monotonic()
     cause.begin(robot)
@@ -108,9 +124,18 @@ def measured(robot: Robot, cause: Cause, rng: random.Random) -> StopTime:
         time.sleep(POLL_S)
     rest_s = time.monotonic()
     time.sleep(STILL_S)
+    assert not base.line.moved_since(rest_s), "the wheels turned again while the cause lasted"
     moving = [note.at_s for note in list(base.line.notes) if note.at_s > begin_s and any(note.wheels_mps)]
-    assert not moving or moving[-1] <= rest_s, "the wheels turned again while the cause lasted"
     return StopTime(moving[-1] - begin_s if moving else 0.0, rest_s - begin_s)
+
+
+def end_cause(robot: Robot, cause: Cause) -> None:
+    """Undo a cause; nothing may move for STILL_S although the operator sends, unless the cause does not disarm."""
+    assert cause.end is not None
+    since_s = time.monotonic()
+    cause.end(robot)
+    time.sleep(STILL_S)
+    assert not cause.disarms or not robot.base.line.moved_since(since_s), "the wheels turned again without cmd/arm"
 
 
 def stop_times(recorded: Path, folder: Path, name: str, count: int, seed: int) -> list[StopTime]:
@@ -124,19 +149,16 @@ def stop_times(recorded: Path, folder: Path, name: str, count: int, seed: int) -
     with started(recorded, folder / "0") as one:
         for _ in range(count):
             times.append(measured(one, cause, rng))
-            cause.end(one)
-            one.operator.drive(SPEED_MPS)
+            end_cause(one, cause)
     return times
 
 
 @contextmanager
 def started(recorded: Path, folder: Path) -> Iterator[Robot]:
-    """Yield a robot whose operator drives it."""
+    """Yield a robot that needs cmd/arm."""
     folder.mkdir(parents=True)
-    with robot(recorded, folder, module=FAULTY_DAEMON) as parts:
-        one = Robot(*parts)
-        one.operator.drive(SPEED_MPS)
-        yield one
+    with robot(recorded, folder, *MANUAL, module=FAULTY_DAEMON) as parts:
+        yield Robot(*parts)
 
 
 def row(name: str, times: list[StopTime]) -> str:

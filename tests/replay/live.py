@@ -133,7 +133,7 @@ class Operator:
         self._wish = None
 
     def arm(self) -> None:
-        """Arm the robot."""
+        """Ask to arm."""
         self.send("cmd/arm", codec.header_cdr(time.time_ns()))
 
     def send(self, key: str, payload: bytes) -> None:
