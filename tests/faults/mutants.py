@@ -1,0 +1,191 @@
+"""Faults put into the code that moves the wheels: `python -m tests.faults.mutants` lists those that no test notices.
+
+Each mutant changes one operator, number or word of omnid/core/control, omnid/controller or drivers/motors in a copy of
+the repository, where the tests of that code run. A mutant that survives is a missing test, or changes nothing that
+matters: a person judges it (tests/faults/RESULTS.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+ROOT: Final = Path(__file__).parents[2]
+COPIED: Final = ("omnid", "drivers", "calib", "tests", "pyproject.toml")
+TIMEOUT_S: Final = 300.0
+CONTROL_TESTS: Final = ("tests/omnid/core/control", "tests/omnid/controller", "tests/omnid/stages",
+                        "tests/omnid/transport/test_commands.py")
+MOTOR_TESTS: Final = ("tests/drivers/motors", "tests/contract", "tests/omnid/controller/test_motor.py")
+TESTS: Final = {"omnid/core/control": CONTROL_TESTS, "omnid/controller": CONTROL_TESTS, "drivers/motors": MOTOR_TESTS}
+SWAPS: Final[dict[type[ast.AST], tuple[str, str]]] = {
+    ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"), ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="), ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"),
+    ast.And: ("and", "or"), ast.Or: ("or", "and"), ast.Is: ("is", "is not"), ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"), ast.BitOr: ("|", "&"), ast.BitAnd: ("&", "|"),
+}
+NAMES: Final = {"min": "max", "max": "min", "any": "all", "all": "any", "abs": "", "wrap_angle": ""}
+
+
+class Mutant(NamedTuple):
+    """A change of one place in a file."""
+
+    path: str
+    line: int
+    start: int  # offset in the file's characters
+    end: int
+    text: str  # in its place
+
+    def apply(self, source: str) -> str:
+        """Return the changed source."""
+        return source[: self.start] + self.text + source[self.end:]
+
+    def described(self, source: str) -> str:
+        """Return place and change in one line."""
+        after = self.apply(source).splitlines()[self.line - 1].strip()
+        return f"{self.path}:{self.line}: `{source.splitlines()[self.line - 1].strip()}` -> `{after}`"
+
+
+class _Finder(ast.NodeVisitor):
+    """Collects the mutants of one file; settings' declarations, annotations and texts are left alone."""
+
+    def __init__(self, path: str, source: str) -> None:
+        self._path, self._source = path, source
+        self._starts = [0]
+        for line in source.splitlines(keepends=True):
+            self._starts.append(self._starts[-1] + len(line))
+        self.found: list[Mutant] = []
+
+    def visit_Call(self, node: ast.Call) -> None:
+        """Exchange some functions by others."""
+        name = node.func.id if isinstance(node.func, ast.Name) else ""
+        if name == "knob":
+            return
+        if name in NAMES:
+            self._add(node.lineno, self._start(node.func), self._end(node.func), NAMES[name])
+        self.generic_visit(node)
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+        """Visit the value only."""
+        if node.value is not None:
+            self.visit(node.value)
+
+    def visit_arguments(self, node: ast.arguments) -> None:
+        """Visit default values only."""
+        for default in (*node.defaults, *node.kw_defaults):
+            if default is not None:
+                self.visit(default)
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        """Exchange each comparison."""
+        for left, operator, right in zip([node.left, *node.comparators], node.ops, node.comparators, strict=False):
+            self._swap(operator, left, right)
+        self.generic_visit(node)
+
+    def visit_BinOp(self, node: ast.BinOp) -> None:
+        """Exchange an operator."""
+        self._swap(node.op, node.left, node.right)
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        """Exchange and, or."""
+        self._swap(node.op, node.values[0], node.values[1])
+        self.generic_visit(node)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
+        """Leave out a sign or a not."""
+        if isinstance(node.op, ast.Not | ast.USub):
+            self._add(node.lineno, self._start(node), self._start(node.operand), "")
+        self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        """Change a number or a truth value."""
+        if isinstance(node.value, bool):
+            self._add(node.lineno, self._start(node), self._end(node), str(not node.value))
+        elif isinstance(node.value, int | float):
+            self._add(node.lineno, self._start(node), self._end(node), f"({node.value!r} + 1)")
+
+    def _swap(self, operator: ast.AST, left: ast.AST, right: ast.AST) -> None:
+        old, new = SWAPS.get(type(operator), ("", ""))
+        start = self._end(left)
+        at = self._source.find(old, start, self._start(right))
+        if old and at >= 0:
+            self._add(self._source.count("\n", 0, at) + 1, at, at + len(old), new)
+
+    def _add(self, line: int, start: int, end: int, text: str) -> None:
+        self.found.append(Mutant(self._path, line, start, end, text))
+
+    def _start(self, node: ast.AST) -> int:
+        return self._starts[node.lineno - 1] + node.col_offset  # type: ignore[attr-defined]
+
+    def _end(self, node: ast.AST) -> int:
+        return self._starts[node.end_lineno - 1] + node.end_col_offset  # type: ignore[attr-defined]
+
+
+def mutants_of(path: str, source: str) -> list[Mutant]:
+    """Return all mutants of a file that Python can compile."""
+    finder = _Finder(path, source)
+    finder.visit(ast.parse(source))
+    return [mutant for mutant in finder.found if _compiles(mutant.apply(source))]
+
+
+def all_mutants(folders: Sequence[str]) -> Iterator[Mutant]:
+    """Yield the mutants of all files of the folders."""
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            yield from mutants_of(str(path.relative_to(ROOT)), path.read_text())
+
+
+def survives(mutant: Mutant, copy: Path) -> bool:
+    """True if no test notices the mutant in a copy of the repository."""
+    path, source = copy / mutant.path, (ROOT / mutant.path).read_text()
+    tests = next(tests for folder, tests in TESTS.items() if mutant.path.startswith(folder))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    path.write_text(mutant.apply(source))
+    try:
+        done = subprocess.run(command, cwd=copy, capture_output=True, timeout=TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    finally:
+        path.write_text(source)
+    return done.returncode == 0
+
+
+def _compiles(source: str) -> bool:
+    try:
+        compile(source, "mutant", "exec")
+    except SyntaxError:
+        return False
+    return True
+
+
+def main() -> int:
+    """Print the survivors of a sample of mutants."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.mutants", description=__doc__)
+    parser.add_argument("folders", nargs="*", default=list(TESTS), help=f"default: {' '.join(TESTS)}")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--count", type=int, default=200, help="mutants to try; default: %(default)s")
+    args = parser.parse_args()
+    everything = list(all_mutants(args.folders))
+    chosen = random.Random(args.seed).sample(everything, min(args.count, len(everything)))
+    survivors = 0
+    with tempfile.TemporaryDirectory() as name:
+        for entry in COPIED:
+            (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy)(ROOT / entry, Path(name) / entry)
+        for mutant in chosen:
+            if survives(mutant, Path(name)):
+                survivors += 1
+                print(mutant.described((ROOT / mutant.path).read_text()), flush=True)
+    print(f"{len(chosen)} of {len(everything)} mutants tried, {survivors} survived", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
