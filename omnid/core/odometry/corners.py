@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
+from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, flow, track
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -59,17 +59,17 @@ def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
 
 
 def rows_in_upper(
-    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings, *, checked: bool = True
 ) -> Array:
     """Return rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN without a match.
 
-    guess (N,) rows. A match passes the forward-backward check and lies in the same column within CROSS_PX, below the
-    point.
+    guess (N,) rows. A match passes the forward-backward check, if checked, and lies in the same column within CROSS_PX,
+    below the point.
     """
     lower, upper = pair
     start = np.column_stack([points[:, 0], guess])
     finite = np.flatnonzero(np.isfinite(guess))
-    there, good = track(lower, upper, points[finite], start[finite], klt)
+    there, good = (track if checked else flow)(lower, upper, points[finite], start[finite], klt)
     aside = (there[:, 0] - points[finite, 0] + lower.width / 2) % lower.width - lower.width / 2
     good &= (np.abs(aside) < CROSS_PX) & (there[:, 1] > points[finite, 1])
     rows = np.full(len(points), np.nan)

@@ -23,7 +23,7 @@ Indices = NDArray[np.intp]
 
 MIN_LANDMARKS = 6  # below which six unknowns are no estimate
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
-ROUNDS = 2  # of Gauss-Newton, each on the inliers of the one before
+STEPS = (2, 4)  # of Gauss-Newton in each round at most; a round takes the inliers of the one before
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
 COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet warped to the new viewpoint
@@ -120,23 +120,24 @@ class FrameToMap:
         """
         pair = frame.lower, frame.upper
         rows = tracks.pixels[:, 1] + tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        rows = rows_in_upper(pair, tracks.pixels, rows, self._stereo_klt)
+        # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
+        rows = rows_in_upper(pair, tracks.pixels, rows, self._stereo_klt, checked=False)
         rows, variance = align_rows(pair, tracks.pixels, rows)
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
         self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None
     ) -> tuple[GaussNewtonResult | None, Flags]:
-        """Return the solution of Gauss-Newton in ROUNDS, and flags (M,) of the inliers; None where they are too few."""
+        """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
         solution = None
-        for _ in range(ROUNDS):
+        for steps in STEPS:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
             of_views = None if noise is None else noise[kept]
             solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
-                                    of_views)
+                                    of_views, steps)
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.patch_alignment import AlignedPatches, affine_warps, align, warped_templates
-from omnid.core.odometry.patch_fit import CELL_PX
+from omnid.core.odometry.patch_fit import TEMPLATE_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import view
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+BACK_LEVELS = 1  # of the track back from a prediction: RANSAC rejects what it lets pass
 EDGE_ROWS = 3  # px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked
 
 
@@ -71,7 +72,9 @@ class LocalMap:
             rows, predicted = rows[::every], predicted[::every]
         if self._last is None:
             return Tracks(rows[:0], np.zeros((0, 2)), predicted[:0], 0)
-        pixels, found = track(self._last, lower, self.store.table.pixels[rows], predicted[:, :2], self._klt)
+        back_levels = BACK_LEVELS if most is None else self._klt.levels
+        before = self.store.table.pixels[rows]
+        pixels, found = track(self._last, lower, before, predicted[:, :2], self._klt, back_levels)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows))
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
@@ -96,7 +99,7 @@ class LocalMap:
         warps = affine_warps(
             table.views[landmarks], table.slopes[landmarks], T_curr_ref.reshape(-1, 4, 4), self._model
         )
-        templates = np.zeros((len(landmarks), CELL_PX, CELL_PX), np.uint8)
+        templates = np.zeros((len(landmarks), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
         for seq in np.unique(anchors).tolist():
             own = np.flatnonzero(anchors == seq)
             pixels = table.views[landmarks[own], :2]

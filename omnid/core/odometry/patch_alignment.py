@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.patch_fit import CELL_PX, PatchFit, fit_patches
+from omnid.core.odometry.patch_fit import CELL_PX, TEMPLATE_PX, PatchFit, fit_patches
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate, view
@@ -86,7 +86,7 @@ class AlignedPatches:
 
 
 def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices) -> AlignedPatches:
-    """Align patches (N, CELL, CELL), centred on predicted (N, 2), with the current panorama.
+    """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
     groups (N,): patches that come from one image have one number.
     """
@@ -102,8 +102,9 @@ def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, rows:
     """
     known = np.flatnonzero(np.isfinite(rows))
     predicted = np.column_stack([points[known, 0], rows[known]])
-    offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
-    found = align(_sample(pair[0], points[known], offsets), pair[1], predicted, np.zeros(len(known), np.intp))
+    upright = np.broadcast_to(np.eye(2), (len(known), 2, 2))
+    templates = warped_templates(pair[0], points[known], upright, predicted)
+    found = align(templates, pair[1], predicted, np.zeros(len(known), np.intp))
     fits = found.found & (np.abs(found.pixels[:, 0] - points[known, 0]) < CROSS_PX)
     aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
     aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
@@ -121,27 +122,31 @@ def view_noise(covariance: Array, row_variance: Array) -> Array:
 
 
 def warped_templates(keyframe: PaddedPanorama, pixels: Array, warps: Array, predicted: Array) -> Image:
-    """Return patches (N, CELL, CELL) of a keyframe around pixels (N, 2), warped, to be compared at predicted (N, 2)."""
-    offsets = _cell_offsets() + (np.rint(predicted) - predicted).astype(np.float32)[:, None]
-    return _sample(keyframe, pixels, offsets @ np.swapaxes(np.linalg.inv(warps), 1, 2).astype(np.float32))
+    """Return templates (N, TEMPLATE, TEMPLATE) of a keyframe around pixels (N, 2), warped, for predicted (N, 2).
+
+    They are sampled so that their pixels are whole pixels of the panorama in which they are predicted.
+    """
+    if not len(pixels):
+        return np.zeros((0, TEMPLATE_PX, TEMPLATE_PX), np.uint8)
+    back = np.linalg.inv(warps).astype(np.float32)
+    centre = (back @ (np.rint(predicted) - predicted).astype(np.float32)[:, :, None])[:, :, 0]
+    centre += np.column_stack([pixels[:, 0] % keyframe.width + keyframe.pad_px, pixels[:, 1]]).astype(np.float32)
+    side = np.arange(TEMPLATE_PX, dtype=np.float32) - TEMPLATE_PX // 2
+    columns, rows = (
+        (centre[:, axis, None] + back[:, axis, 1, None] * side)[:, :, None] + (back[:, axis, 0, None] * side)[:, None]
+        for axis in (0, 1)
+    )
+    shape = len(pixels), TEMPLATE_PX**2
+    patches = cv2.remap(keyframe.image, columns.reshape(shape), rows.reshape(shape), cv2.INTER_LINEAR,
+                        borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(patches, np.uint8).reshape(-1, TEMPLATE_PX, TEMPLATE_PX)
 
 
-def _cut(image: PaddedPanorama, centres: Array) -> Image:
-    """Return patches (N, CELL, CELL) around whole pixels (N, 2)."""
-    return _sample(image, centres, _cell_offsets()[None])
-
-
-def _cell_offsets() -> Floats:
-    """Return the positions (CELL * CELL, 2) of a cell's pixels relative to its centre."""
-    side = np.arange(CELL_PX, dtype=np.float32) - CELL_PX // 2
-    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-
-
-def _sample(image: PaddedPanorama, centres: Array, offsets: Floats) -> Image:
-    """Return patches (N, CELL, CELL) at centres (N, 2) + offsets (N or 1, CELL * CELL, 2), also across the seam."""
-    if not len(centres):
-        return np.zeros((0, CELL_PX, CELL_PX), np.uint8)
-    columns = (centres[:, :1] % image.width + image.pad_px).astype(np.float32) + offsets[..., 0]
-    rows = centres[:, 1:].astype(np.float32) + offsets[..., 1]
-    patches = cv2.remap(image.image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(patches, np.uint8).reshape(-1, CELL_PX, CELL_PX)
+def _cut(panorama: PaddedPanorama, centres: Array) -> Image:
+    """Return cells (N, CELL, CELL) around whole pixels (N, 2), also across the seam; the border is repeated."""
+    image, side = panorama.image, np.arange(CELL_PX) - CELL_PX // 2
+    columns = (centres[:, :1] % panorama.width).astype(np.intp) + panorama.pad_px + side
+    rows = centres[:, 1:].astype(np.intp) + side
+    columns = columns.clip(0, image.shape[1] - 1)
+    rows = rows.clip(0, image.shape[0] - 1) * image.shape[1]
+    return np.asarray(np.take(image.reshape(-1), rows[:, :, None] + columns[:, None]))

@@ -19,8 +19,9 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-CELL_PX = 24  # holds the window, the largest shift and the gradient's border
 WINDOW_PX = 13
+TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the gradient's border
+CELL_PX = 20  # of the current image: holds the window, the largest shift and the interpolation's border
 MAX_SHIFT_PX = 2.0  # a patch that has to move farther was predicted wrongly
 ITERATIONS, CONVERGED_PX = 12, 0.004
 GAIN_SIGMA = 0.05  # of a patch about the gain of all patches of its image: vignetting, slanted light
@@ -35,7 +36,6 @@ MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as t
 _HALF = WINDOW_PX // 2
 _CENTRE = CELL_PX // 2
 _INNER = slice(_CENTRE - _HALF, _CENTRE + _HALF + 1)
-_AROUND = slice(_CENTRE - _HALF - 1, _CENTRE + _HALF + 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +48,16 @@ class PatchFit:
 
 
 def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: float) -> PatchFit:
-    """Fit templates (N, CELL, CELL) to the current image's cells of the same size, cut where they are predicted.
+    """Fit templates (N, T, T) to the current image's cells (N, CELL, CELL), cut where they are predicted.
 
+    The centre of a template is its pixel T // 2, T is TEMPLATE_PX or more.
     groups (N,): patches of one image have one number, and nearly one gain. noise_grey: standard deviation of the
     noise of both images.
     """
     count = len(templates)
-    t = templates.astype(np.float32)
-    gx, gy = _gradients(t)
-    window = t[:, _INNER, _INNER].reshape(-1, WINDOW_PX**2)
-    M = np.stack([-gx, -gy, window], axis=1)
-    M -= M.mean(axis=2, keepdims=True)
+    M = _design(templates)
     normal = (M @ np.swapaxes(M, 1, 2)).astype(float)
+    unweighted = normal.copy()
     trace = normal[:, 0, 0] + normal[:, 1, 1]
     determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1] ** 2
     textured = (normal[:, 2, 2] > M.shape[2] * MIN_CONTRAST**2) & (determinant > MIN_DETERMINANT * trace**2)
@@ -72,35 +70,48 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
 
     current = cells.astype(np.float32)
     shift = np.zeros((count, 2))
-    solution, residual = np.zeros((count, 3)), np.zeros(count)
+    solution, projection, energy = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
     active = np.flatnonzero(textured)
     for _ in range(ITERATIONS):
         if not len(active):
             break
-        y = _shifted(current[active], shift[active])
+        y = _shifted(current, active, shift[active])
         y -= y.mean(axis=1, keepdims=True)
         projected = (M[active] @ y[:, :, None])[:, :, 0].astype(float)
+        projection[active], energy[active] = projected, np.einsum("nk,nk->n", y, y)
         projected[:, 2] += prior * gain[active]
-        found = np.einsum("nij,nj->ni", inverse[active], projected)
+        found = (inverse[active] @ projected[:, :, None])[:, :, 0]
         step = found[:, :2] / np.clip(found[:, 2:], *GAIN_RANGE)
         shift[active] += np.clip(step, -1.0, 1.0)
-        error = y - np.einsum("ni,nik->nk", found.astype(np.float32), M[active])
-        solution[active], residual[active] = found, (error**2).mean(axis=1)
+        solution[active] = found
         moving = (np.abs(step).max(axis=1) > CONVERGED_PX) & (np.abs(shift[active]).max(axis=1) < MAX_SHIFT_PX)
         active = active[moving]
     fits = textured & (np.abs(shift).max(axis=1, initial=0.0) < MAX_SHIFT_PX)
     fits &= (solution[:, 2] > GAIN_RANGE[0]) & (solution[:, 2] < GAIN_RANGE[1])
+    # |y - M^T s|^2 of the last step, without computing the differences.
+    explained = 2 * projection - (unweighted @ solution[:, :, None])[:, :, 0]
+    residual = np.maximum(energy - (solution * explained).sum(axis=1), 0.0) / WINDOW_PX**2
     return PatchFit(shift, _covariance(inverse, residual, np.clip(solution[:, 2], *GAIN_RANGE)), fits)
 
 
-def _gradients(t: Floats) -> tuple[Floats, Floats]:
-    """Return the gradients (N, WINDOW * WINDOW) along column and row, by Scharr's 3x3 operator."""
-    a = t[:, _AROUND, _AROUND]
-    side, middle = np.float32(3 / 32), np.float32(10 / 32)
-    down = side * (a[:, :-2] + a[:, 2:]) + middle * a[:, 1:-1]
-    across = side * (a[:, :, :-2] + a[:, :, 2:]) + middle * a[:, :, 1:-1]
-    gx, gy = down[:, :, 2:] - down[:, :, :-2], across[:, 2:] - across[:, :-2]
-    return gx.reshape(-1, WINDOW_PX**2).astype(np.float32), gy.reshape(-1, WINDOW_PX**2).astype(np.float32)
+def _design(templates: Image) -> Floats:
+    """Return (N, 3, WINDOW * WINDOW): minus the gradients along column and row, and the window, each of mean 0.
+
+    The gradients are those of Scharr's 3x3 operator.
+    """
+    middle = templates.shape[1] // 2
+    around = slice(middle - _HALF - 1, middle + _HALF + 2)
+    a = templates[:, around, around].astype(np.float32)
+    side, inner = np.float32(3 / 32), np.float32(10 / 32)
+    down = side * (a[:, :-2] + a[:, 2:]) + inner * a[:, 1:-1]
+    across = side * (a[:, :, :-2] + a[:, :, 2:]) + inner * a[:, :, 1:-1]
+    M = np.empty((len(a), 3, WINDOW_PX, WINDOW_PX), np.float32)
+    np.subtract(down[:, :, :-2], down[:, :, 2:], out=M[:, 0])
+    np.subtract(across[:, :-2], across[:, 2:], out=M[:, 1])
+    M[:, 2] = a[:, 1:-1, 1:-1]
+    flat = M.reshape(-1, 3, WINDOW_PX**2)
+    flat -= flat.mean(axis=2, keepdims=True)
+    return flat
 
 
 def _common_gains(energy: Array, cells: Image, groups: Indices) -> Array:
@@ -109,7 +120,8 @@ def _common_gains(energy: Array, cells: Image, groups: Indices) -> Array:
     A regression would be too low, because the template has noise; the ratio of contrasts holds that of both.
     """
     current = cells[:, _INNER, _INNER].reshape(-1, WINDOW_PX**2).astype(np.float32)
-    ratio = np.sqrt(current.var(axis=1) * current.shape[1] / np.maximum(energy, 1.0))
+    current -= current.mean(axis=1, keepdims=True)
+    ratio = np.sqrt(np.einsum("nk,nk->n", current, current) / np.maximum(energy, 1.0))
     gain = np.ones(len(cells))
     for group in np.unique(groups).tolist():
         own = groups == group
@@ -117,17 +129,18 @@ def _common_gains(energy: Array, cells: Image, groups: Indices) -> Array:
     return gain
 
 
-def _shifted(cells: Floats, shift: Array) -> Floats:
-    """Return the windows (N, WINDOW * WINDOW) of cells at shifts (N, 2), bilinear."""
+def _shifted(cells: Floats, which: Indices, shift: Array) -> Floats:
+    """Return the windows (M, WINDOW * WINDOW) of some cells, which (M,) of (N, CELL, CELL), at shifts (M, 2), bilinear.
+    """
     clipped = np.clip(shift, -MAX_SHIFT_PX, MAX_SHIFT_PX)
     whole = np.floor(clipped).astype(np.intp)
     fx, fy = (clipped - whole).astype(np.float32).T[:, :, None, None]
     first = (_CENTRE - _HALF + whole[:, 1]) * CELL_PX + _CENTRE - _HALF + whole[:, 0]
     grid = (np.arange(WINDOW_PX + 1)[:, None] * CELL_PX + np.arange(WINDOW_PX + 1)).ravel()
-    index = (np.arange(len(cells)) * CELL_PX**2 + first)[:, None] + grid
-    block = cells.reshape(-1)[index].reshape(-1, WINDOW_PX + 1, WINDOW_PX + 1)
-    rows = block[:, :-1] + fy * (block[:, 1:] - block[:, :-1])
-    windows = rows[:, :, :-1] + fx * (rows[:, :, 1:] - rows[:, :, :-1])
+    index = (which * CELL_PX**2 + first)[:, None] + grid
+    block = np.take(cells.reshape(-1), index).reshape(-1, WINDOW_PX + 1, WINDOW_PX + 1)
+    rows = (1 - fy) * block[:, :-1] + fy * block[:, 1:]
+    windows = (1 - fx) * rows[:, :, :-1] + fx * rows[:, :, 1:]
     return np.asarray(windows.reshape(-1, WINDOW_PX**2), np.float32)
 
 

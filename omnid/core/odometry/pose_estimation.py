@@ -14,7 +14,7 @@ from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-RANSAC_BATCH, RANSAC_BATCHES = 50, 10  # hypotheses drawn at once, and how often at most
+RANSAC_BATCH, RANSAC_BATCHES = 12, 40  # hypotheses drawn at once, and how often at most
 RANSAC_THRESHOLD_PX = 2.0  # largest error of a view in the consensus set
 RANSAC_MISSED = 1e-6  # probability that no hypothesis was free of outliers, at which the search ends
 KERNEL_WIDTH = 2.5  # standard deviations at which the Cauchy kernel halves the weight of an error
@@ -86,9 +86,27 @@ def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model
     lower_only = np.isnan(views[:, 2])
     S[lower_only, 2, :], S[lower_only, :, 2] = 0.0, 0.0
     S[lower_only, 2, 2] = 1.0
-    W = np.linalg.inv(np.linalg.cholesky(S))
+    W = _inverse_cholesky(S)
     W[lower_only, 2, :] = 0.0
-    return np.asarray(W)
+    return W
+
+
+def _inverse_cholesky(S: Array) -> Array:
+    """Return the inverses (N, 3, 3) of the lower Cholesky factors of S (N, 3, 3), which is positive definite.
+
+    Written out, because numpy's loops over small matrices take ten times as long.
+    """
+    W = np.zeros(S.shape)
+    l00 = np.sqrt(S[:, 0, 0])
+    l10, l20 = S[:, 1, 0] / l00, S[:, 2, 0] / l00
+    l11 = np.sqrt(S[:, 1, 1] - l10 * l10)
+    l21 = (S[:, 2, 1] - l20 * l10) / l11
+    l22 = np.sqrt(S[:, 2, 2] - l20 * l20 - l21 * l21)
+    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1 / l00, 1 / l11, 1 / l22
+    W[:, 1, 0] = -l10 * W[:, 0, 0] * W[:, 1, 1]
+    W[:, 2, 1] = -l21 * W[:, 1, 1] * W[:, 2, 2]
+    W[:, 2, 0] = -(l20 * W[:, 0, 0] + l21 * W[:, 1, 0]) * W[:, 2, 2]
+    return W
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +128,13 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
     """
     W = whitening(landmarks, covariance, views, T, model, noise)
     clean = np.where(np.isnan(views), 0.0, views)
+    H, g, squared = _normal_equations(landmarks, clean, T, W, model)
     for _ in range(steps):
-        H, g, _ = _normal_equations(landmarks, clean, T, W, model)
         step = np.linalg.solve(H, g)
         T = se3.exp(step) @ T
         if np.abs(step).max() < CONVERGED:
-            break
-    H, _, squared = _normal_equations(landmarks, clean, T, W, model)
+            break  # the last equations hold here as well
+        H, g, squared = _normal_equations(landmarks, clean, T, W, model)
     return GaussNewtonResult(T, np.asarray(np.linalg.inv(H), float), squared)
 
 
@@ -128,7 +146,13 @@ def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model:
     squared = (error**2).sum(axis=1)
     weight = 1 / (1 + squared / KERNEL_WIDTH**2)
     by_point = W @ view_jacobian(points, model.cylinder, model.baseline_m)
-    J = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=2)
-    J = J.reshape(-1, 6)
-    weighted = J * np.repeat(weight, 3)[:, None]
-    return weighted.T @ J + DAMPING * np.eye(6), weighted.T @ error.ravel(), squared
+    # The rotation's part is points x rows of by_point.
+    x, y, z = points.T[:, :, None]
+    J = np.empty((len(points), 3, 6))
+    J[:, :, :3] = by_point
+    J[:, :, 3] = y * by_point[:, :, 2] - z * by_point[:, :, 1]
+    J[:, :, 4] = z * by_point[:, :, 0] - x * by_point[:, :, 2]
+    J[:, :, 5] = x * by_point[:, :, 1] - y * by_point[:, :, 0]
+    flat = J.reshape(-1, 6)
+    weighted = flat * np.repeat(weight, 3)[:, None]
+    return weighted.T @ flat + DAMPING * np.eye(6), weighted.T @ error.ravel(), squared

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ Image = NDArray[np.uint8]
 
 
 CONVERGED_PX = 0.01  # an iteration that moves the window less is the last one
+MAX_LEVELS = 6
 MIN_EIGENVALUE = 1e-4  # of the window's gradients, OpenCV's default: below it the window has no texture
 
 
@@ -45,15 +46,18 @@ class KltSettings:
     """Settings of the pyramidal Lucas-Kanade tracker and of the forward-backward check."""
 
     window_px: int = knob(15, "side of the tracking window, px", low=5, high=61)
-    levels: int = knob(3, "pyramid levels above the image", low=0, high=6)
+    levels: int = knob(3, "pyramid levels above the image", low=0, high=MAX_LEVELS)
     max_error_px: float = knob(0.5, "largest forward-backward error of a track, px", low=0.01, high=10)
     iterations: int = knob(20, "iterations on each pyramid level", low=1, high=200)
 
 
 def track(
-    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
+    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings, back_levels: int = MAX_LEVELS
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Track points (N, 2) of a into b, from a guess (N, 2), with the forward-backward check.
+
+    back_levels: pyramid levels at most of the track back. It begins where it should end, so that few are enough where
+    the guess is good; with few, more of the wrong tracks pass.
 
     Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
     returned in [0, width). The status of Lucas-Kanade is no evidence: it only tells that the iteration ended.
@@ -61,7 +65,7 @@ def track(
     if not len(points):
         return points.copy(), np.zeros(0, bool)
     there, found = flow(a, b, points, guess, klt)
-    back, returned = flow(b, a, there, points, klt)
+    back, returned = flow(b, a, there, points, replace(klt, levels=min(klt.levels, back_levels)))
     error = back - points
     error[:, 0] = (error[:, 0] + a.width / 2) % a.width - a.width / 2
     close = (error**2).sum(axis=1) < klt.max_error_px**2

@@ -17,7 +17,7 @@ from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.patch_alignment import affine_warps, align, disparity_slopes, warped_templates
-from omnid.core.odometry.patch_fit import CELL_PX
+from omnid.core.odometry.patch_fit import TEMPLATE_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import triangulate, view
@@ -148,7 +148,7 @@ class DriveLandmarks:
     def _aligned(self, current: View, index: Indices, near: Array, *, upper: bool) -> tuple[Array, Flags]:
         """Return pixels (M, 2) of landmarks near those given, by their first keyframes' patches, and which fit."""
         anchors = self._anchor[index]
-        templates = np.zeros((len(index), CELL_PX, CELL_PX), np.uint8)
+        templates = np.zeros((len(index), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
         T_rect_odom = se3.inverse(current.T_odom_rect)
         known = {int(a): T_rect_odom @ self._keyframes[a].T_odom_rect for a in np.unique(anchors).tolist()}
         T_curr_ref = np.array([known[a] for a in anchors.tolist()]).reshape(-1, 4, 4)

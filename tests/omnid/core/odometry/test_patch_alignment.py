@@ -16,7 +16,7 @@ from omnid.core.odometry.patch_alignment import (
     view_noise,
     warped_templates,
 )
-from omnid.core.odometry.patch_fit import CELL_PX
+from omnid.core.odometry.patch_fit import TEMPLATE_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import view
@@ -102,7 +102,7 @@ def test_a_warped_patch_is_located_to_hundredths_where_a_rigid_one_errs() -> Non
     errors = {}
     for name, applied in (("warped", warp), ("rigid", np.eye(2))):
         templates = warped_templates(before, pixels, np.broadcast_to(applied, (6, 2, 2)), predicted)
-        assert templates.shape == (6, CELL_PX, CELL_PX)
+        assert templates.shape == (6, TEMPLATE_PX, TEMPLATE_PX)
         aligned = align(templates, after, predicted, np.zeros(6, np.intp))
         assert aligned.found.all()
         errors[name] = np.abs(aligned.pixels - truth).max()

