@@ -59,9 +59,9 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.models calib.rig calib.rig_file drivers.errors drivers.frame omnid.config "
         "omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
     "omnid.calibration":
-        "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig calib.se3 "
-        "drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig omnid.core.stereo "
-        "omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state",
+        "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
+        "calib.rig_covariance calib.se3 drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig "
+        "omnid.core.stereo omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state",
     "omnid.cli": "calib.errors drivers.errors omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,12 +38,15 @@ class CameraParameterisation:
         return [(name, float(value), float(sigma)) for name, value, sigma in found]
 
 
-def parameterise(camera: OmniCamera) -> CameraParameterisation:
-    """Return the parameterisation about a camera: all parameters, and of distortion and polynomial the terms not 0."""
+def parameterise(camera: OmniCamera, distortion: Collection[str] = ()) -> CameraParameterisation:
+    """Return the parameterisation about a camera: all parameters, and of distortion and polynomial the terms not 0.
+
+    distortion: names of an omni camera's terms that are parameters although they are 0.
+    """
     scale = min(camera.size) / 2
     if isinstance(camera, UnifiedCamera):
         values = np.array([camera.xi, *camera.focal, *camera.center, *camera.distortion])
-        kept = np.array([True] * 5 + [value != 0 for value in camera.distortion])
+        kept = (values != 0) | np.isin(OMNI_NAMES, [*OMNI_NAMES[:5], *distortion])
         units = np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
         return CameraParameterisation(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
     if not isinstance(camera, OcamCamera):

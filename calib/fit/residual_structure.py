@@ -50,7 +50,7 @@ def residual_structure(pixels: Array, residuals: Array, points: Array, center: t
     is a one-way analysis of variance with the bins as groups. Unknown (NaN) residuals are left out.
     """
     noise_px = _noise_px(residuals, points)
-    return ResidualStructure(_systematic_px(pixels.reshape(-1, 2), residuals.reshape(-1, 2), center), noise_px)
+    return ResidualStructure(systematic_px(pixels.reshape(-1, 2), residuals.reshape(-1, 2), center), noise_px)
 
 
 def _noise_px(residuals: Array, points: Array) -> float:
@@ -68,8 +68,11 @@ def _noise_px(residuals: Array, points: Array) -> float:
     return float(np.sqrt(squares / freedom)) if freedom else float("inf")
 
 
-def _systematic_px(pixels: Array, residuals: Array, center: tuple[float, float]) -> float:
-    """Return the rms of the bins' mean residuals (N, 2), without the share of the variance within the bins."""
+def systematic_px(pixels: Array, residuals: Array, center: tuple[float, float]) -> float:
+    """Return the rms of the bins' mean residuals, without the share of the variance within the bins.
+
+    pixels (N, 2), residuals (N, 2) [px]: the bins lie about the center.
+    """
     length = np.linalg.norm(residuals, axis=1)
     known = length < OUTLIER_RATIO * np.nanmedian(length)
     offset, residuals = pixels[known] - center, residuals[known]

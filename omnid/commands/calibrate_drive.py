@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
@@ -17,6 +20,8 @@ from omnid.sinks.files import check_outputs
 if TYPE_CHECKING:
     from omnid.calibration.drive import DriveCalibration
 
+MIN_DISTANCE_M = 1.0  # between two stops
+MAX_SCALE_CHANGE = 0.05  # by a known distance: more is a mistake
 SMALL_GAIN = 0.95  # the error of the landmarks with the new rig, as share of that with the old one
 
 
@@ -36,23 +41,41 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 def run(args: argparse.Namespace) -> int:
     """Return 0 where the rig was written, 1 where the drive did not make it better."""
-    from omnid.calibration.drive import calibrate_drive, distance_m, rescaled
+    from omnid.calibration.drive import calibrate_drive
 
     _check(args)
     found = calibrate_drive(args.logs, read_rig(args.rig), (args.lower, args.upper),
                             lambda line: print(line, file=sys.stderr))
     print("\n".join(describe(found)))
-    if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px:
+    if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
         print(f"{args.rig} fits these drives as well as any rig: nothing was written")
         return 1
     rig = found.rig
     if args.distance_m:
-        ratio = args.distance_m / distance_m(found)
-        rig = rescaled(rig, ratio)
-        print(f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance")
+        rig = at_distance(found, args.distance_m)
+        print(f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance "
+              f"({found.distance_m:.3f} m before)")
     write_rig(args.output, rig)
     print(f"{args.output}: written")
+    if found.is_misfit:
+        print(f"{args.output}: warning: the model does not describe these cameras; calibrate with a board, and look at "
+              "the mirrors", file=sys.stderr)
     return 0
+
+
+def at_distance(found: DriveCalibration, distance_m: float) -> Rig:
+    """Return the rig with the baseline of a known distance from the first to the last pair; OmnidError if absurd."""
+    from omnid.calibration.drive_scale import rescaled
+
+    if found.distance_m < MIN_DISTANCE_M:
+        raise OmnidError(f"--distance-m: the log ends {found.distance_m:.2f} m from its beginning, expected "
+                         f"{MIN_DISTANCE_M:.0f} m at least; measure the distance between two stops farther apart")
+    ratio = distance_m / found.distance_m
+    if abs(ratio - 1) > MAX_SCALE_CHANGE:
+        raise OmnidError(f"--distance-m {distance_m:g}: the log ends {found.distance_m:.3f} m from its beginning by "
+                         f"the baseline of {1e3 * found.rig.baseline_m:.1f} mm; which of the two is wrong?")
+    rig, covariance = rescaled(found.rig, ratio), found.rig.covariance
+    return replace(rig, covariance=covariance and covariance.select(covariance.names[:-1]))
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -67,9 +90,13 @@ def _check(args: argparse.Namespace) -> None:
 def describe(found: DriveCalibration) -> list[str]:
     """Return the result as lines of text: errors before and after, scale, and each parameter with its sigma."""
     adjustment, parameters = found.adjustment, found.adjustment.parameters
-    lines = [f"{found.keyframes} keyframes, {len(adjustment.state.points)} landmarks, {len(adjustment.observations)} "
-             f"observations; error {found.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after",
-             f"lengths change by {100 * found.scale_change:+.3f} %, uncertain by {100 * found.scale_sigma:.3f} %",
+    misfit = "MISFIT: the residuals are not noise. " if found.is_misfit else ""
+    uncertainty = drive_uncertainty(found.rig)
+    lines = [f"{misfit}{found.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
+             f"{len(adjustment.observations)} observations; error {found.first_sigma_px:.3f} px before, "
+             f"{adjustment.sigma_px:.3f} px after",
+             *(f"{side}: {structure}" for side, structure in zip(("lower", "upper"), found.structure, strict=True)),
+             f"lengths change by {100 * found.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
              f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}"]
     after = parameters.values + adjustment.state.steps * parameters.units
     sigmas = adjustment.sigmas * parameters.units
@@ -79,4 +106,7 @@ def describe(found: DriveCalibration) -> list[str]:
         lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
     if not np.all(adjustment.seen):
         lines.append("parameters of which the drive tells nothing stay near their start")
+    if found.level_rad:
+        lines.append(f"the rig frame was turned by {np.rad2deg(found.level_rad):.2f} deg, so that the drive lies in "
+                     "the x-y plane of the base")
     return lines

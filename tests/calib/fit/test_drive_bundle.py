@@ -9,22 +9,18 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.drive_bundle import (
-    DriveObservations,
-    DriveState,
-    RigParameters,
-    adjust_drive,
-    observation_sigma,
-    project,
-)
+from calib.fit.drive_bundle import adjust_drive, held_out_error, observation_sigma
+from calib.fit.drive_parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.drive_problem import DriveObservations, DriveProblem, DriveState, KeyframeMotion, project
 from calib.models.camera import Array
+from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from tests.simulation.paths import loop, vibrate
 from tests.simulation.rigs import make_rig
 
-KEYFRAMES, LANDMARKS = 24, 240
+KEYFRAMES, LANDMARKS = 16, 180
 NOISE_PX = 0.03
-PRIOR_STEPS = 3.0  # pixels, or what moves the image by about so many
+PRIOR = np.eye(15) / 3.0**2  # sigmas of 3 pixels, or of what moves the image by about so many
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +40,7 @@ def drive(truth: Rig, seed: int, noise_px: float = NOISE_PX) -> tuple[DriveState
     in_rig = se3.apply(T_rig_odom, points)[keyframe, landmark]
     pixels = project(truth, camera, in_rig) + noise_px * rng.standard_normal((len(keyframe), 2))
     seen = np.isfinite(pixels).all(axis=1) & (np.linalg.norm(in_rig, axis=1) > 0.7)
-    return DriveState(T_rig_odom, points, np.zeros(0)), DriveObservations(
+    return DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion.still(KEYFRAMES)), DriveObservations(
         keyframe[seen], landmark[seen], camera[seen], pixels[seen])
 
 
@@ -59,7 +55,7 @@ def start(state: DriveState, parameters: RigParameters, rng: np.random.Generator
     turned = se3.exp(0.01 * rng.standard_normal((KEYFRAMES, 6))) @ state.T_rig_odom
     turned[0] = state.T_rig_odom[0]
     points = state.points * (1 + 0.02 * rng.standard_normal((LANDMARKS, 1)))
-    return DriveState(turned, points, np.zeros(len(parameters.names)))
+    return replace(state, T_rig_odom=turned, points=points, steps=np.zeros(len(parameters.names)))
 
 
 def rays_apart_deg(a: Rig, b: Rig) -> Array:
@@ -79,7 +75,7 @@ def test_a_disturbed_rig_becomes_the_true_one(truth: Rig) -> None:
     state, observations = drive(truth, 1)
     rig = disturbed(truth, rng)
     parameters = RigParameters.about(rig)
-    found = adjust_drive(parameters, start(state, parameters, rng), observations, np.full(15, PRIOR_STEPS))
+    found = adjust_drive(parameters, start(state, parameters, rng), observations, PRIOR)
     assert np.median(rays_apart_deg(rig, truth)) > 0.1
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
     assert found.rig.baseline_m == pytest.approx(truth.baseline_m, rel=1e-9)
@@ -95,7 +91,7 @@ def test_sigmas_are_those_of_the_errors(truth: Rig) -> None:
     for seed in range(3):
         state, observations = drive(truth, seed)
         begin = replace(state, steps=np.zeros(len(parameters.names)))
-        found = adjust_drive(parameters, begin, observations, np.full(15, PRIOR_STEPS))
+        found = adjust_drive(parameters, begin, observations, PRIOR)
         ratios.append(found.state.steps / found.sigmas)
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.8
 
@@ -107,7 +103,7 @@ def test_landmarks_that_move_are_left_out(truth: Rig) -> None:
     pixels = observations.pixels + np.where(wandering[:, None], rng.uniform(-4, 4, observations.pixels.shape), 0.0)
     parameters = RigParameters.about(truth)
     begin = replace(state, steps=np.zeros(len(parameters.names)))
-    found = adjust_drive(parameters, begin, replace(observations, pixels=pixels), np.full(15, PRIOR_STEPS))
+    found = adjust_drive(parameters, begin, replace(observations, pixels=pixels), PRIOR)
     assert len(found.state.points) <= LANDMARKS - 40
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
 
@@ -118,4 +114,52 @@ def test_pixels_at_random_are_refused(truth: Rig) -> None:
     parameters = RigParameters.about(truth)
     begin = replace(state, steps=np.zeros(len(parameters.names)))
     with pytest.raises(CalibError, match="px off any rig and path"):
-        adjust_drive(parameters, begin, replace(observations, pixels=pixels), np.full(15, PRIOR_STEPS))
+        adjust_drive(parameters, begin, replace(observations, pixels=pixels), PRIOR)
+
+
+def test_tangential_terms_are_found_and_chosen_by_landmarks_held_out(truth: Rig) -> None:
+    """Cameras with decentring terms, calibrated from a file that has none."""
+    state, observations = drive(truth, 5)
+    assert isinstance(truth.lower.camera, UnifiedCamera)
+    camera = replace(truth.lower.camera, distortion=(0.0, 0.0, 0.004, 0.002))
+    points = problem_points(truth, state, observations)
+    bent, straight = (project(rig, observations.camera, points)
+                      for rig in (replace(truth, lower=replace(truth.lower, camera=camera)), truth))
+    observations = replace(observations, pixels=observations.pixels + bent - straight)
+    parameters = RigParameters.about(truth, ("p1", "p2"))
+    prior = np.eye(len(parameters.names)) / 3.0**2
+    found = adjust_drive(parameters, replace(state, steps=np.zeros(len(prior))), observations, prior)
+    assert held_out_error(parameters, found, prior) < 0.8 * held_out_error(RigParameters.about(truth), found, PRIOR)
+    lower = found.rig.lower.camera
+    assert isinstance(lower, UnifiedCamera)
+    assert lower.distortion[2:] == pytest.approx((0.004, 0.002), abs=3e-4)
+
+
+def problem_points(truth: Rig, state: DriveState, observations: DriveObservations) -> Array:
+    """Return the landmark of each observation in the rig frame."""
+    parameters = RigParameters.about(truth)
+    problem = DriveProblem(parameters, observations, PRIOR, np.zeros(1, int))
+    return problem.in_rig(replace(state, steps=np.zeros(15)), np.zeros(15))
+
+
+def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
+    """The upper camera is exposed 12 ms late, rows follow by 30 us; the rig turns and drives at changing speed."""
+    rng = np.random.default_rng(6)
+    state, observations = drive(truth, 6)
+    twist = np.column_stack([rng.uniform(-0.7, 0.7, (KEYFRAMES, 2)), np.zeros((KEYFRAMES, 3)),
+                             rng.uniform(-0.8, 0.8, KEYFRAMES)])
+    motion = KeyframeMotion(twist, np.full(KEYFRAMES, 5e-3))
+    delay_s = np.where(observations.camera == 1, 12e-3, 0.0) + 30e-6 * observations.pixels[:, 1]
+    points = problem_points(truth, state, observations)
+    moving = np.array([se3.apply(se3.exp(-t * v), p[None])[0]
+                       for t, v, p in zip(delay_s, twist[observations.keyframe], points, strict=True)])
+    pixels = project(truth, observations.camera, moving) + NOISE_PX * rng.standard_normal((len(points), 2))
+    seen = np.isfinite(pixels).all(axis=1)
+    kept, used = replace(observations, pixels=pixels).only(seen)
+    parameters = RigParameters.about(truth, times=(UPPER_DELAY, LINE_TIME))
+    begin = replace(state, points=state.points[used], steps=np.zeros(17), motion=motion)
+    found = adjust_drive(parameters, begin, kept, np.diag([*np.diag(PRIOR), 1 / 9, 1 / 36]))
+    times = parameters.times_at(found.state.steps)
+    assert times.upper_delay_s == pytest.approx(7e-3, abs=3e-4)
+    assert times.line_time_s == pytest.approx(30e-6, abs=1e-6)
+    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01

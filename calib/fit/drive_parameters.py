@@ -1,0 +1,104 @@
+"""Parameters of a bundle adjustment of a drive: both cameras, the transform between them, and times of exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib import se3
+from calib.fit.parameterisation import CameraParameterisation, parameterise
+from calib.models.camera import Array
+from calib.rig import Rig
+from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
+
+ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras: about a pixel
+TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]  # the baseline's length stays
+# Times of exposure, and one step of each: some tenths of a pixel at walking speed.
+UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
+TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureTimes:
+    """Times of exposure against the stamps: of the upper camera, and from one image row of a camera to the next."""
+
+    upper_delay_s: float = 0.0
+    line_time_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RigParameters:
+    """A rig as a function of steps: both cameras, then rotation (3) and direction of the baseline (2), then times.
+
+    The rig frame stays with the lower camera: moving that as well would only move all poses.
+    """
+
+    rig: Rig
+    lower: CameraParameterisation
+    upper: CameraParameterisation
+    times: tuple[str, ...] = ()  # of TIME_UNITS
+
+    @staticmethod
+    def about(rig: Rig, distortion: Collection[str] = (), times: tuple[str, ...] = ()) -> RigParameters:
+        """Return the parameters of the cameras' own models about a rig; distortion: terms of omni cameras, if 0."""
+        lower, upper = (parameterise(mounted.camera, distortion) for mounted in (rig.lower, rig.upper))
+        return RigParameters(rig, lower, upper, times)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the steps."""
+        return (*(f"lower {name}" for name in self.lower.names), *(f"upper {name}" for name in self.upper.names),
+                *TRANSFORM_NAMES, *self.times)
+
+    @property
+    def rig_names(self) -> tuple[str, ...]:
+        """Names of the steps of the rig, which come first."""
+        return self.names[:len(self.names) - len(self.times)]
+
+    @property
+    def values(self) -> Array:
+        """Values (P,) at no step, in the parameters' own units; the transform's are zero, in radians."""
+        return np.concatenate([self.lower.start, self.upper.start, np.zeros(len(TRANSFORM_NAMES) + len(self.times))])
+
+    @property
+    def units(self) -> Array:
+        """One step (P,) in the parameters' own units."""
+        return np.concatenate([self.lower.units, self.upper.units, np.full(len(TRANSFORM_NAMES), ANGLE_UNIT_RAD),
+                               [TIME_UNITS[name] for name in self.times]])
+
+    def moves_camera(self, camera: int) -> Array:
+        """Return flags (P,) of the steps that change the image of the lower (0) or the upper (1) camera."""
+        of_lower = np.arange(len(self.names)) < len(self.lower.names)
+        return np.asarray(~of_lower if camera else of_lower | (np.array(self.names) == LINE_TIME))
+
+    def at(self, steps: Array) -> Rig:
+        """Return the rig after steps (P,); CalibError where there is no such camera."""
+        first, second = len(self.lower.names), len(self.lower.names) + len(self.upper.names)
+        rig, turn = self.rig, steps[second:second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
+        R_rect_rig = rig.T_rect_rig[:3, :3]
+        along = np.array([turn[3], turn[4], 1.0]) / np.linalg.norm([turn[3], turn[4], 1.0])
+        viewpoint = rig.lower.viewpoint + rig.baseline_m * R_rect_rig.T @ along
+        R_rig_upper = R_rect_rig.T @ se3.rotation_exp(turn[:3]) @ R_rect_rig @ rig.upper.T_cam_rig[:3, :3].T
+        lower = replace(rig.lower, camera=self.lower.camera_at(steps[:first]))
+        upper = replace(rig.upper, camera=self.upper.camera_at(steps[first:second]),
+                        T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
+        return replace(rig, lower=lower, upper=upper, covariance=None)
+
+    def transform_steps(self, rig: Rig) -> Array:
+        """Return steps (P,) to the transform between another rig's cameras; cameras and times stay."""
+        R_rect_rig = self.rig.T_rect_rig[:3, :3]
+        R_rig_upper, own = rig.upper.T_cam_rig[:3, :3].T, self.rig.upper.T_cam_rig[:3, :3]
+        turn = se3.rotation_log(R_rect_rig @ R_rig_upper @ own @ R_rect_rig.T)
+        x, y, z = R_rect_rig @ (rig.upper.viewpoint - rig.lower.viewpoint)
+        steps = np.zeros(len(self.names))
+        first = len(self.rig_names) - len(TRANSFORM_NAMES)
+        steps[first:len(self.rig_names)] = np.array([*turn, x / z, y / z]) / ANGLE_UNIT_RAD
+        return steps
+
+    def times_at(self, steps: Array) -> ExposureTimes:
+        """Return the times of exposure after steps (P,)."""
+        values = dict(zip(self.times, steps[len(self.rig_names):].tolist(), strict=True))
+        return ExposureTimes(1e-3 * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
+                             1e-6 * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0))

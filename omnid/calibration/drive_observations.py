@@ -1,0 +1,173 @@
+"""Keyframes and landmarks of drives, as observations in the cameras' images: odometry with the rig as it is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion
+from calib.rig import Rig
+from drivers.logs.mcap_reader import LogReader
+from omnid.calibration.log_rig_check import open_log
+from omnid.config import Config
+from omnid.core.rig.drive_landmarks import DriveLandmarks, View, image_pixels
+from omnid.errors import OmnidError
+from omnid.messages import OdometryUpdate
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.odometry import OdometryStage
+from omnid.stages.rig_gate import RigGate
+from omnid.stages.stereo import Stereo
+from omnid.stages.synchronise import Synchronise
+from omnid.tracking_state import TrackingState
+
+Array = NDArray[np.float64]
+Topics = tuple[str | None, str | None]
+
+KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
+MAX_KEYFRAMES = 80  # of all drives: keyframes are farther apart on long ones
+MIN_KEYFRAMES = 15
+MIN_TURN_RAD = np.deg2rad(60)  # of all drives together; on a straight line tilt and direction of motion are one
+MAX_LOST = 0.2  # share of the pairs
+NOISE_PX = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """Keyframes of all drives, their landmarks, and what was seen of them."""
+
+    state: DriveState  # without steps of the rig
+    observations: DriveObservations
+    fixed: tuple[int, ...]  # the first keyframe of each drive
+    T_last: Array  # (4, 4) pose of the last pair in the frame of the last keyframe
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self.state.T_rig_odom)
+
+
+def collect(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config) -> Drives:
+    """Return the observations of drives; OmnidError where they are too short or too straight."""
+    place = geometry(rig, config.panorama)
+    parts = [_drive(log, place, topics, config, MAX_KEYFRAMES // len(logs)) for log in logs]
+    states, seen = [part.state for part in parts], [part.observations for part in parts]
+    keyframes = np.cumsum([0, *(part.keyframes for part in parts)])
+    landmarks = np.cumsum([0, *(len(state.points) for state in states)])
+    T_rig_odom = np.concatenate([state.T_rig_odom for state in states])
+    _require_motion(T_rig_odom, len(logs))
+    observations = DriveObservations(
+        np.concatenate([part.keyframe + first for part, first in zip(seen, keyframes, strict=False)]),
+        np.concatenate([part.landmark + first for part, first in zip(seen, landmarks, strict=False)]),
+        np.concatenate([part.camera for part in seen]), np.concatenate([part.pixels for part in seen]))
+    motion = KeyframeMotion(np.concatenate([state.motion.twist for state in states]),
+                            np.concatenate([state.motion.upper_delay_s for state in states]))
+    state = DriveState(T_rig_odom, np.concatenate([state.points for state in states]), np.zeros(0), motion)
+    return Drives(state, observations, tuple(keyframes[:-1].tolist()), parts[-1].T_last)
+
+
+def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int) -> Drives:
+    """Return at most so many keyframes of one drive, its landmarks, and their pixels in the images."""
+    reader = open_log(log, topics, place.rig)
+    try:
+        landmarks = DriveLandmarks(place.model(NOISE_PX))
+        T_rig_odom, twists = list[Array](), list[Array]()
+        newest = np.eye(4)
+        choice = _KeyframeChoice(_spacing(reader, most))
+        for update, twist in _with_twists(_updates(reader, place, config, log)):
+            newest = update.T_odom_rig
+            if not choice.takes(update):
+                continue
+            seen = update.depth.panoramas
+            T_odom_rect = update.T_odom_rig @ place.T_rig_rect
+            landmarks.add(View(seen.lower, seen.upper, seen.visible, update.depth.disparity, T_odom_rect))
+            T_rig_odom.append(se3.inverse(update.T_odom_rig))
+            twists.append(twist)
+    finally:
+        reader.close()
+    found = landmarks.observations()
+    pixels = image_pixels(found, place.rig, place.cylinder)
+    observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
+    observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
+    motion = KeyframeMotion(np.array(twists), np.zeros(len(twists)))
+    state = DriveState(np.array(T_rig_odom), found.points[used], np.zeros(0), motion)
+    return Drives(state, observations, (0,), T_rig_odom[-1] @ newest)
+
+
+def _spacing(reader: LogReader, most: int) -> int:
+    """Return how many pairs at least lie between two keyframes, so that there are not too many."""
+    pairs = reader.pair_estimate() or 0
+    return max(1, -(-pairs // most))
+
+
+class _KeyframeChoice:
+    """Chooses the poses that lie apart far enough to tell something new."""
+
+    def __init__(self, apart: int) -> None:
+        self._apart = apart  # pairs at least
+        self._last: Array | None = None
+        self._since = 0
+
+    def takes(self, update: OdometryUpdate) -> bool:
+        """True if a pose becomes a keyframe."""
+        self._since += 1
+        if self._last is not None:
+            moved = se3.log(se3.inverse(self._last) @ update.T_odom_rig)
+            still = np.linalg.norm(moved[:3]) < KEYFRAME_M and np.linalg.norm(moved[3:]) < KEYFRAME_RAD
+            if still or self._since < self._apart or update.state is TrackingState.LOST:
+                return False
+        self._last, self._since = update.T_odom_rig, 0
+        return True
+
+
+def _with_twists(updates: Iterator[OdometryUpdate]) -> Iterator[tuple[OdometryUpdate, Array]]:
+    """Yield each pose with the twist (6,) per second from the pose before to the one after, in the rig frame."""
+    before: OdometryUpdate | None = None
+    current: OdometryUpdate | None = None
+    for after in updates:
+        if current is not None:
+            yield current, _twist(before or current, after)
+        before, current = current, after
+    if current is not None:
+        yield current, _twist(before or current, current)
+
+
+def _twist(first: OdometryUpdate, last: OdometryUpdate) -> Array:
+    span_s = 1e-9 * (last.stamp_ns - first.stamp_ns)
+    moved = se3.log(se3.inverse(first.T_odom_rig) @ last.T_odom_rig)
+    return np.asarray(moved / span_s) if span_s > 0 else np.zeros(6)
+
+
+def _updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> Iterator[OdometryUpdate]:
+    """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
+    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
+    gate = RigGate(place.cylinder, "warn")
+    stereo, odometry = Stereo(place, config.stereo, gate), OdometryStage(place, config.odometry)
+    states: Counter[TrackingState] = Counter()
+    for pair in filter(None, map(pairing.process, reader.frames())):
+        update = odometry.process(stereo.process(dewarp.process(pair)))
+        states[update.state] += 1
+        yield update
+    if gate.exchanged:
+        raise OmnidError(f"{log}: {gate.warning}")
+    if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
+        raise OmnidError(f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
+                         "rig; start from one that is nearer to the truth, or take a drive where there is more to see")
+
+
+def _require_motion(T_rig_odom: Array, drives: int) -> None:
+    """Raise OmnidError where the drives are too short or too straight to tell."""
+    if len(T_rig_odom) < MIN_KEYFRAMES:
+        raise OmnidError(f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
+                         f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive")
+    heading = se3.yaw(se3.inverse(T_rig_odom))
+    change = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
+    if np.ptp(np.concatenate([[0.0], np.cumsum(change)])) < MIN_TURN_RAD:
+        raise OmnidError(f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
+                         "a straight line some errors of the rig look like motion: take a drive with turns")

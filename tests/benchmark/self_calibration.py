@@ -1,0 +1,71 @@
+"""Rigs calibrated on one drive, tried on another: `python -m tests.benchmark.self_calibration DRIVE:TRIAL ...`.
+
+DRIVE and TRIAL are folders of `python -m tests.simulation ... --mirrors`, of one seed and thus of the same rig. The
+start is DRIVE/nominal.toml, or the file of that name by --rig. ATE: of the path as a rigid body, and from the first
+pose as `omnid eval` does it, which contains the direction of the rig frame. Sigma: of lengths, as the command says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import omnid
+from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.models.camera import Array
+from calib.rig_file import read_rig
+from omnid.calibration.drive import calibrate_drive
+from omnid.formats.tum import Trajectory, read_tum
+from omnid.recordings.evaluation import evaluate
+
+HEAD = ("| drive, trial | error before, after | model | length | ATE (rigid) | ATE (first pose) | heading, max "
+        "| said sigma | processor time |\n|---|---|---|---|---|---|---|---|---|")
+
+
+def row(drive: Path, trial: Path, start: Path) -> str:
+    """Return one row of the table."""
+    started = time.process_time()
+    found = calibrate_drive([drive / "log.mcap"], read_rig(start), report=lambda line: print(line, file=sys.stderr))
+    spent_s = time.process_time() - started
+    result = omnid.replay(trial / "log.mcap", found.rig)
+    truth = read_tum(trial / "truth.txt")
+    m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
+    common = np.isin(truth.stamps_ns, result.stamps_ns)
+    rigid = rigid_error_m(result.T_odom_rig[:, :3, 3], truth.T[common, :3, 3])
+    uncertainty = drive_uncertainty(found.rig)
+    terms = " ".join(sorted({name.split()[-1] for name in found.adjustment.parameters.names if name[-2:] in
+                             ("k1", "k2", "p1", "p2")})) or "as the file"
+    cells = [f"{drive.name}, {trial.name}", f"{found.first_sigma_px:.3f}, {found.adjustment.sigma_px:.3f} px"
+             + (" MISFIT" if found.is_misfit else ""), terms, f"{100 * m.length_error_ratio:+.3f} %",
+             f"{1e3 * rigid:.2f} mm", f"{1e3 * m.ate_rmse_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
+             f"{100 * uncertainty.scale:.2f} %" if uncertainty else "", f"{spent_s:.0f} s"]
+    return f"| {' | '.join(cells)} |"
+
+
+def rigid_error_m(found: Array, truth: Array) -> float:
+    """Return the rms distance of two paths (N, 3) after the best rotation and translation (Umeyama 1991)."""
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return float(np.sqrt(np.mean(((b - a @ R.T) ** 2).sum(axis=1))))
+
+
+def main() -> None:
+    """Print the table, each row as soon as it is measured."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("pairs", nargs="+", metavar="DRIVE:TRIAL")
+    parser.add_argument("--rig", default="nominal.toml", metavar="FILE", help="the start, in the folder DRIVE")
+    args = parser.parse_args()
+    print(HEAD)
+    for pair in args.pairs:
+        drive, trial = map(Path, pair.split(":"))
+        print(row(drive, trial, drive / args.rig), flush=True)
+
+
+if __name__ == "__main__":
+    main()
