@@ -72,6 +72,11 @@ class _Finder(ast.NodeVisitor):
             self._add(node.lineno, self._start(node.func), self._end(node.func), NAMES[name])
         self.generic_visit(node)
 
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        """Visit the body only, not its decorators."""
+        for statement in node.body:
+            self.visit(statement)
+
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         """Visit the value only."""
         if node.value is not None:
