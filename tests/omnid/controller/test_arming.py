@@ -192,3 +192,10 @@ def test_to_arm_twice_changes_nothing(driving: Bench) -> None:
     driving.send_setpoint()
     driving.tick()
     assert driving.last.velocity_mps == before == 0.3
+
+
+def test_the_state_names_the_source_that_drives(driving: Bench) -> None:
+    assert driving.controller.state.source == "operator"
+    driving.stop()
+    driving.tick()
+    assert driving.controller.state.source == ""
