@@ -1,4 +1,4 @@
-"""The graph of stages and its threads; the only module that imports threading.
+"""The graph of stages and its threads. Only this module and that of the inboxes import threading.
 
 A stream exists before it is read, so a cycle cannot be wired. Messages flow through bounded inboxes that belong to
 their readers; the end of a stream flows the same way. Inline, the same stages run in the caller's thread, each message
@@ -31,6 +31,7 @@ from omnid.engine.flow import (
     Stream,
     nothing,
 )
+from omnid.engine.inbox import Port, StageInbox
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.errors import OmnidError
 
@@ -40,53 +41,6 @@ T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
 _POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
-
-
-class _Inbox:
-    """Bounded queue of a reader for a number of writers; it ends when all of them have ended."""
-
-    def __init__(self, stats: StageStats, writers: int, capacity: int, policy: Policy) -> None:
-        self._stats, self._writers, self._capacity, self._policy = stats, writers, capacity, policy
-        self._messages: deque[object] = deque()
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def put(self, message: object) -> None:
-        with self._changed:
-            if self._policy is LOSSLESS:
-                self._changed.wait_for(lambda: len(self._messages) < self._capacity)  # or closed, which empties it
-            if self._closed:  # the reader has ended
-                self._stats.dropped += 1
-                return
-            if len(self._messages) >= self._capacity:
-                self._messages.popleft()
-                self._stats.dropped += 1
-            self._messages.append(message)
-            self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
-            self._changed.notify_all()
-
-    def get(self) -> object:
-        with self._changed:
-            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0  # the last message is finished
-            self._changed.wait_for(lambda: self._closed or self._messages or not self._writers)
-            if not self._messages:
-                return END
-            self._changed.notify_all()
-            return self._messages.popleft()
-
-    def end(self) -> None:
-        with self._changed:
-            self._writers -= 1
-            self._changed.notify_all()
-
-    def close(self) -> None:
-        """Drop and count all messages, those to come too: the reader has ended."""
-        with self._changed:
-            self._closed = True
-            self._stats.dropped += len(self._messages)
-            self._messages.clear()
-            self._stats.busy_since_ns = 0
-            self._changed.notify_all()
 
 
 class Ticker:
@@ -147,7 +101,7 @@ class Graph:
         self.telemetry = Telemetry()
         self._policy, self._threaded, self._depth, self._on_thread = policy, threaded, depth, on_thread
         self._sources: list[Source] = []
-        self._inboxes: list[_Inbox] = []
+        self._inboxes: dict[str, StageInbox] = {}  # by the name of the stage
         self._tickers: list[Ticker] = []
         self._threads: list[threading.Thread] = []
         self._ended: set[str] = set()  # names of threads
@@ -168,9 +122,26 @@ class Graph:
         self._thread(name, self._run_source, source)
         return source.stream
 
-    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In]) -> Stream[Out]:
-        """Add a stage, whose inputs merge into its one inbox; return its output."""
-        return self._node(Node(self._add(StageStats(name)), stage), inputs, self._policy, self._depth)
+    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], direct: bool = False) -> Stream[Out]:
+        """Add a stage, whose inputs merge into its one inbox; return its output.
+
+        direct: it has no inbox and no thread, and runs in that of the stage before it, which is its only input.
+        """
+        node = Node(self._add(StageStats(name)), stage)
+        if not direct:
+            return self._node(node, inputs, self._policy, self._depth)
+        (before,) = inputs
+        before.readers.append(Direct(node, 1, self._succeeds, self._finish))
+        return node.stream
+
+    def bound(self, head: str, tail: str) -> None:
+        """Let the stage `head` take a message only when `tail`, a stage after it, will soon be able to take the result.
+
+        So at most one message is under way between both, and under overload the head's inbox drops what is old before
+        any work is done for it: the tail gets the newest. Inline, nothing ever waits.
+        """
+        if self._threaded:
+            self._inboxes[head].prepare_for(self._inboxes[tail])
 
     def sink(
         self, name: str, sink: Sink[In], *inputs: Stream[In], policy: Policy | None = None, depth: int | None = None
@@ -233,12 +204,12 @@ class Graph:
     def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int) -> Stream[Any]:
         if not inputs or depth < 1:
             raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
-        reader: Reader = Direct(node, len(inputs), self._succeeds, self._finish)
+        readers: list[Reader] = [Direct(node, len(inputs), self._succeeds, self._finish)] * len(inputs)
         if self._threaded:
-            reader = inbox = _Inbox(node.stats, len(inputs), depth * len(inputs), policy)
-            self._inboxes.append(inbox)
+            inbox = self._inboxes[node.name] = StageInbox(node.stats, len(inputs), depth, policy)
             self._thread(node.name, self._run_node, node, inbox)
-        for stream in inputs:
+            readers = [Port(inbox, writer) for writer in range(len(inputs))]
+        for stream, reader in zip(inputs, readers, strict=True):
             stream.readers.append(reader)
         return node.stream
 
@@ -275,12 +246,12 @@ class Graph:
         source.stream.end()
         return False
 
-    def _run_node(self, node: Node, inbox: _Inbox) -> None:
+    def _run_node(self, node: Node, inbox: StageInbox) -> None:
         self._succeeds(node.name, self._drain, node, inbox)
         inbox.close()
         node.stream.end()
 
-    def _drain(self, node: Node, inbox: _Inbox) -> None:
+    def _drain(self, node: Node, inbox: StageInbox) -> None:
         while (message := inbox.get()) is not END:
             node.handle(message)
         self._finish(node)
@@ -336,7 +307,7 @@ class Graph:
                 wake, source.wake = source.wake, nothing
                 self._succeeds(source.name, wake)
         if self._aborting:
-            for inbox in self._inboxes:
+            for inbox in self._inboxes.values():
                 inbox.close()
 
     @contextmanager

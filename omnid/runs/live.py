@@ -130,6 +130,7 @@ class LiveRun:
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         stages = wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
+        graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
         commands = self._commands(session, bus, controller, recorder) if controller else None
         sources = StatusSources(
             graph.telemetry,

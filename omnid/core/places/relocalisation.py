@@ -27,6 +27,8 @@ THRESHOLD_PX = 3.0  # largest error of a view in the consensus set
 MIN_MATCHES = 12  # matches, and inliers among them, below which a keyframe is not recognised
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
 MAX_KEYFRAMES = 8  # kept in memory
+MAX_MATCHED, MAX_DESCRIBED = 4, 2  # keyframes in one search, and those among them whose features are not yet known
+ENOUGH_INLIERS = 60  # that end a search
 KEYFRAMES_APART_M = 0.3  # a keyframe nearer to the last one replaces it
 
 
@@ -49,12 +51,14 @@ class Relocaliser:
         self._apart_m = apart_m
         self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
         self._descriptors: dict[int, KeyframeDescriptor] = {}
+        self._searched = 0  # keyframes that the searches since the last addition or success have matched
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. Features are computed when needed."""
         if self._kept and _distance_m(self._kept[-1][1], keyframe) < self._apart_m:
             self._kept.pop()
         self._kept.append((frame, keyframe))
+        self._searched = 0
         kept = {frame.seq for frame, _ in self._kept}
         self._descriptors = {seq: features for seq, features in self._descriptors.items() if seq in kept}
 
@@ -64,10 +68,29 @@ class Relocaliser:
         self._descriptors.clear()
 
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
-        """Return the pose with the most inliers among all keyframes, None where no keyframe is recognised."""
+        """Return the pose with the most inliers among some keyframes, None where none of them is recognised.
+
+        The newest keyframes come first, and a search of the next frame goes on where this one ends: all at once would
+        take a second, in which the robot has no pose at all.
+        """
         here = _describe(frame, self._model)
-        found = (self._match(here, frame.seq, *kept) for kept in reversed(self._kept))
-        return max((pose for pose in found if pose), key=lambda pose: pose.inliers, default=None)
+        newest_first = deque(reversed(self._kept))
+        newest_first.rotate(-self._searched)
+        best: PoseEstimate | None = None
+        unknown = 0
+        for kept, keyframe in list(newest_first)[:MAX_MATCHED]:
+            unknown += kept.seq not in self._descriptors
+            if unknown > MAX_DESCRIBED:
+                break
+            self._searched += 1
+            pose = self._match(here, frame.seq, kept, keyframe)
+            if pose is not None and (best is None or pose.inliers > best.inliers):
+                best = pose
+            if best is not None and best.inliers >= ENOUGH_INLIERS:
+                break
+        if best is not None:
+            self._searched = 0
+        return best
 
     def _match(
         self, here: KeyframeDescriptor, seed: int, kept: StereoFrame, keyframe: Keyframe

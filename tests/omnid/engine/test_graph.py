@@ -537,3 +537,86 @@ def test_refuses_wrong_wiring() -> None:
         graph.run()
     with pytest.raises(OmnidError, match="runs once"):
         graph.source("late", lambda: range(3))
+
+
+def test_of_two_writers_each_drops_its_own_oldest_message() -> None:
+    """So a camera never takes the place of the other one's image."""
+    graph, gate, out = Graph(policy=NEWEST, depth=1), threading.Event(), Collect()
+    sent = [threading.Event(), threading.Event()]
+
+    def numbers(offset: int, done: threading.Event) -> Iterator[int]:
+        yield from range(offset, offset + 5)
+        done.set()
+
+    class Slow:
+        def process(self, number: int) -> int:
+            if not gate.is_set():
+                for event in sent:
+                    event.wait(5)
+                gate.set()
+            return number
+
+    lower = graph.source("lower", lambda: numbers(0, sent[0]))
+    upper = graph.source("upper", lambda: numbers(100, sent[1]))
+    graph.sink("out", out, graph.stage("slow", Slow(), lower, upper), policy=LOSSLESS)
+    graph.run()
+    assert {4, 104} <= set(out.got)
+
+
+class Recorded:
+    """Passes numbers on after an optional wait, and keeps what it was given."""
+
+    def __init__(self, wait_s: float = 0.0) -> None:
+        self.seen: list[int] = []
+        self._wait_s = wait_s
+
+    def process(self, number: int) -> int:
+        self.seen.append(number)
+        time.sleep(self._wait_s)
+        return number
+
+
+@pytest.mark.parametrize("bound", [True, False])
+def test_a_bound_head_works_only_for_what_the_tail_will_take(bound: bool) -> None:
+    """Without the bound, the head's work on most messages is dropped in front of the slow tail."""
+    graph, head, tail = Graph(policy=NEWEST, depth=1), Recorded(), Recorded(0.03)
+
+    def numbers() -> Iterator[int]:
+        for number in range(200):
+            time.sleep(0.001)
+            yield number
+
+    graph.sink("tail", tail, graph.stage("head", head, graph.source("numbers", numbers)))
+    if bound:
+        graph.bound("head", "tail")
+    graph.run()
+    assert tail.seen[-1] == 199  # the last one is not lost
+    assert (len(head.seen) <= len(tail.seen) + 1) == bound
+
+
+def test_a_bound_head_ends_with_a_tail_that_fails() -> None:
+    class Failing:
+        def process(self, number: int) -> None:
+            raise ValueError("broken")
+
+    graph = Graph(policy=NEWEST, depth=1)
+    graph.sink("tail", Failing(), graph.stage("head", Recorded(), graph.source("numbers", lambda: iter(range(50)))))
+    graph.bound("head", "tail")
+    with pytest.raises(ValueError, match="broken"):
+        graph.run()
+
+
+def test_a_direct_stage_runs_in_the_thread_of_the_one_before() -> None:
+    names: list[str] = []
+
+    class Named:
+        def process(self, number: int) -> int:
+            names.append(threading.current_thread().name)
+            return number
+
+    graph, out = Graph(), Collect()
+    first = graph.stage("first", Named(), graph.source("numbers", lambda: iter(range(3))))
+    graph.sink("out", out, graph.stage("second", Named(), first, direct=True))
+    graph.run()
+    assert set(names) == {"first"} and out.got == [0, 1, 2]
+    assert [stats.processed for stats in graph.telemetry.stages if stats.name == "second"] == [3]
