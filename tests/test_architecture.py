@@ -145,7 +145,8 @@ class Rule:
 RULES = (
     Rule("calib", ("threading", "_thread", "time", "socket", "logging")),
     Rule("drivers.motors", ("numpy", "cv2")),
-    Rule("omnid", ("threading", "_thread"), excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py")),
+    Rule("omnid", ("threading", "_thread"),
+         excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py", "omnid/engine/bounded_call.py")),
     Rule("omnid", ("zenoh",), excepted=("omnid/transport/bus.py", "omnid/transport/session.py", "omnid/client.py")),
     Rule("omnid.core", ("threading", "time", "logging", "socket", "subprocess")),
     Rule("omnid.core.control", ("numpy", "cv2")),

@@ -14,6 +14,7 @@ from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.engine.bounded_call import returns_within
 from omnid.engine.graph import Graph
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.signals import handle_stop_signals
@@ -24,6 +25,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
 CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
+BUS_END_S: Final = 3.0
 TICKERS: Final = frozenset({"motor", "progress", "router", "status", "watchdog"})  # they drop deadlines, not messages
 
 
@@ -51,12 +53,17 @@ class Session:
     def open_bus(self, rig: Rig) -> Bus:
         """Open the bus; it answers queries for the configuration and the rig."""
         bus = Bus(self.config.bus, self.warn)
-        self.outputs.callback(bus.close)
+        self.outputs.callback(self._close_bus, bus)
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         if bus.needs_router:
             self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
         return bus
+
+    def _close_bus(self, bus: Bus) -> None:
+        """Close the bus. zenoh waits for subscribers that do not read, for 10 s and more; a service has less time."""
+        if not returns_within(bus.close, BUS_END_S, "bus-close"):
+            self.warn(f"the bus has not closed within {BUS_END_S:g} s, for a subscriber does not read: it is given up")
 
     def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
         """Start the controller process; DriverError where the motor cannot be opened.

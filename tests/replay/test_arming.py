@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import re
+import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
+
+import pytest
 
 from omnid.core.control.safety_rules import FAILED
 from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
 
-MANUAL = ("--set", "controller.arming=manual")
-WATCH_S = 1.0  # during which nothing may move
+# A busy machine is late with everything, and each fault would disarm.
+PATIENT = ("controller.arming=manual", "controller.deadlines.pose_s=8", "controller.deadlines.command_s=8",
+           "controller.deadlines.tick_s=8", "motor.watchdog_ms=8000")
+MANUAL = tuple(word for setting in PATIENT for word in ("--set", setting))
+WATCH_S = 0.5  # during which nothing may move
+HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
+TIMEOUT_STOP_S = float(re.findall(r"^TimeoutStopSec=(\d+)$", (ROOT / "systemd/omnid.service").read_text(), re.M)[0])
 
 
 def omnid(daemon: Daemon, command: str, *words: str) -> tuple[int, str]:
@@ -40,7 +50,7 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, s
         wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
         assert omnid(daemon, "stop") == (0, "omnid stops: its wheels stay stopped until `omnid arm`\n")
         expect_stand(operator, base)
-        assert omnid(daemon, "arm")[0] == 0
+        operator.arm()
         wait_until(lambda: base.drives, "motion after the release")
         base.unplug()
         wait_until(lambda: operator.message("wheels") == FAILED, "the fault")
@@ -49,7 +59,7 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, s
         base.plug_in()
         wait_until(lambda: operator.message("wheels") == f"not armed: {FAILED}", "the end of the fault")
         expect_stand(operator, base)
-        assert omnid(daemon, "arm")[0] == 0
+        operator.arm()
         wait_until(lambda: base.drives, "motion after the fault")
         code, err = daemon.end()
         assert code == 0 and f"the wheels stop: {FAILED}; they stay stopped until cmd/arm (`omnid arm`)" in err
@@ -61,3 +71,33 @@ def test_without_a_robot_the_error_says_what_to_do(scene: Path) -> None:
         done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
         assert done.returncode == 2 and done.stdout == ""
         assert done.stderr.startswith("omnid: bus cannot reach ") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_sigterm_with_subscribers_that_do_not_read_stops_the_wheels_and_ends_in_time(
+    tmp_path: Path, scene: Path
+) -> None:
+    """Three listeners get no processor; the daemon publishes panoramas for them. zenoh alone would wait for 20 s."""
+    with ExitStack() as ends, robot(scene, tmp_path, "--set", "bus.panorama_hz=10") as (daemon, operator, base):
+        listeners = [_started_listener(ends, daemon) for _ in range(3)]
+        operator.drive(0.3)
+        wait_until(lambda: base.drives, "motion")
+        for listener in listeners:
+            listener.send_signal(signal.SIGSTOP)
+        time.sleep(HUNG_S)
+        daemon.process.send_signal(signal.SIGTERM)
+        wait_until(lambda: not base.drives or not daemon.alive, "the stop")
+        assert not base.drives, "the wheels stop before the daemon ends"
+        _, err = daemon.process.communicate(timeout=TIMEOUT_STOP_S)
+        assert daemon.process.returncode == 0 and "the bus has not closed within 3 s" in err, err
+        assert not base.drives
+
+
+def _started_listener(ends: ExitStack, daemon: Daemon) -> subprocess.Popen[str]:
+    """Start `omnid listen` and return when it has shown a pose."""
+    line = [sys.executable, "-m", "omnid", "listen", "--connect", f"tcp/127.0.0.1:{daemon.port}"]
+    listener = ends.enter_context(subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT))
+    ends.callback(listener.kill)
+    assert listener.stdout is not None
+    wait_until(lambda: "tracking" in listener.stdout.readline(), "a pose")
+    return listener

@@ -163,10 +163,15 @@ class ControlLaw:
         return self._goal.towards(turn_rad, error_rad)
 
     def _jumps(self, before: ControllerPose, pose: ControllerPose) -> bool:
-        """True if the heading has changed by more than the base can have turned since the last pose."""
-        passed_s = abs(pose.stamp_ns - before.stamp_ns) * S_PER_NS
-        reach_rad = JUMP_RAD + self._settings.limits.yaw_acceleration_radps2 * passed_s**2 / 2
-        return abs(wrap_angle(pose.heading_rad - before.heading_at(pose.stamp_ns))) > reach_rad
+        """True if the heading has changed by more than the base can have turned since the last pose.
+
+        That is: by more than it turns from a stand, and by more than it turns with the yaw rate of the last pose.
+        """
+        limits, passed_s = self._settings.limits, abs(pose.stamp_ns - before.stamp_ns) * S_PER_NS
+        turned_rad = abs(wrap_angle(pose.heading_rad - before.heading_rad))
+        unpredicted_rad = abs(wrap_angle(pose.heading_rad - before.heading_at(pose.stamp_ns)))
+        return (turned_rad > JUMP_RAD + limits.yaw_rate_radps * passed_s
+                and unpredicted_rad > JUMP_RAD + limits.yaw_acceleration_radps2 * passed_s**2 / 2)
 
     def _command_age_s(self, now_ns: int) -> float:
         """Return the age of the setpoint; inf where there is none, or a void one."""

@@ -57,7 +57,8 @@ IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
 
 # The first rule that holds is reported. A NaN is a reason, and so is an age as far below 0 as it may be above: no pose
-# comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode.
+# comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode. A
+# heading that jumps is none either: odometry has closed a gap, and only setpoints from before it are void.
 RULES: Final = (
     Rule(ENDS, False, lambda now, _: now.ending),
     Rule(ASKED, False, lambda now, _: now.stop_asked),
@@ -66,7 +67,7 @@ RULES: Final = (
     Rule(OVERLOADED, True, lambda now, deadlines: not now.late_s <= deadlines.tick_s),
     Rule(POSE_STALE, True, lambda now, deadlines: not abs(now.pose_age_s) <= deadlines.pose_s),
     Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
-    Rule(POSE_JUMPED, True, lambda now, _: now.pose_jumped),
+    Rule(POSE_JUMPED, False, lambda now, _: now.pose_jumped),
     Rule(NOT_ARMED, False, lambda now, _: not now.armed),
     Rule(IDLE, False, lambda now, _: now.command_age_s == float("inf")),
     Rule(COMMAND_STALE, False, lambda now, deadlines: not abs(now.command_age_s) <= deadlines.command_s),

@@ -45,19 +45,12 @@ def stop_itself(bench: Bench) -> None:
     bench.wheels.expired = False
 
 
-def jump(bench: Bench) -> None:
-    bench.send_pose(1.5)
-    bench.tick()
-    bench.controller.set_pose(bench.controller._law.pose._replace(heading_rad=0.0, yaw_rate_radps=0.0))  # type: ignore
-
-
 FAULTS: dict[str, Callable[[Bench], None]] = {
     safety_rules.FAILED: fail,
     safety_rules.STOPPED: stop_itself,
     safety_rules.OVERLOADED: lambda bench: bench.tick(late_s=0.26),
     safety_rules.POSE_STALE: lambda bench: (bench.send_pose(age_s=1.0), bench.tick())[0],
     safety_rules.POSE_LOST: lambda bench: (bench.send_pose(state="lost"), bench.tick())[0],
-    safety_rules.POSE_JUMPED: jump,
 }
 
 

@@ -16,7 +16,7 @@ from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
-from omnid.core.control.arming import AUTOMATIC
+from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import HeadingLimits, Setpoint
@@ -105,13 +105,22 @@ def test_after_a_jump_a_heading_is_the_one_of_the_corrected_odometry() -> None:
     assert robot.driver.fastest_radps <= RIPPLE * LIMITS.yaw_rate_radps
 
 
-def test_with_an_operator_a_jump_stops_the_base_until_it_is_armed() -> None:
+def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> None:
     robot = Lockstep()
     robot.controller = Controller(robot.driver, replace(SETTINGS, arming="manual"), PERIOD_S,
                                   clock_ns=lambda: robot.now_ns)
+    robot.run(STRAIGHT, 2)
+    robot.controller.arm(ArmRequest(robot.now_ns))
+    robot.run(STRAIGHT, 40)
+    assert robot.driver.base.velocity_mps > 0.15
+    for _ in range(20):  # the operator sends no more, and the pose jumps
+        robot.now_ns += round(PERIOD_S * 1e9)
+        robot.controller.set_pose(ControllerPose(robot.now_ns, 1.5, 0.0, "tracking"))
+        robot.controller.tick()
+    assert robot.heading_rad == 0.0 and robot.driver.base.velocity_mps == 0.0
     robot.jump_rad = 1.5
-    robot.run(Setpoint(0.2, 0.0), 200)
-    assert robot.heading_rad == 0.0
+    robot.run(STRAIGHT, 40)
+    assert robot.driver.base.velocity_mps > 0.15, "it obeys the next one"
 
 
 def test_a_jump_within_the_reach_of_the_base_is_no_fault() -> None:

@@ -1,0 +1,18 @@
+"""Calls that may block for longer than their caller can wait."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+
+def returns_within(action: Callable[[], None], timeout_s: float, name: str) -> bool:
+    """Call an action in a thread; return whether it has returned in time.
+
+    One that has not goes on in its thread, which does not keep the program from ending. For the end of a run: what the
+    action uses must not be used afterwards.
+    """
+    thread = threading.Thread(target=action, name=name, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    return not thread.is_alive()
