@@ -21,7 +21,7 @@ TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
 
 
 @dataclass(frozen=True, slots=True)
-class ExposureTimes:
+class ShutterTimes:
     """Times of exposure against the stamps: of the upper camera, and from one image row of a camera to the next."""
 
     upper_delay_s: float = 0.0
@@ -97,8 +97,8 @@ class RigParameters:
         steps[first:len(self.rig_names)] = np.array([*turn, x / z, y / z]) / ANGLE_UNIT_RAD
         return steps
 
-    def times_at(self, steps: Array) -> ExposureTimes:
+    def times_at(self, steps: Array) -> ShutterTimes:
         """Return the times of exposure after steps (P,)."""
         values = dict(zip(self.times, steps[len(self.rig_names):].tolist(), strict=True))
-        return ExposureTimes(1e-3 * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
+        return ShutterTimes(1e-3 * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
                              1e-6 * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, held_out_error, observation_sigma
 from calib.fit.drive_models import DriveModelScore, best_distortion, candidate_distortions, drive_structure
-from calib.fit.drive_parameters import TRANSFORM_NAMES, RigParameters
+from calib.fit.drive_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
 from calib.fit.drive_prior import baseline_by_prior, nominal_sigmas, prior_information
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
@@ -36,6 +36,9 @@ START_DISTORTION = ("p1", "p2")  # until the model is chosen
 # Larger changes are those of another rig; a nominal rig does not know how its cameras were mounted.
 MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.5), np.deg2rad(4.5)
 MAX_CHANGE_SIGMAS = 4.0  # of a nominal rig's sigmas: intrinsics
+TIMES = (UPPER_DELAY, LINE_TIME)
+# Times below these are those of synchronous cameras with global shutters.
+MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,13 @@ class DriveCalibration:
         return any(structure.is_misfit for structure in self.structure)
 
     @property
+    def times(self) -> list[tuple[str, float]]:
+        """Keys of the configuration and values of the times of exposure that differ from none."""
+        times = self.adjustment.parameters.times_at(self.adjustment.state.steps)
+        values = {"camera.upper_delay_ms": 1e3 * times.upper_delay_s, "camera.line_time_us": 1e6 * times.line_time_s}
+        return [(key, value) for key, value in values.items() if value]
+
+    @property
     def distance_m(self) -> float:
         """The straight distance [m] between the first and the last pair of a single log, with the rig."""
         T_rig_odom = self.adjustment.state.T_rig_odom
@@ -74,16 +84,17 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     config = Config()
     before = _with_masks(logs[0], rig, topics)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
-    parameters = RigParameters.about(before, distortion)
+    parameters = RigParameters.about(before, distortion, TIMES)
     steps = parameters.transform_steps(_straightened(logs, before, topics, config, report))
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
     scores = tuple(_score(found, drives, terms) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
         report(str(score))
-    if best_distortion(scores) != distortion:
-        parameters = RigParameters.about(before, best_distortion(scores))
+    times = significant_times(found)
+    if (best_distortion(scores), times) != (distortion, TIMES):
+        parameters = RigParameters.about(before, best_distortion(scores), times)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
-    _require_same_rig(found)
+    require_same_rig(found)
     first_sigma = observation_sigma(before, found, drives.fixed)
     return _calibration(before, found, (scores, first_sigma), drives)
 
@@ -116,7 +127,7 @@ def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
 
 
 def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...]) -> DriveModelScore:
-    parameters = RigParameters.about(found.parameters.rig, terms)
+    parameters = RigParameters.about(found.parameters.rig, terms, TIMES)
     prior = prior_information(parameters, parameters.rig)
     return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed))
 
@@ -142,7 +153,15 @@ def _calibration(before: Rig, found: DriveAdjustment, known: tuple[tuple[DriveMo
     return DriveCalibration(before, rig, found, scores, first_sigma, lengths, drive_structure(found), level, drives)
 
 
-def _require_same_rig(found: DriveAdjustment) -> None:
+def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
+    """Return the names of the times of exposure that differ from none."""
+    names, values = found.parameters.names, found.state.steps * found.parameters.units
+    sigmas = found.sigmas * found.parameters.units
+    return tuple(name for name, value, sigma in zip(names, values, sigmas, strict=True)
+                 if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma))
+
+
+def require_same_rig(found: DriveAdjustment) -> None:
     """Raise OmnidError where the drive asks for another rig than the one given."""
     parameters, steps = found.parameters, found.state.steps
     first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
