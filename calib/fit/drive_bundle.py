@@ -84,6 +84,15 @@ def adjust_drive(parameters: RigParameters, state: DriveState, observations: Dri
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
 
 
+def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations, prior: Array) -> Array:
+    """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
+
+    Rays of both cameras must meet: columns of the panoramas, but no lengths. The poses of the keyframes do not matter.
+    """
+    everything = np.arange(len(state.T_rig_odom))
+    return _descend(DriveProblem(parameters, observations, prior, everything), state, ROUGH_GAIN)[0].steps
+
+
 def held_out_error(parameters: RigParameters, found: DriveAdjustment, prior: Array, fixed: Sequence[int] = (0,)
                    ) -> float:
     """Return the error [px] of landmarks that another model of the rig was not fitted to; robust (Cauchy's function).

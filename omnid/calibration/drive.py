@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, held_out_error, observation_sigma
+from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, adjust_pairs, held_out_error, observation_sigma
 from calib.fit.drive_models import DriveModelScore, best_distortion, candidate_distortions, drive_structure
 from calib.fit.drive_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
 from calib.fit.drive_prior import baseline_by_prior, nominal_sigmas, prior_information
@@ -18,7 +18,7 @@ from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
 from calib.rig_covariance import RigCovariance
-from omnid.calibration.drive_observations import Drives, Topics, collect
+from omnid.calibration.drive_observations import Drives, Topics, collect, observe_pairs
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
 from omnid.calibration.log_rig_check import check_rig, open_log, read_rig_pairs
 from omnid.config import Config
@@ -31,7 +31,7 @@ Report = Callable[[str], None]
 ROUNDS = 2  # the second one tracks in panoramas that the first one's rig has straightened
 MAX_ROUNDS = 4
 SETTLED = 1e-3  # relative change of the scale in a round, below which no further round is needed
-DRIFT_ROUNDS = 3
+PAIR_ROUNDS = 3  # of matching columns, before the first round
 START_DISTORTION = ("p1", "p2")  # until the model is chosen
 # Larger changes are those of another rig; a nominal rig does not know how its cameras were mounted.
 MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.5), np.deg2rad(4.5)
@@ -85,7 +85,7 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     before = _with_masks(logs[0], rig, topics)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     parameters = RigParameters.about(before, distortion, TIMES)
-    steps = parameters.transform_steps(_straightened(logs, before, topics, config, report))
+    steps = _straightened(logs[0], parameters, topics, config, report)
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
     scores = tuple(_score(found, drives, terms) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
@@ -196,21 +196,25 @@ def _with_masks(log: Path, rig: Rig, topics: Topics) -> Rig:
         reader.close()
 
 
-def _straightened(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config, report: Report) -> Rig:
-    """Return the rig with its upper camera turned such that columns match, from where tracking works."""
-    reader = open_log(logs[0], topics, rig)
+def _straightened(log: Path, parameters: RigParameters, topics: Topics, config: Config, report: Report) -> Array:
+    """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
+    rig = parameters.rig
+    reader = open_log(log, topics, rig)
     try:
         pairs = read_rig_pairs(reader, rig)
     finally:
         reader.close()
-    for _ in range(DRIFT_ROUNDS):
-        finding = check_rig(pairs, rig, config.panorama).finding
-        if finding.drift is None:
-            raise OmnidError(f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not "
-                             "exchanged, and is there enough to see?")
-        if finding.condition == "good":
-            break
-        report(finding.summary)
-        # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
-        rig = apply_drift(rig, replace(finding.drift, shift=np.zeros(2)))
-    return rig
+    finding = check_rig(pairs, rig, config.panorama).finding
+    report(finding.summary)
+    if finding.drift is None:
+        raise OmnidError(f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
+                         "and is there enough to see?")
+    # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
+    steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
+    prior = prior_information(parameters, rig)
+    for _ in range(PAIR_ROUNDS):
+        state, observations = observe_pairs(pairs, parameters.at(steps), config)
+        steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)
+    finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
+    report(finding.summary)
+    return steps

@@ -16,9 +16,11 @@ from calib.rig import Rig
 from drivers.logs.mcap_reader import LogReader
 from omnid.calibration.log_rig_check import open_log
 from omnid.config import Config
-from omnid.core.rig.drive_landmarks import DriveLandmarks, View, image_pixels
+from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels
+from omnid.core.rig.rig_check import match
+from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
+from omnid.messages import FramePair, OdometryUpdate
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.odometry import OdometryStage
@@ -70,6 +72,29 @@ def collect(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config) -> D
                             np.concatenate([state.motion.upper_delay_s for state in states]))
     state = DriveState(T_rig_odom, np.concatenate([state.points for state in states]), np.zeros(0), motion)
     return Drives(state, observations, tuple(keyframes[:-1].tolist()), parts[-1].T_last)
+
+
+def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple[DriveState, DriveObservations]:
+    """Return points that both cameras saw at once, each pair a keyframe in one place, without tracking."""
+    place = geometry(rig, config.panorama)
+    dewarp, model = Dewarp(place, config.panorama), place.model(NOISE_PX)
+    found: list[tuple[Array, Array, Array]] = []
+    for number, pair in enumerate(pairs):
+        panoramas = dewarp.process(pair)
+        matches = match(panoramas.lower, panoramas.upper, panoramas.visible)
+        found.append((np.full(len(matches.lower), number), matches.lower, matches.upper))
+    keyframe, lower, upper = (np.concatenate([part[k] for part in found]) for k in range(3))
+    points = se3.apply(place.T_rig_rect, triangulate(np.column_stack([lower, upper[:, 1]]), model.cylinder,
+                                                     model.baseline_m))
+    count, landmark = len(points), np.arange(len(points))
+    seen = PanoramaObservations(np.tile(keyframe, 2), np.tile(landmark, 2), np.repeat([0, 1], count),
+                                np.concatenate([lower, upper]), points)
+    pixels = image_pixels(seen, rig, place.cylinder)
+    known = np.isfinite(pixels).all(axis=1) & np.tile(np.isfinite(points).all(axis=1), 2)
+    observations = DriveObservations(seen.keyframe, seen.landmark, seen.camera, pixels)
+    observations, used = observations.only(known & np.tile(known[:count] & known[count:], 2))
+    T = np.tile(np.eye(4), (len(pairs), 1, 1))
+    return DriveState(T, points[used], np.zeros(0), KeyframeMotion.still(len(pairs))), observations
 
 
 def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int) -> Drives:
