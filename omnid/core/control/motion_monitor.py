@@ -1,0 +1,191 @@
+"""Comparison of three accounts of the motion: told to the wheels, reported by them, and seen by the cameras.
+
+Each account differs from the others within plausible slip, delay and noise. A speed that was seen or reported is
+plausible if it lies between the lowest and the highest speed of the last delay_s, widened by the slip, the tolerance
+and three standard deviations. The part of it beyond, integrated over time, is the unexplained motion in m and rad: some
+of it slows the base down, more stops it. While nothing is unexplained, the sum falls again.
+
+    told 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.05 = 0.13 m/s: 0.13 m a second
+
+Wheels that are not driven may be pushed by hand: nothing is compared while the base is told to stand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Final, NamedTuple
+
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+from omnid.core.control.velocity_limits import STOP
+from omnid.settings import knob
+
+S_PER_NS: Final = 1e-9
+MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
+SIGMAS: Final = 3.0
+RECOVERY: Final = 0.5  # of the motion that stops, per second in which nothing is unexplained
+REST_S: Final = 2.0  # told to stand for so long, the base begins anew with nothing unexplained
+
+NOT_SEEN: Final = "the images do not show the commanded motion"
+NOT_COMMANDED: Final = "the images show a motion that was not commanded"
+NOT_FOLLOWED: Final = "the wheels do not follow the commands"
+DISAGREEMENTS: Final = (NOT_SEEN, NOT_COMMANDED, NOT_FOLLOWED)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSettings:
+    """Plausible differences between told, reported and seen motion."""
+
+    check: bool = knob(True, "compare the motion that is commanded, reported by the wheels and seen by the cameras")
+    delay_s: float = knob(0.5, "time after which the base must follow a command, s", low=0.05, high=5)
+    slip: float = knob(0.4, "plausible slip of the wheels, as a share of the speed", low=0, high=0.95)
+    speed_mps: float = knob(0.05, "difference in speed that means nothing, m/s", low=0, high=1)
+    yaw_rate_radps: float = knob(0.15, "difference in yaw rate that means nothing, rad/s", low=0, high=3)
+    slow_m: float = knob(0.05, "unexplained motion that slows the base down, m", low=0.001, high=10)
+    stop_m: float = knob(0.15, "unexplained motion that stops the base, m", low=0.001, high=10)
+    slow_rad: float = knob(0.15, "unexplained rotation that slows the base down, rad", low=0.001, high=10)
+    stop_rad: float = knob(0.5, "unexplained rotation that stops the base, rad", low=0.001, high=10)
+
+
+class Motion(NamedTuple):
+    """A motion that was seen or reported, with its standard deviations; NaN where it is unknown."""
+
+    velocity_mps: float
+    yaw_rate_radps: float
+    velocity_sigma_mps: float = 0.0
+    yaw_rate_sigma_radps: float = 0.0
+
+
+class _Account(NamedTuple):
+    """A motion at a time."""
+
+    at_ns: int
+    velocity_mps: float
+    yaw_rate_radps: float
+
+
+class _Band(NamedTuple):
+    """Plausible values of a speed."""
+
+    low: float
+    high: float
+
+    def widened(self, share: float, tolerance: float) -> _Band:
+        """Return the band with a slip and a tolerance; a slip of the slowest speed never changes its sign."""
+        return _Band(self.low - share * abs(self.low) - tolerance, self.high + share * abs(self.high) + tolerance)
+
+    def beyond(self, value: float) -> float:
+        """Return by how far a value lies above the band, below 0 where it lies below; 0 inside and for NaN."""
+        return max(0.0, value - self.high) - max(0.0, self.low - value)
+
+
+class MotionMonitor:
+    """Sums of unexplained motion; the caller gives each tick's command, each pose and each report of the wheels.
+
+    The memory of commands is bounded. Not thread-safe.
+    """
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self._settings = settings
+        self._told: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._reported: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._driven_ns: int | None = None  # the newest tick that told the base to move
+        self._seen_ns = self._heard_ns = 0
+        self._wheels_report = False  # they have reported a motion: some controllers never do
+        self._unexplained = {reason: [0.0, 0.0] for reason in DISAGREEMENTS}  # m, rad
+
+    @property
+    def doubtful(self) -> bool:
+        """True if some motion is unexplained: the base is to slow down."""
+        return any(metres > self._settings.slow_m or radians > self._settings.slow_rad
+                   for metres, radians in self._unexplained.values())
+
+    @property
+    def reason(self) -> str:
+        """The disagreement for which the base must stop; empty without one."""
+        limits = self._settings
+        return next((reason for reason, (metres, radians) in self._unexplained.items()
+                     if metres > limits.stop_m or radians > limits.stop_rad), "")
+
+    def tell(self, now_ns: int, motion: Twist) -> None:
+        """Note the motion that the base was told at this tick."""
+        if not self._settings.check:
+            return
+        self._told.append(_Account(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
+        if motion != STOP:
+            self._driven_ns = now_ns
+        if self._driven_ns is None or (now_ns - self._driven_ns) * S_PER_NS > REST_S:
+            self._forget()
+
+    def see(self, stamp_ns: int, seen: Motion) -> None:
+        """Compare what the cameras saw at a time with what was told, or reported by the wheels, until then."""
+        before_ns, self._seen_ns = self._seen_ns, max(stamp_ns, self._seen_ns)
+        if stamp_ns <= before_ns or not self._drives_at(stamp_ns):
+            return
+        dt_s = _passed_s(before_ns, stamp_ns)
+        explained = [*self._recent(self._told, stamp_ns), *self._recent(self._reported, stamp_ns)]
+        velocity, yaw_rate = self._bands(explained, seen)
+        self._add_seen(0, velocity, seen.velocity_mps, dt_s)
+        self._add_seen(1, yaw_rate, seen.yaw_rate_radps, dt_s)
+
+    def hear(self, now_ns: int, reported: Motion) -> None:
+        """Compare what the wheels report with what they were told; a yaw rate of NaN is not compared."""
+        if not self._settings.check:
+            return
+        before_ns, self._heard_ns = self._heard_ns, now_ns
+        turn_radps = reported.yaw_rate_radps if math.isfinite(reported.yaw_rate_radps) else 0.0
+        self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
+        if not self._wheels_report or not math.isfinite(reported.velocity_mps):
+            return
+        self._reported.append(_Account(now_ns, reported.velocity_mps, turn_radps))
+        if not self._drives_at(now_ns):
+            return
+        dt_s = _passed_s(before_ns, now_ns)
+        velocity, yaw_rate = self._bands(self._recent(self._told, now_ns), reported)
+        self._add(NOT_FOLLOWED, 0, abs(velocity.beyond(reported.velocity_mps)), dt_s)
+        self._add(NOT_FOLLOWED, 1, abs(yaw_rate.beyond(reported.yaw_rate_radps)), dt_s)
+
+    def _drives_at(self, at_ns: int) -> bool:
+        """True if the base was told to move within the delay before a time."""
+        return any(entry.velocity_mps or entry.yaw_rate_radps for entry in self._recent(self._told, at_ns))
+
+    def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
+        """Return the accounts within the delay before a time, the newest first."""
+        since_ns = at_ns - self._settings.delay_s / S_PER_NS
+        return [entry for entry in takewhile(lambda entry: entry.at_ns >= since_ns, reversed(accounts))
+                if entry.at_ns <= at_ns]
+
+    def _bands(self, explained: list[_Account], found: Motion) -> tuple[_Band, _Band]:
+        """Return the plausible velocities and yaw rates."""
+        limits = self._settings
+        speeds, rates = [one.velocity_mps for one in explained], [one.yaw_rate_radps for one in explained]
+        return (_Band(min(speeds), max(speeds)).widened(limits.slip, limits.speed_mps
+                                                        + SIGMAS * found.velocity_sigma_mps),
+                _Band(min(rates), max(rates)).widened(limits.slip, limits.yaw_rate_radps
+                                                      + SIGMAS * found.yaw_rate_sigma_radps))
+
+    def _add_seen(self, axis: int, band: _Band, value: float, dt_s: float) -> None:
+        """Add the unexplained part of what was seen: too little of what was told, or too much."""
+        beyond = band.beyond(value)
+        too_little = beyond * (band.low + band.high) < 0.0
+        self._add(NOT_SEEN, axis, abs(beyond) if too_little else 0.0, dt_s)
+        self._add(NOT_COMMANDED, axis, 0.0 if too_little else abs(beyond), dt_s)
+
+    def _add(self, reason: str, axis: int, speed: float, dt_s: float) -> None:
+        sums = self._unexplained[reason]
+        if speed > 0.0:
+            sums[axis] += speed * dt_s
+            return
+        limit = (self._settings.stop_m, self._settings.stop_rad)[axis]
+        sums[axis] = max(0.0, sums[axis] - RECOVERY * limit * dt_s)
+
+    def _forget(self) -> None:
+        for sums in self._unexplained.values():
+            sums[:] = 0.0, 0.0
+
+
+def _passed_s(before_ns: int, now_ns: int) -> float:
+    """Return the time between two accounts, at most LONGEST_TICK_S: nothing is known of a longer gap."""
+    return min(max(0.0, (now_ns - before_ns) * S_PER_NS), LONGEST_TICK_S)

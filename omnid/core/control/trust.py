@@ -1,0 +1,83 @@
+"""Trust in pose and motor: uncertainty, resets, the motor controller's faults and its battery."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from omnid.settings import knob
+
+S_PER_NS: Final = 1e-9
+BATTERY_S: Final = 2.0  # a voltage that is low for a shorter time is that of a motor that starts
+OFF: Final = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrustSettings:
+    """Levels at which the base slows down or stops."""
+
+    degraded_speed: float = knob(0.5, "share of the speed and yaw rate of controller.limits while the pose is degraded "
+                                 "or some motion is unexplained; 1: no slowing", low=0.05, high=1)
+    velocity_sigma_mps: float = knob(0.2, "the wheels stop when the standard deviation of the seen velocity stays "
+                                     "higher, m/s; 0: never", low=0, high=10)
+    yaw_rate_sigma_radps: float = knob(0.4, "the same of the yaw rate, rad/s; 0: never", low=0, high=20)
+    sigma_s: float = knob(0.3, "time for which a standard deviation may be higher, s", low=0, high=10)
+    odometry_reset: str = knob("stop", "when odometry has lost its map and begins again", choices=("stop", "ignore"))
+    motor_fault: str = knob("stop", "when the motor controller reports a fault", choices=("stop", "ignore"))
+    battery_v: float = knob(0.0, "the wheels stop when the battery's voltage stays below, V; 0: never", low=0,
+                            high=1000)
+
+
+class PoseTrust:
+    """Follows uncertainty and resets from pose to pose."""
+
+    def __init__(self, settings: TrustSettings) -> None:
+        self._settings = settings
+        self._unsure_since_ns: int | None = None
+        self._newest_ns = 0
+        self._resets: int | None = None
+        self._reset = False
+
+    @property
+    def unsure(self) -> bool:
+        """True if the velocity of the poses has been too uncertain for too long."""
+        since_ns = self._unsure_since_ns
+        return since_ns is not None and (self._newest_ns - since_ns) * S_PER_NS >= self._settings.sigma_s
+
+    def see(self, stamp_ns: int, sigmas: tuple[float, float], resets: int) -> None:
+        """Take the next pose: standard deviations of velocity [m/s] and yaw rate [rad/s], count of resets."""
+        settings = self._settings
+        limits = (settings.velocity_sigma_mps, settings.yaw_rate_sigma_radps)
+        high = any(limit != OFF and not sigma <= limit for sigma, limit in zip(sigmas, limits, strict=True))
+        if not high:
+            self._unsure_since_ns = None
+        elif self._unsure_since_ns is None:
+            self._unsure_since_ns = stamp_ns
+        self._newest_ns = stamp_ns
+        self._reset |= self._resets not in (None, resets) and settings.odometry_reset == "stop"
+        self._resets = resets
+
+    def take_reset(self) -> bool:
+        """Return whether odometry has begun again since the last call."""
+        reset, self._reset = self._reset, False
+        return reset
+
+
+class MotorTrust:
+    """Follows the motor controller's fault and its battery."""
+
+    def __init__(self, settings: TrustSettings) -> None:
+        self._settings = settings
+        self._low_since_ns: int | None = None
+        self.faulty = False  # at the last report
+        self.battery_empty = False
+
+    def hear(self, now_ns: int, fault: int, battery_v: float) -> None:
+        """Take a report of the motor controller; battery_v: NaN where it is unknown."""
+        self.faulty = fault != 0 and self._settings.motor_fault == "stop"
+        if self._settings.battery_v == OFF or not battery_v < self._settings.battery_v:
+            self._low_since_ns, self.battery_empty = None, False
+            return
+        if self._low_since_ns is None:
+            self._low_since_ns = now_ns
+        self.battery_empty = (now_ns - self._low_since_ns) * S_PER_NS >= BATTERY_S
