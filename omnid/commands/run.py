@@ -6,6 +6,7 @@ import argparse
 import logging
 from collections import Counter, defaultdict
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         _require_no_log_options(args)
         return LiveRun(config, _devices(config), log).run()
+    config = replace(config, controller=config.controller.of_log)  # the log's images do not follow the wheels
     return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log)).run()
 
 

@@ -13,6 +13,9 @@ from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.heading_controller import Twist
+from omnid.core.control.motion_monitor import Motion
+from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
 from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
 from omnid.engine.flow import nothing
@@ -27,10 +30,14 @@ class Controller:
     """
 
     def __init__(self, driver: MotorDriver, settings: ControllerSettings, period_s: float,
-                 report: Callable[[str], None] = nothing, *,
-                 clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """report: takes lines for the log. clock_ns: the clock of the poses' stamps."""
+                 report: Callable[[str], None] = nothing, *, clock_ns: Callable[[], int] = time.monotonic_ns,
+                 limited: Callable[[VelocityCommand], tuple[float, float]] | None = None) -> None:
+        """report: takes lines for the log. clock_ns: the clock of the poses' stamps.
+
+        limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
+        """
         self._driver, self._report, self._clock_ns = driver, report, clock_ns
+        self._limited = limited or _unlimited
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
         self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
@@ -78,11 +85,13 @@ class Controller:
         output = self._law.step(now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed,
                                 motor_stopped=self._motor_stopped)
         self._report_arming()
+        self._report_slowing()
         self._count_stop(output.reason)
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
+        self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
         if status is not None:
-            self._take_status(status)
+            self._take_status(status, now_ns)
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
         return TickReport(None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s,
@@ -113,6 +122,13 @@ class Controller:
         state.refused = commands.refused
         state.source = "" if self._law.reason or commands.current is None else commands.current.source
 
+    def _report_slowing(self) -> None:
+        """Keep the reason to drive slowly; report the start of one that a person should look at."""
+        before, self.state.slowed_by = self.state.slowed_by, self._law.plausibility.slowed_by
+        self.state.slowed += bool(self.state.slowed_by and not before)
+        if self.state.slowed_by == MOTION_DOUBTFUL != before:
+            self._report(f"the wheels turn slowly: {MOTION_DOUBTFUL}")
+
     def _count_stop(self, reason: str) -> None:
         """Keep the reason; count it where it ends a drive, and report it unless the end was asked for."""
         before, self.state.reason = self.state.reason, reason
@@ -142,13 +158,17 @@ class Controller:
         self.state.sent += 1
         return status
 
-    def _take_status(self, status: MotorStatus) -> None:
+    def _take_status(self, status: MotorStatus, now_ns: int) -> None:
         self._motor_stopped = status.watchdog_expired
         self.state.expiries += status.watchdog_expired
-        self.state.fault = status.fault
+        self.state.fault, self.state.battery_v = status.fault, status.battery_v
         if status.watchdog_expired:  # it stands: the command was not obeyed
             self._law.motion = STOP
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
+        # One that holds a heading decides about its yaw rate itself.
+        yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
+        self._law.plausibility.add_report(now_ns, MotorReport(Motion(status.velocity_mps, yaw_rate_radps), status.fault,
+                                                        status.battery_v))
 
     def _to_wheel_s(self, done_ns: int) -> float:
         """Return the age of the pose's images where this command is the first that follows from them, else NaN."""
@@ -157,3 +177,7 @@ class Controller:
             return math.nan
         self._driven_ns = pose.stamp_ns
         return (done_ns - pose.stamp_ns) * S_PER_NS
+
+
+def _unlimited(command: VelocityCommand) -> tuple[float, float]:
+    return command.velocity_mps, command.yaw_rate_radps

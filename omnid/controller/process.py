@@ -95,7 +95,8 @@ def run_controller(channel: Channel) -> int:
             return 2
         channel.send(LogRecord(prepare_process(start.realtime)))
         controller = Controller(driver, start.controller, 1.0 / start.motor.rate_hz,
-                                lambda text: channel.send(LogRecord(text)))
+                                lambda text: channel.send(LogRecord(text)),
+                                limited=start.motor.drive.geometry().limited)
         ControllerLoop(channel, controller).run()
     return 0
 

@@ -26,6 +26,9 @@ class ControllerState:
     source: str = ""  # of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command
     fault: int = 0  # the motor controller's own number
+    battery_v: float = math.nan  # by its report
+    slowed_by: str = ""  # why the base drives slowly; empty: it need not
+    slowed: int = 0  # how often it began to
     sent: int = 0  # commands that were answered
     late: int = 0  # commands whose answer did not come in time; the wheels go on
     errors: int = 0  # commands that failed

@@ -27,7 +27,7 @@ EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons to stand tha
 REMEDY: Final = "send cmd/arm: `omnid arm`"
 LEVELS: Final = {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}
 _CAMERA_COUNTERS: Final = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
-_WHEEL_COUNTERS: Final = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports")
+_WHEEL_COUNTERS: Final = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports", "slowed")
 
 
 class Rates:
@@ -151,7 +151,9 @@ class StatusCollector:
             refused = dict(commands.refused)  # a copy, for another thread adds to it
             values |= {Key.COMMANDS: str(commands.accepted), Key.STOPS: str(commands.stops)}
             values |= {f"{status_names.REFUSED_PREFIX}{reason}": str(count) for reason, count in refused.items()}
-        message = state.reason or "driving"
+        if math.isfinite(state.battery_v):
+            values["battery_v"] = f"{state.battery_v:.2f}"
+        message = state.reason or (f"driving slowly: {state.slowed_by}" if state.slowed_by else "driving")
         if state.reason == NOT_ARMED:
             message = state.disarmed_by if state.disarmed_by == STARTED else f"not armed: {state.disarmed_by}"
         return DiagnosticStatus(status_names.WHEELS, self._wheels_level(controller), message, values)
@@ -162,6 +164,8 @@ class StatusCollector:
         if state.reason == FAILED or state.failed or state.fault:
             return ERROR
         reason = state.disarmed_by if state.reason == NOT_ARMED else state.reason
+        if not reason and state.slowed_by:
+            return WARN
         return OK if reason in (*EXPECTED_STOPS, STARTED) else WARN
 
     def _stage(self, stage: StageStats) -> DiagnosticStatus:

@@ -72,7 +72,9 @@ class LockstepDrive:
 
 def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:
     """Return the part of a pose that the controller needs; one that is not finite is LOST."""
-    T_odom_base, _, velocity, _ = of_base(odometry, T_base_rig)
-    heading_rad, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[5])
-    finite = math.isfinite(heading_rad) and math.isfinite(rate_radps)
-    return ControllerPose(odometry.stamp_ns, heading_rad, rate_radps, odometry.state if finite else TrackingState.LOST)
+    T_odom_base, _, velocity, covariance = of_base(odometry, T_base_rig)
+    heading_rad, velocity_mps, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[0]), float(velocity[5])
+    sigma_mps, sigma_radps = (math.sqrt(max(0.0, float(covariance[axis, axis]))) for axis in (0, 5))
+    finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps)))
+    return ControllerPose(odometry.stamp_ns, heading_rad, rate_radps, odometry.state if finite else TrackingState.LOST,
+                          velocity_mps, sigma_mps, sigma_radps, odometry.reset_counter)

@@ -21,7 +21,10 @@ from omnid.core.control.heading_controller import (
     wrap_angle,
 )
 from omnid.core.control.heading_goal import HeadingGoal
+from omnid.core.control.motion_monitor import Motion, MotionSettings
+from omnid.core.control.plausibility import Plausibility
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
+from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.settings import knob
 
@@ -51,6 +54,8 @@ class ControllerSettings:
     setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
     sources: SourceSettings = field(default_factory=SourceSettings)
     arming: str = arming_knob()
+    trust: TrustSettings = field(default_factory=TrustSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings)
 
     @property
     def of_replay(self) -> ControllerSettings:
@@ -58,7 +63,12 @@ class ControllerSettings:
 
         It arms itself, also after faults that have passed: to start a replay with a motor is to ask for its motion.
         """
-        return replace(self, arming=AUTOMATIC, sources=SourceSettings())
+        return replace(self.of_log, arming=AUTOMATIC, sources=SourceSettings())
+
+    @property
+    def of_log(self) -> ControllerSettings:
+        """The settings where the images are those of a log, which do not follow the wheels."""
+        return replace(self, motion=replace(self.motion, check=False))
 
 
 class ControllerPose(NamedTuple):
@@ -68,6 +78,15 @@ class ControllerPose(NamedTuple):
     heading_rad: float  # of the base in odom
     yaw_rate_radps: float
     state: str  # tracking | degraded | lost
+    velocity_mps: float = math.nan  # forward; NaN if unknown
+    velocity_sigma_mps: float = 0.0
+    yaw_rate_sigma_radps: float = 0.0
+    resets: int = 0  # how often odometry has lost its map and begun again
+
+    @property
+    def motion(self) -> Motion:
+        """The motion that was seen."""
+        return Motion(self.velocity_mps, self.yaw_rate_radps, self.velocity_sigma_mps, self.yaw_rate_sigma_radps)
 
     def heading_at(self, now_ns: int) -> float:
         """Return the heading at another time, at a constant yaw rate."""
@@ -100,6 +119,7 @@ class ControlLaw:
         self._ending = self._pose_jumped = False
         self._pose: ControllerPose | None = None
         self.arming = Arming(settings.arming)
+        self.plausibility = Plausibility(settings.trust, settings.motion)
         self.commands = CommandSelector(settings.sources)
         self.motion = STOP  # that the base follows now: the next step continues from it
         self.reason = IDLE  # of the last step
@@ -113,6 +133,7 @@ class ControlLaw:
         """Replace the pose."""
         self._pose_jumped |= self._pose is not None and self._jumps(self._pose, pose)
         self._pose = pose
+        self.plausibility.add_pose(pose.stamp_ns, pose.state, pose.motion, pose.resets)
 
     def set_command(self, command: TimedSetpoint) -> None:
         """Offer a setpoint."""
@@ -133,7 +154,7 @@ class ControlLaw:
     def step(self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False,
              motor_stopped: bool = False) -> ControlOutput:
         """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
-        inputs = self._inputs(now_ns, late_s, motor_failed, motor_stopped)
+        inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
         deadlines = self._settings.deadlines
         accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
         if accepted is not None:
@@ -157,7 +178,8 @@ class ControlLaw:
     def _drive(self, setpoint: Setpoint, heading_rad: float, dt_s: float) -> float:
         """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
         wanted = self._heading_controller.step(setpoint, heading_rad, dt_s, self.motion)
-        self.motion = self._settings.limits.step(wanted, self.motion, dt_s)
+        limits = self._settings.limits
+        self.motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
         turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
         error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
         return self._goal.towards(turn_rad, error_rad)

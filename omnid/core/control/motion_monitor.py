@@ -1,13 +1,13 @@
-"""Comparison of three accounts of the motion: told to the wheels, reported by them, and seen by the cameras.
+"""Comparison of three accounts of the motion: commanded, reported by the wheels, and seen by the cameras.
 
 Each account differs from the others within plausible slip, delay and noise. A speed that was seen or reported is
 plausible if it lies between the lowest and the highest speed of the last delay_s, widened by the slip, the tolerance
 and three standard deviations. The part of it beyond, integrated over time, is the unexplained motion in m and rad: some
 of it slows the base down, more stops it. While nothing is unexplained, the sum falls again.
 
-    told 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.05 = 0.13 m/s: 0.13 m a second
+    commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.05 = 0.13 m/s: 0.13 m a second
 
-Wheels that are not driven may be pushed by hand: nothing is compared while the base is told to stand.
+Wheels that are not driven may be pushed by hand: nothing is compared while the base is commanded to stand.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ S_PER_NS: Final = 1e-9
 MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
 SIGMAS: Final = 3.0
 RECOVERY: Final = 0.5  # of the motion that stops, per second in which nothing is unexplained
-REST_S: Final = 2.0  # told to stand for so long, the base begins anew with nothing unexplained
+REST_S: Final = 2.0  # commanded to stand for so long, the base begins again with nothing unexplained
 
 NOT_SEEN: Final = "the images do not show the commanded motion"
 NOT_COMMANDED: Final = "the images show a motion that was not commanded"
@@ -36,7 +36,7 @@ DISAGREEMENTS: Final = (NOT_SEEN, NOT_COMMANDED, NOT_FOLLOWED)
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """Plausible differences between told, reported and seen motion."""
+    """Plausible differences between commanded, reported and seen motion."""
 
     check: bool = knob(True, "compare the motion that is commanded, reported by the wheels and seen by the cameras")
     delay_s: float = knob(0.5, "time after which the base must follow a command, s", low=0.05, high=5)
@@ -77,7 +77,7 @@ class _Band(NamedTuple):
         return _Band(self.low - share * abs(self.low) - tolerance, self.high + share * abs(self.high) + tolerance)
 
     def beyond(self, value: float) -> float:
-        """Return by how far a value lies above the band, below 0 where it lies below; 0 inside and for NaN."""
+        """Return by how far a value lies above the band, below 0 where it lies below; 0 inside."""
         return max(0.0, value - self.high) - max(0.0, self.low - value)
 
 
@@ -89,12 +89,13 @@ class MotionMonitor:
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
-        self._told: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._commanded: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
         self._reported: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
-        self._driven_ns: int | None = None  # the newest tick that told the base to move
-        self._seen_ns = self._heard_ns = 0
+        self._driven_ns: int | None = None  # the newest tick with a commanded motion
+        self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
         self._unexplained = {reason: [0.0, 0.0] for reason in DISAGREEMENTS}  # m, rad
+        self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
 
     @property
     def doubtful(self) -> bool:
@@ -102,39 +103,32 @@ class MotionMonitor:
         return any(metres > self._settings.slow_m or radians > self._settings.slow_rad
                    for metres, radians in self._unexplained.values())
 
-    @property
-    def reason(self) -> str:
-        """The disagreement for which the base must stop; empty without one."""
-        limits = self._settings
-        return next((reason for reason, (metres, radians) in self._unexplained.items()
-                     if metres > limits.stop_m or radians > limits.stop_rad), "")
-
-    def tell(self, now_ns: int, motion: Twist) -> None:
-        """Note the motion that the base was told at this tick."""
+    def add_command(self, now_ns: int, motion: Twist) -> None:
+        """Add the motion that was commanded at this tick."""
         if not self._settings.check:
             return
-        self._told.append(_Account(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
+        self._commanded.append(_Account(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
         if motion != STOP:
             self._driven_ns = now_ns
         if self._driven_ns is None or (now_ns - self._driven_ns) * S_PER_NS > REST_S:
             self._forget()
 
-    def see(self, stamp_ns: int, seen: Motion) -> None:
-        """Compare what the cameras saw at a time with what was told, or reported by the wheels, until then."""
-        before_ns, self._seen_ns = self._seen_ns, max(stamp_ns, self._seen_ns)
+    def add_seen(self, stamp_ns: int, seen: Motion) -> None:
+        """Compare what the cameras saw at a time with what was commanded, or reported by the wheels, until then."""
+        before_ns, self._last_seen_ns = self._last_seen_ns, max(stamp_ns, self._last_seen_ns)
         if stamp_ns <= before_ns or not self._drives_at(stamp_ns):
             return
         dt_s = _passed_s(before_ns, stamp_ns)
-        explained = [*self._recent(self._told, stamp_ns), *self._recent(self._reported, stamp_ns)]
+        explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
         velocity, yaw_rate = self._bands(explained, seen)
-        self._add_seen(0, velocity, seen.velocity_mps, dt_s)
-        self._add_seen(1, yaw_rate, seen.yaw_rate_radps, dt_s)
+        self._add_beyond(0, velocity, seen.velocity_mps, dt_s)
+        self._add_beyond(1, yaw_rate, seen.yaw_rate_radps, dt_s)
 
-    def hear(self, now_ns: int, reported: Motion) -> None:
-        """Compare what the wheels report with what they were told; a yaw rate of NaN is not compared."""
+    def add_report(self, now_ns: int, reported: Motion) -> None:
+        """Compare what the wheels report with what was commanded; a yaw rate of NaN is not compared."""
         if not self._settings.check:
             return
-        before_ns, self._heard_ns = self._heard_ns, now_ns
+        before_ns, self._last_report_ns = self._last_report_ns, now_ns
         turn_radps = reported.yaw_rate_radps if math.isfinite(reported.yaw_rate_radps) else 0.0
         self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
         if not self._wheels_report or not math.isfinite(reported.velocity_mps):
@@ -143,13 +137,14 @@ class MotionMonitor:
         if not self._drives_at(now_ns):
             return
         dt_s = _passed_s(before_ns, now_ns)
-        velocity, yaw_rate = self._bands(self._recent(self._told, now_ns), reported)
+        velocity, yaw_rate = self._bands(self._recent(self._commanded, now_ns), reported)
         self._add(NOT_FOLLOWED, 0, abs(velocity.beyond(reported.velocity_mps)), dt_s)
-        self._add(NOT_FOLLOWED, 1, abs(yaw_rate.beyond(reported.yaw_rate_radps)), dt_s)
+        if math.isfinite(reported.yaw_rate_radps):
+            self._add(NOT_FOLLOWED, 1, abs(yaw_rate.beyond(reported.yaw_rate_radps)), dt_s)
 
     def _drives_at(self, at_ns: int) -> bool:
-        """True if the base was told to move within the delay before a time."""
-        return any(entry.velocity_mps or entry.yaw_rate_radps for entry in self._recent(self._told, at_ns))
+        """True if a motion was commanded within the delay before a time."""
+        return any(entry.velocity_mps or entry.yaw_rate_radps for entry in self._recent(self._commanded, at_ns))
 
     def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
         """Return the accounts within the delay before a time, the newest first."""
@@ -166,22 +161,24 @@ class MotionMonitor:
                 _Band(min(rates), max(rates)).widened(limits.slip, limits.yaw_rate_radps
                                                       + SIGMAS * found.yaw_rate_sigma_radps))
 
-    def _add_seen(self, axis: int, band: _Band, value: float, dt_s: float) -> None:
-        """Add the unexplained part of what was seen: too little of what was told, or too much."""
+    def _add_beyond(self, axis: int, band: _Band, value: float, dt_s: float) -> None:
+        """Add the unexplained part of what was seen: too little of what was commanded, or too much; none of NaN."""
+        if not math.isfinite(value):
+            return
         beyond = band.beyond(value)
-        too_little = beyond * (band.low + band.high) < 0.0
-        self._add(NOT_SEEN, axis, abs(beyond) if too_little else 0.0, dt_s)
-        self._add(NOT_COMMANDED, axis, 0.0 if too_little else abs(beyond), dt_s)
+        falls_short = beyond * (band.low + band.high) < 0.0
+        self._add(NOT_SEEN, axis, abs(beyond) if falls_short else 0.0, dt_s)
+        self._add(NOT_COMMANDED, axis, 0.0 if falls_short else abs(beyond), dt_s)
 
     def _add(self, reason: str, axis: int, speed: float, dt_s: float) -> None:
-        sums = self._unexplained[reason]
-        if speed > 0.0:
-            sums[axis] += speed * dt_s
-            return
-        limit = (self._settings.stop_m, self._settings.stop_rad)[axis]
-        sums[axis] = max(0.0, sums[axis] - RECOVERY * limit * dt_s)
+        """Add an unexplained speed; 0 lets the sum fall."""
+        sums, limit = self._unexplained[reason], (self._settings.stop_m, self._settings.stop_rad)[axis]
+        sums[axis] = max(0.0, sums[axis] + dt_s * (speed if speed > 0.0 else -RECOVERY * limit))
+        if sums[axis] > limit:
+            self.reason = self.reason or reason
 
     def _forget(self) -> None:
+        self.reason = ""
         for sums in self._unexplained.values():
             sums[:] = 0.0, 0.0
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from omnid.settings import knob
 from omnid.tracking_state import TrackingState
 
@@ -30,7 +31,12 @@ class SafetyInputs:
     late_s: float = 0.0
     pose_jumped: bool = False  # the heading differs from the one before by more than the base can turn
     motor_failed: bool = False  # at the last tick
+    pose_reset: bool = False  # odometry has lost its map and begun again
+    pose_unsure: bool = False  # the velocity has been too uncertain for too long
     motor_stopped: bool = False  # by the motor controller itself, before the last tick
+    motor_faulty: bool = False  # by its own report
+    battery_empty: bool = False
+    disagreement: str = ""  # between commanded, reported and seen motion
     stop_asked: bool = False  # and not released by cmd/arm
     armed: bool = True
     ending: bool = False
@@ -52,6 +58,10 @@ OVERLOADED: Final = "the host is overloaded"
 POSE_STALE: Final = "the pose is stale"
 POSE_LOST: Final = "the pose is lost"
 POSE_JUMPED: Final = "the heading of the pose has jumped"
+POSE_RESET: Final = "odometry has lost its map and begun again"
+POSE_UNSURE: Final = "the pose is too uncertain"
+MOTOR_FAULT: Final = "the motor controller reports a fault"
+BATTERY_EMPTY: Final = "the battery is empty"
 NOT_ARMED: Final = "not armed"
 IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
@@ -64,9 +74,16 @@ RULES: Final = (
     Rule(ASKED, False, lambda now, _: now.stop_asked),
     Rule(FAILED, True, lambda now, _: now.motor_failed),
     Rule(STOPPED, True, lambda now, _: now.motor_stopped),
+    Rule(MOTOR_FAULT, True, lambda now, _: now.motor_faulty),
+    Rule(BATTERY_EMPTY, True, lambda now, _: now.battery_empty),
     Rule(OVERLOADED, True, lambda now, deadlines: not now.late_s <= deadlines.tick_s),
     Rule(POSE_STALE, True, lambda now, deadlines: not abs(now.pose_age_s) <= deadlines.pose_s),
     Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
+    Rule(POSE_RESET, True, lambda now, _: now.pose_reset),
+    Rule(POSE_UNSURE, True, lambda now, _: now.pose_unsure),
+    Rule(NOT_FOLLOWED, True, lambda now, _: now.disagreement == NOT_FOLLOWED),
+    Rule(NOT_SEEN, True, lambda now, _: now.disagreement == NOT_SEEN),
+    Rule(NOT_COMMANDED, True, lambda now, _: now.disagreement == NOT_COMMANDED),
     Rule(POSE_JUMPED, False, lambda now, _: now.pose_jumped),
     Rule(NOT_ARMED, False, lambda now, _: not now.armed),
     Rule(IDLE, False, lambda now, _: now.command_age_s == float("inf")),

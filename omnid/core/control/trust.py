@@ -44,7 +44,7 @@ class PoseTrust:
         since_ns = self._unsure_since_ns
         return since_ns is not None and (self._newest_ns - since_ns) * S_PER_NS >= self._settings.sigma_s
 
-    def see(self, stamp_ns: int, sigmas: tuple[float, float], resets: int) -> None:
+    def add_pose(self, stamp_ns: int, sigmas: tuple[float, float], resets: int) -> None:
         """Take the next pose: standard deviations of velocity [m/s] and yaw rate [rad/s], count of resets."""
         settings = self._settings
         limits = (settings.velocity_sigma_mps, settings.yaw_rate_sigma_radps)
@@ -72,7 +72,7 @@ class MotorTrust:
         self.faulty = False  # at the last report
         self.battery_empty = False
 
-    def hear(self, now_ns: int, fault: int, battery_v: float) -> None:
+    def add_report(self, now_ns: int, fault: int, battery_v: float) -> None:
         """Take a report of the motor controller; battery_v: NaN where it is unknown."""
         self.faulty = fault != 0 and self._settings.motor_fault == "stop"
         if self._settings.battery_v == OFF or not battery_v < self._settings.battery_v:

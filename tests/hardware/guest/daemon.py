@@ -61,6 +61,8 @@ max_gap_s = 60.0
 port = "/dev/omnid/motor"
 rate_hz = 2.0
 watchdog_ms = 5000
+[controller.motion]
+check = false
 [controller.deadlines]
 pose_s = 10.0
 command_s = 5.0

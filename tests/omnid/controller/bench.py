@@ -14,6 +14,7 @@ from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import HeadingLimits, Setpoint
 from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.telemetry import StageStats
 
@@ -21,7 +22,8 @@ PERIOD_S = 0.05
 PERIOD_NS = 50_000_000
 LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
                        yaw_acceleration_radps2=4.0)
-SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0))
+SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0),
+                              trust=TrustSettings(battery_v=11.0))
 UNATTENDED = replace(SETTINGS, arming=AUTOMATIC)
 AHEAD = Setpoint(0.3, None, 0.0)
 
@@ -33,13 +35,16 @@ class Wheels:
         self.commands: list[VelocityCommand] = []
         self.silent = self.expired = self.closed = False
         self.heading_rad = math.nan
+        self.fault, self.battery_v = 0, math.nan  # of its reports
+        self.velocity_mps: float | None = 0.0  # of its reports; None: as commanded
 
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Keep the command."""
         if self.silent:
             raise DriverError("motor on /dev/x gave no answer")
         self.commands.append(command)
-        return MotorStatus(0.0, self.heading_rad, 0.0, self.expired, 0, math.nan)
+        velocity_mps = command.velocity_mps if self.velocity_mps is None else self.velocity_mps
+        return MotorStatus(velocity_mps, self.heading_rad, 0.0, self.expired, self.fault, self.battery_v)
 
     def close(self) -> None:
         """Note that it was closed."""
@@ -62,8 +67,9 @@ class Bench:
         return self.wheels.commands[-1]
 
     def send_pose(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
-            age_s: float = 0.0) -> None:
-        self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state))
+            age_s: float = 0.0, velocity_mps: float = math.nan, sigma_mps: float = 0.0, resets: int = 0) -> None:
+        self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state,
+                                                velocity_mps, sigma_mps, resets=resets))
 
     def send_setpoint(self, setpoint: Setpoint = AHEAD, source: str = OPERATOR, sender: str = "") -> None:
         self.now_ns += 1

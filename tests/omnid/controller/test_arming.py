@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
+from omnid.core.control.motion_monitor import DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from tests.omnid.controller.bench import UNATTENDED, Bench
 
 
@@ -45,12 +47,48 @@ def stop_itself(bench: Bench) -> None:
     bench.wheels.expired = False
 
 
+def report_a_fault(bench: Bench) -> None:
+    bench.wheels.fault = 7
+    bench.tick()
+    bench.wheels.fault = 0
+
+
+def empty_the_battery(bench: Bench) -> None:
+    bench.wheels.battery_v = 10.9
+    drive_until_stopped(bench)
+    bench.wheels.battery_v = 12.0
+
+
+def run_away(bench: Bench) -> None:
+    bench.wheels.velocity_mps = 2.0
+    drive_until_stopped(bench)
+    bench.wheels.velocity_mps = None
+
+
+def drive_until_stopped(bench: Bench, velocity_mps: float = math.nan, sigma_mps: float = 0.0) -> None:
+    """Drive with poses of this velocity until a fault stops the wheels."""
+    for _ in range(100):
+        bench.send_pose(velocity_mps=velocity_mps, sigma_mps=sigma_mps)
+        bench.send_setpoint()
+        bench.tick()
+        if bench.controller.state.reason:
+            return
+    raise AssertionError("no fault stops the wheels")
+
+
 FAULTS: dict[str, Callable[[Bench], None]] = {
     safety_rules.FAILED: fail,
     safety_rules.STOPPED: stop_itself,
     safety_rules.OVERLOADED: lambda bench: bench.tick(late_s=0.26),
     safety_rules.POSE_STALE: lambda bench: (bench.send_pose(age_s=1.0), bench.tick())[0],
     safety_rules.POSE_LOST: lambda bench: (bench.send_pose(state="lost"), bench.tick())[0],
+    safety_rules.POSE_RESET: lambda bench: (bench.send_pose(resets=1), bench.tick())[0],
+    safety_rules.POSE_UNSURE: lambda bench: drive_until_stopped(bench, sigma_mps=1.0),
+    safety_rules.MOTOR_FAULT: report_a_fault,
+    safety_rules.BATTERY_EMPTY: empty_the_battery,
+    NOT_FOLLOWED: run_away,
+    NOT_SEEN: lambda bench: drive_until_stopped(bench, velocity_mps=0.0),
+    NOT_COMMANDED: lambda bench: drive_until_stopped(bench, velocity_mps=1.2),
 }
 
 
@@ -82,7 +120,7 @@ def test_without_an_operator_a_fault_that_has_passed_is_over(reason: str) -> Non
     bench = Bench(UNATTENDED)
     bench.drive()
     FAULTS[reason](bench)
-    bench.drive(40)
+    bench.drive(80)
     assert bench.last.velocity_mps == 0.3 and bench.controller.state.stops == {reason: 1}
     assert not any("cmd/arm" in line for line in bench.lines)
 
@@ -144,9 +182,15 @@ def test_a_stop_that_is_repeated_after_its_release_changes_nothing(driving: Benc
 def test_refuses_to_arm_while_a_fault_holds(bench: Bench, reason: str) -> None:
     bench.send_pose()
     bench.tick()
-    if reason in (safety_rules.FAILED, safety_rules.STOPPED):  # known after the answer of the motor controller
+    if reason in (safety_rules.FAILED, safety_rules.STOPPED, safety_rules.MOTOR_FAULT):  # known after its answer
         FAULTS[reason](bench)
         bench.send_pose()
+        bench.arm()
+        bench.tick()
+    elif reason in (safety_rules.BATTERY_EMPTY, safety_rules.POSE_UNSURE, *DISAGREEMENTS):  # of a drive
+        bench.drive()
+        FAULTS[reason](bench)
+        bench.send_pose(sigma_mps=1.0)
         bench.arm()
         bench.tick()
     else:

@@ -99,11 +99,18 @@ def test_stops_where_the_pose_is_lost(driving: Bench) -> None:
     assert driving.last.velocity_mps > 0.0, "found again, and a new setpoint"
 
 
-def test_drives_on_where_the_pose_is_degraded(driving: Bench) -> None:
-    driving.send_pose(state="degraded")
-    driving.send_setpoint()
-    driving.tick()
-    assert driving.last.velocity_mps == 0.3
+def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
+    """At half of the limits, which it comes to within the deceleration, and back again."""
+    speeds = [driving.last.velocity_mps]
+    for state in ["degraded"] * 10 + ["tracking"] * 10:
+        driving.send_pose(state=state)
+        driving.send_setpoint()
+        driving.tick()
+        speeds.append(driving.last.velocity_mps)
+    assert speeds[10] == LIMITS.velocity_mps / 2 and speeds[-1] == pytest.approx(0.3)
+    assert all(a - b <= LIMITS.deceleration_mps2 * PERIOD_S + 1e-6 for a, b in pairwise(speeds))
+    assert (driving.controller.state.slowed, driving.controller.state.slowed_by) == (1, "")
+    assert driving.lines == [] and not driving.controller.state.stops
 
 
 def test_stops_where_no_more_setpoints_come(driving: Bench) -> None:

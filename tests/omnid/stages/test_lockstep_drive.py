@@ -34,8 +34,8 @@ def odometry(at_s: float, state: TrackingState = TrackingState.TRACKING, *, head
     T_odom_rig = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
     velocity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate_radps])
     depth: Any = None
-    return OdometryUpdate(0, 10**12 + round(at_s * 1e9), T_odom_rig, np.eye(6), velocity, np.eye(6), state, 0, 99, 99,
-                          depth)
+    return OdometryUpdate(0, 10**12 + round(at_s * 1e9), T_odom_rig, np.eye(6), velocity, 1e-4 * np.eye(6), state, 0,
+                          99, 99, depth)
 
 
 def driven(drive: LockstepDrive, count: int, start_s: float = 0.0, **kwargs: Any) -> list[VelocityCommand]:
