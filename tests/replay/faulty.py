@@ -94,7 +94,7 @@ def main() -> int:
     faults: dict[str, str] = {}
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
     images, clock = LogImages.load(args.log), LogClock(time.monotonic_ns())
-    config = load_config(None, [*args.settings, f"motor.port={args.motor}", "controller.motion.check=false"])
+    config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
     live = LiveRun(config, lambda camera: FaultyCamera(images, camera, clock, faults),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()

@@ -12,16 +12,21 @@ import pytest
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.mcap_reader import LogReader
-from omnid.config import PairConfig, PanoramaConfig
+from omnid.config import Config, PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
-from omnid.diagnostics.rig_monitor import MIN_PLACES, VIEWS, RigMonitor
+from omnid.diagnostics.rig_monitor import MIN_PLACES, VIEWS, RigMonitor, start_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
+from omnid.stages.odometry import OdometryStage
+from omnid.stages.rig_gate import RigGate
+from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
+from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import RIG
+from tests.omnid.core.scenery import wrapped
 from tests.simulation import build, write_log
 from tests.simulation.readout import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
@@ -122,6 +127,45 @@ def test_a_rig_that_moves_during_the_run_is_detected(rooms: Path, true: tuple[Ri
     monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
     assert monitor.finding is not None and monitor.status().level == 1
     assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tuple[RigMonitor, Collector]) -> None:
+    """Three new views of it are enough, long before a whole check is due."""
+    place, config = geometry(read_rig(rooms / "rig.toml"), PanoramaConfig()), Config()
+    columns = round(3 / 360 * place.cylinder.width)
+    monitor = RigMonitor(place.cylinder, PERIOD_S)
+    stereo = Stereo(place, config.stereo, RigGate(place.cylinder, "refuse", lambda: monitor.contradicted))
+    odometry = OdometryStage(place, config.odometry)
+    for number, good in enumerate(true[1][:8]):
+        turned = wrapped(np.roll(good.upper.panorama, columns * (number >= 4), axis=1))
+        seen = replace(good, upper=turned, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS))
+        monitor.process(seen)
+        assert monitor.contradicted == (number >= 6), "the newest three views decide"
+        fits = stereo.process(seen).rig_fits
+        assert fits != monitor.contradicted
+    depth = stereo.process(true[1][8])
+    assert monitor.status().level == 2 and not depth.rig_fits
+    assert odometry.process(depth).state is TrackingState.DEGRADED
+    depth = stereo.process(true[1][9])
+    depth.rig_fits = True
+    assert odometry.process(depth).state is TrackingState.TRACKING
+
+
+def test_the_status_tells_the_result_of_the_start(rooms: Path, true: tuple[RigMonitor, Collector]) -> None:
+    right = read_rig(rooms / "rig.toml")
+    gate = RigGate(true[0]._cylinder, "warn")
+    assert start_status(gate).message == "not checked yet"
+    for one in true[1][:2]:
+        gate.process(one)
+    status = start_status(gate)
+    assert (status.level, status.message, status.values["condition"]) == (0, "good", "fits") and gate.decided
+    for turn_deg, level, words in ((0.8, 1, "do not quite fit"), (3.0, 2, "contradict the rig")):
+        _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)))
+        gate = RigGate(true[0]._cylinder, "warn")
+        for one in seen[:4]:
+            gate.process(one)
+        status = start_status(gate)
+        assert status.level == level and words in status.message and gate.contradicted == (level == 2)
 
 
 @pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
