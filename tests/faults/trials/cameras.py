@@ -73,7 +73,7 @@ def both_frozen(setting: Setting) -> Outcome:
 def repeated_now_and_then(setting: Setting) -> Outcome:
     """A driver that hands out a buffer twice is counted, and the robot drives on."""
     busy = ("--set", "controller.deadlines.pose_s=2.0")  # poses are late on a machine with other jobs
-    with driving(setting, *busy, module=FAULTY_DAEMON) as (daemon, operator, base):
+    with driving(setting, *busy, module=FAULTY_DAEMON) as (daemon, operator, _):
         daemon.write_line("upper glitch")
         wait_until(lambda: int(operator.values("pairing").get("repeated_upper", "0")) >= 8, "eight repeated images")
         stops = {f"{STOPPED_PREFIX}{reason}" for reason in (POSE_STALE, POSE_LOST)}
