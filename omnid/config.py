@@ -68,6 +68,7 @@ class LiveConfig:
     cloud_s: float = knob(2.0, "period of the maps on the bus, s; 0: only at the end", low=0, high=3600)
     cloud_points: int = knob(50_000, "largest number of map points on the bus: the most confident ones", low=0,
                              high=10_000_000)
+    shed_load: bool = knob(True, "give up the map, then half the landmarks, while the computer is too slow")
     check_s: float = knob(5.0, "period of the check of the rig's calibration, s; 0: none", low=0,
                           high=3600)
 

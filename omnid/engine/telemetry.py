@@ -129,6 +129,10 @@ class Telemetry:
         self._stages[stats.name] = stats
         return stats
 
+    def of(self, name: str) -> StageStats:
+        """Return the counters of a stage; KeyError without it."""
+        return self._stages[name]
+
     @property
     def stages(self) -> tuple[StageStats, ...]:
         """All counters."""

@@ -20,6 +20,7 @@ from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.diagnostics.latency import Latency
+from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.rig_monitor import RigMonitor, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.engine.flow import nothing
@@ -123,13 +124,17 @@ class LiveRun:
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+        ladder = LoadLadder()
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       rig_monitor=rig_monitor, rig_broken=_broken(rig_monitor),
+                      features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         stages = wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
+        if config.live.shed_load:
+            graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
         commands = self._commands(session, bus, controller, recorder) if controller else None
         sources = StatusSources(
@@ -141,7 +146,8 @@ class LiveRun:
             controller.statistics if controller else None,
             commands,
             TICKERS,
-            (partial(start_status, stages.rig_gate), *(part.status for part in (bus, recorder, rig_monitor) if part)),
+            (ladder.status, partial(start_status, stages.rig_gate),
+             *(part.status for part in (bus, recorder, rig_monitor) if part)),
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
 

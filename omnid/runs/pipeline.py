@@ -17,8 +17,8 @@ from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive
-from omnid.stages.mapping import Mapping
-from omnid.stages.odometry import OdometryStage
+from omnid.stages.mapping import Mapping, no_wait
+from omnid.stages.odometry import OdometryStage, all_features
 from omnid.stages.rig_gate import RigGate, never
 from omnid.stages.stereo import Stereo
 
@@ -35,6 +35,8 @@ class Sinks:
     replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
     rig_monitor: Sink[Panoramas] | None = None
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
+    features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
+    map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     recorded_frames: tuple[Stream[Frame], ...] = ()
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
@@ -54,11 +56,13 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs, direct=True)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
-    odometry = graph.stage("odometry", Chain(stereo, OdometryStage(geometry, config.odometry)), panoramas)
+    poses = Chain(stereo, OdometryStage(geometry, config.odometry, sinks.features))
+    odometry = graph.stage("odometry", poses, panoramas)
     outgoing: dict[str, Stream[Outgoing]] = {
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
-    mapping = Mapping(config.mapping, sinks.map_every_s) if sinks.maps or sinks.recorder or sinks.bus else None
-    if mapping:
+    mapping: Mapping | None = None
+    if sinks.maps or sinks.recorder or sinks.bus:
+        mapping = Mapping(config.mapping, sinks.map_every_s, sinks.map_period_s)
         maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
         outgoing["bus-map"] = maps
         for name, map_sink in sinks.maps.items():

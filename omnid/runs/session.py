@@ -26,7 +26,8 @@ from omnid.transport.bus import Bus
 
 CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
 BUS_END_S: Final = 3.0
-TICKERS: Final = frozenset({"motor", "progress", "router", "status", "watchdog"})  # they drop deadlines, not messages
+# They drop deadlines, not messages.
+TICKERS: Final = frozenset({"load", "motor", "progress", "router", "status", "watchdog"})
 
 
 class Session:

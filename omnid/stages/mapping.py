@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,11 @@ FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to 
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2  # less motion shows the same points again
 STANDING_NS = 1_000_000_000  # between two pairs of the same view that enter the map
 STAMP_JITTER_NS = 5_000_000  # so that a period of the cameras that divides that of the map does divide it
+
+
+def no_wait() -> float:
+    """Return 0 s."""
+    return 0.0
 
 
 class ThinnedPath:
@@ -53,8 +59,12 @@ class ThinnedPath:
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(self, config: MappingConfig, every_s: float = 0.0) -> None:
-        """every_s: between two maps, by the stamps; 0: one map, at the end."""
+    def __init__(self, config: MappingConfig, every_s: float = 0.0, min_period_s: Callable[[], float] = no_wait
+                 ) -> None:
+        """every_s: between two maps, by the stamps; 0: one map, at the end. min_period_s: called for each pair, the
+        least time between two pairs that enter the map, infinite for none.
+        """
+        self._min_period_s = min_period_s
         self._config = config
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
@@ -90,11 +100,14 @@ class Mapping:
 
         Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new.
         """
-        if self._mapped is None or not self._min_gap_ns:
+        period_s = self._min_period_s()
+        if period_s == math.inf:
+            return False
+        if self._mapped is None or not (self._min_gap_ns or period_s):
             return True
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
         is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
-        wait_ns = max(self._min_gap_ns, STANDING_NS) if is_same_view else self._min_gap_ns
+        wait_ns = max(self._min_gap_ns, period_s * 1e9, STANDING_NS if is_same_view else 0)
         return since_ns >= wait_ns - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,11 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 
 
+def all_features() -> float:
+    """Return 1."""
+    return 1.0
+
+
 class OdometryMethod(Protocol):
     """A method that estimates the pose of the rectified frame from pair to pair."""
 
@@ -30,8 +36,10 @@ class OdometryMethod(Protocol):
 class OdometryStage:
     """Estimate poses in odom, which is the rig frame of the first pair."""
 
-    def __init__(self, geometry: Geometry, config: OdometryConfig) -> None:
-        self._method = _method(geometry, config)
+    def __init__(self, geometry: Geometry, config: OdometryConfig, features: Callable[[], float] = all_features
+                 ) -> None:
+        """features: called for each keyframe, the share of the landmarks that it is to have."""
+        self._method = _method(geometry, config, features)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
@@ -82,10 +90,10 @@ def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, 
     return T_odom_base, covariance, A @ odometry.velocity, A @ odometry.velocity_covariance @ A.T
 
 
-def _method(geometry: Geometry, config: OdometryConfig) -> OdometryMethod:
+def _method(geometry: Geometry, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:
     model = geometry.model(config.noise_px)
     if config.method == "default":
-        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model))
+        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), features)
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

@@ -21,6 +21,7 @@ WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
 RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
+LOAD: Final = f"{PREFIX}load"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
@@ -49,6 +50,8 @@ class Key(StrEnum):
     PROCESSED = "processed"
     DROPPED = "dropped"  # messages
     MISSED = "missed"  # deadlines of a ticker
+    # Load
+    LEVEL = "level"  # of load shedding, 0: all is computed
     # Cameras and pairing
     DROPS = "drops"
     ERRORS = "errors"

@@ -24,6 +24,7 @@ Indices = NDArray[np.intp]
 MIN_LANDMARKS = 6  # below which six unknowns are no estimate
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
 STEPS = (2, 4)  # of Gauss-Newton in each round at most; a round takes the inliers of the one before
+ENOUGH_ROWS = 120  # disparities measured in a frame that are enough
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
 COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet warped to the new viewpoint
@@ -120,6 +121,9 @@ class FrameToMap:
         """
         pair = frame.lower, frame.upper
         rows = tracks.pixels[:, 1] + tracks.predicted[:, 2] - tracks.predicted[:, 1]
+        if len(rows) >= 2 * ENOUGH_ROWS:
+            # The depths of landmarks change little from frame to frame: every second one in turn is measured.
+            rows[(self._map.store.table.id[tracks.landmarks] + frame.seq) % 2 == 1] = np.nan
         # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
         rows = rows_in_upper(pair, tracks.pixels, rows, self._stereo_klt, checked=False)
         rows, variance = align_rows(pair, tracks.pixels, rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+COARSE_ITERATIONS = 8  # of Lucas-Kanade on each level: the patches are aligned afterwards
 BACK_LEVELS = 1  # of the track back from a prediction: RANSAC rejects what it lets pass
 EDGE_ROWS = 3  # px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked
 
@@ -38,6 +39,7 @@ class LocalMap:
 
     def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 8, max_misses: int = 3) -> None:
         self._model, self._klt = model, klt
+        self._coarse_klt = replace(klt, iterations=min(klt.iterations, COARSE_ITERATIONS))
         self.store = LandmarkStore(model, max_keyframes, max_misses)
         self._last: PaddedPanorama | None = None
 
@@ -74,7 +76,7 @@ class LocalMap:
             return Tracks(rows[:0], np.zeros((0, 2)), predicted[:0], 0)
         back_levels = BACK_LEVELS if most is None else self._klt.levels
         before = self.store.table.pixels[rows]
-        pixels, found = track(self._last, lower, before, predicted[:, :2], self._klt, back_levels)
+        pixels, found = track(self._last, lower, before, predicted[:, :2], self._coarse_klt, back_levels)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows))
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:

@@ -6,7 +6,7 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol
 
@@ -58,7 +58,9 @@ class VisualOdometry:
     """Estimate the pose of the rectified frame; odom is the rectified frame of the first pair."""
 
     def __init__(self, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
-                 relocaliser: KeyframeLocaliser) -> None:
+                 relocaliser: KeyframeLocaliser, features: Callable[[], float] = lambda: 1.0) -> None:
+        """features: called for each keyframe, the share of limits.features that it is to have."""
+        self._features = features
         self._limits = limits
         self._stereo_klt = replace(klt, levels=1)
         self._map = LocalMap(model, klt, limits.keyframes)
@@ -207,7 +209,7 @@ class VisualOdometry:
             return self._add_keyframe(frame, usable, np.zeros((0, 2)))
         self._most_inliers = max(self._most_inliers, inliers)
         self._frames_since_keyframe += 1
-        sparse = inliers < limits.refresh * limits.features and self._frames_since_keyframe >= limits.sparse_every
+        sparse = inliers < limits.refresh * self._wanted() and self._frames_since_keyframe >= limits.sparse_every
         if sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers:
             new = self._add_keyframe(frame, usable, estimate.pixels)
             store.add_observations(frame.seq, ids, estimate.views)
@@ -220,7 +222,7 @@ class VisualOdometry:
         They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
         """
         free = clear_around(usable, known, LANDMARK_SPACING_PX)
-        points = corners(frame.lower, free, self._limits.features - len(known))
+        points = corners(frame.lower, free, self._wanted() - len(known))
         guess = points[:, 1] + nearby_disparity(frame.disparity, points)
         pair = frame.lower, frame.upper
         rows, variance = align_rows(pair, points, rows_in_upper(pair, points, guess, self._stereo_klt))
@@ -233,6 +235,11 @@ class VisualOdometry:
             self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames_since_keyframe = 0
         return points[located]
+
+    def _wanted(self) -> int:
+        """Return the number of landmarks wanted in a keyframe."""
+        limits = self._limits
+        return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
 
     def _map_covariance(self, estimate: PoseEstimate) -> Array:
         """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to the pose."""

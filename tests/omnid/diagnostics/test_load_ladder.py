@@ -1,0 +1,67 @@
+"""Load shedding: given up step by step under overload, taken up again later, with patience where that was too soon."""
+
+from __future__ import annotations
+
+import math
+
+from omnid.diagnostics.load_ladder import LEVELS, OBSERVATIONS_DOWN, OBSERVATIONS_UP, LoadLadder
+from omnid.engine.telemetry import StageStats
+from omnid.transport.codec import OK, WARN
+from omnid.transport.status_names import LOAD, Key
+
+
+class Observed:
+    """A ladder, and the counters that it observes."""
+
+    def __init__(self) -> None:
+        self.ladder, self._stats = LoadLadder(), StageStats("pair")
+
+    def level_after(self, count: int, *, dropped: int) -> int:
+        """Return the level after so many observations, with so many of 60 images dropped in each."""
+        for _ in range(count):
+            self._stats.processed += 60 - dropped
+            self._stats.dropped += dropped
+            self.ladder.observe(self._stats)
+        return LEVELS.index(self.ladder.level)
+
+
+def test_under_lasting_overload_everything_is_given_up_in_order() -> None:
+    observed = Observed()
+    assert observed.level_after(OBSERVATIONS_UP - 1, dropped=30) == 0
+    assert [observed.level_after(1, dropped=30)] + [
+        observed.level_after(OBSERVATIONS_UP, dropped=30) for _ in range(4)] == [1, 2, 3, 3, 3]
+    assert (observed.ladder.level.map_period_s, observed.ladder.level.features) == (math.inf, 0.5)
+
+
+def test_some_dropped_images_change_nothing() -> None:
+    observed = Observed()
+    observed.level_after(2 * OBSERVATIONS_UP, dropped=30)
+    assert observed.level_after(100, dropped=3) == 2
+    assert observed.level_after(1, dropped=60) == observed.level_after(1, dropped=0) == 2  # not consecutive
+
+
+def test_what_was_given_up_is_taken_up_again_step_by_step() -> None:
+    observed = Observed()
+    observed.level_after(2 * OBSERVATIONS_UP, dropped=30)
+    assert observed.level_after(OBSERVATIONS_DOWN - 1, dropped=0) == 2
+    assert observed.level_after(1, dropped=0) == 1
+    assert observed.level_after(OBSERVATIONS_DOWN, dropped=0) == 0
+
+
+def test_it_waits_longer_each_time_that_was_too_soon() -> None:
+    observed = Observed()
+    waits = []
+    for _ in range(8):
+        observed.level_after(OBSERVATIONS_UP, dropped=30)
+        waits.append(next(k for k in range(1, 1000) if observed.level_after(1, dropped=0) == 0))
+    assert waits[:3] == [OBSERVATIONS_DOWN, 2 * OBSERVATIONS_DOWN, 4 * OBSERVATIONS_DOWN]
+    assert waits[-1] == waits[-2] == 320
+
+
+def test_the_status_tells_the_level() -> None:
+    observed = Observed()
+    quiet = observed.ladder.status()
+    observed.level_after(OBSERVATIONS_UP, dropped=30)
+    loud = observed.ladder.status()
+    assert (quiet.name, quiet.level, quiet.values[Key.LEVEL]) == (LOAD, OK, "0")
+    assert (loud.level, loud.values[Key.LEVEL]) == (WARN, "1") and "map" in loud.message
