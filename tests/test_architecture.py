@@ -69,7 +69,8 @@ ARROWS: Mapping[str, str] = {
         "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
         "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
-        "omnid.recordings omnid.report omnid.runs omnid.settings omnid.settings_dump omnid.sinks omnid.viewer",
+        "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
+        "omnid.viewer",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
         "omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration omnid.transport",
@@ -109,6 +110,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.errors omnid.formats omnid.messages omnid.settings_dump omnid.sinks omnid.stages "
         "omnid.tracking_state omnid.transport",
     "omnid.sample": "",
+    "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
     "omnid.settings": "calib.bounded_toml omnid.errors",
     "omnid.settings_dump": "omnid.settings",
     "omnid.settings_migration": "omnid.settings",

@@ -100,10 +100,12 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
 
 def _require_rerun() -> None:
     import os
+    import sys
     from importlib.util import find_spec
 
     from omnid.errors import OmnidError
 
     if find_spec("rerun") is None:
-        raise OmnidError("omnid view draws with rerun, which is not installed: pip install 'omnid[view]'")
+        raise OmnidError("omnid view draws with rerun, which is not installed: "
+                         f"{sys.executable} -m pip install 'rerun-sdk>=0.41'")
     os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself

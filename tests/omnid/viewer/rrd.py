@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-WITHOUT = "needs rerun: pip install 'omnid[view]'"
+WITHOUT = "needs rerun: pip install 'rerun-sdk>=0.41'"
 
 
 class Row(NamedTuple):

@@ -168,4 +168,4 @@ def test_without_rerun_the_installation_is_named(
     scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert "pip install 'omnid[view]'" in omnid.refused("view", scene / "log.mcap", "-o", "x.rrd")
+    assert f"{sys.executable} -m pip install 'rerun-sdk" in omnid.refused("view", scene / "log.mcap", "-o", "x.rrd")

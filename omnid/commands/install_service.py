@@ -1,0 +1,55 @@
+"""`omnid install-service`: put the systemd unit, the udev rules and a first configuration in their places."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+EXAMPLES = """examples:
+  omnid install-service --dry-run        what would be done
+  sudo /opt/omnid/bin/omnid install-service
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `install-service` to the command line."""
+    parser = subparsers.add_parser("install-service", help="install omnid as a systemd service",
+                                   description="Install the systemd unit for this program, example udev rules, a "
+                                   "minimal configuration and the user that it runs as. Files that people edit are "
+                                   "kept where they exist.", epilog=EXAMPLES,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dry-run", action="store_true", help="list what would be done, change nothing")
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.add_argument("--root", type=Path, default=Path("/"), metavar="DIR",
+                        help="install into the system below DIR; default: /")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the steps, ask, and take them; return 1 where the answer is no."""
+    from omnid.service.install import Installation
+
+    installation = Installation(args.root, Path(sys.prefix) / "bin" / "omnid")
+    steps = installation.steps()
+    for step in steps:
+        print(step.description)
+    if args.dry_run:
+        return 0
+    if not steps:
+        print("nothing to do")
+        return 0
+    if not (args.yes or _agrees()):
+        print("nothing was changed")
+        return 1
+    for step in steps:
+        step.act()
+    print(installation.next_steps)
+    return 0
+
+
+def _agrees() -> bool:
+    try:
+        return input("Do this? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False

@@ -1,0 +1,98 @@
+"""Steps that install omnid as a service: each says what it does before it does it."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from calib.errors import CalibError
+from calib.rig_file import write_file
+from omnid.config import FIRST_SETTINGS, Config
+from omnid.errors import OmnidError
+from omnid.settings_dump import dump_minimal
+
+USER: Final = "omnid"
+SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # in the unit
+HIDDEN: Final = ("/home", "/root", "/tmp", "/run/user")  # from the unit: ProtectHome=, PrivateTmp=
+ADD_USER: Final = ("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
+MODE: Final = 0o644
+
+
+class Step(NamedTuple):
+    """One change of the system."""
+
+    description: str
+    act: Callable[[], None]
+
+
+def service_file(name: str) -> str:
+    """Return the text of a file of the folder systemd/, from the installed package or from a clone."""
+    packaged = files("omnid.service") / "systemd" / name
+    if packaged.is_file():
+        return packaged.read_text()
+    return (Path(__file__).parents[2] / "systemd" / name).read_text()
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """The service below `root`, run by `program`."""
+
+    root: Path
+    program: Path
+
+    def steps(self) -> list[Step]:
+        """Return the steps that are still to be taken; OmnidError for a program that the unit cannot start."""
+        if any(self.program.is_relative_to(folder) for folder in HIDDEN):
+            raise OmnidError(f"{self.program} is in a folder that the service cannot see: install omnid elsewhere, "
+                             "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`")
+        return list(self._steps())
+
+    @property
+    def next_steps(self) -> str:
+        """Instructions for what only the user knows."""
+        return ("Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
+                "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
+                "  sudo udevadm control --reload && sudo udevadm trigger\n"
+                f"  sudo {self.program} doctor --config /etc/omnid/omnid.toml\n"
+                "  sudo systemctl daemon-reload && sudo systemctl enable --now omnid")
+
+    def _steps(self) -> Iterator[Step]:
+        unit = service_file("omnid.service").replace(SHIPPED_PROGRAM, str(self.program))
+        yield from self._file("etc/systemd/system/omnid.service", unit, replace=True)
+        yield from self._file("etc/udev/rules.d/90-omnid.rules", service_file("90-omnid.rules"), replace=False)
+        yield from self._file("etc/omnid/omnid.toml", dump_minimal(Config(), FIRST_SETTINGS), replace=False)
+        if self.root == Path("/") and not _user_exists():
+            yield Step(f"add the system user {USER}", _add_user)
+
+    def _file(self, name: str, text: str, *, replace: bool) -> Iterator[Step]:
+        path = self.root / name
+        if path.exists() and (not replace or path.read_text() == text):
+            return
+        verb = "replace" if path.exists() else "write"
+        yield Step(f"{verb} {path}", lambda: _write(path, text))
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, text.encode())
+        os.chmod(path, MODE)
+    except (OSError, CalibError) as error:
+        raise OmnidError(f"{path} cannot be written; run this command with sudo, or name another --root") from error
+
+
+def _user_exists() -> bool:
+    return any(entry.pw_name == USER for entry in pwd.getpwall())
+
+
+def _add_user() -> None:
+    done = subprocess.run(ADD_USER, capture_output=True, text=True, check=False)
+    if done.returncode:
+        reason = " ".join(done.stderr.split())
+        raise OmnidError(f"the user {USER} cannot be added: {reason}; run this command with sudo")
