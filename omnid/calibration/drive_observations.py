@@ -36,6 +36,7 @@ KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
 MAX_KEYFRAMES = 80  # of all drives: keyframes are farther apart on long ones
 MIN_KEYFRAMES = 15
 MIN_TURN_RAD = np.deg2rad(60)  # of all drives together; on a straight line tilt and direction of motion are one
+MIN_PATH_M = 2.0  # the same landmarks must be seen from near and from far
 MAX_LOST = 0.2  # share of the pairs
 NOISE_PX = 0.1
 
@@ -63,7 +64,7 @@ def collect(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config) -> D
     keyframes = np.cumsum([0, *(part.keyframes for part in parts)])
     landmarks = np.cumsum([0, *(len(state.points) for state in states)])
     T_rig_odom = np.concatenate([state.T_rig_odom for state in states])
-    _require_motion(T_rig_odom, len(logs))
+    require_motion(T_rig_odom, len(logs))
     observations = DriveObservations(
         np.concatenate([part.keyframe + first for part, first in zip(seen, keyframes, strict=False)]),
         np.concatenate([part.landmark + first for part, first in zip(seen, landmarks, strict=False)]),
@@ -186,12 +187,17 @@ def _updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> I
                          "rig; start from one that is nearer to the truth, or take a drive where there is more to see")
 
 
-def _require_motion(T_rig_odom: Array, drives: int) -> None:
+def require_motion(T_rig_odom: Array, drives: int) -> None:
     """Raise OmnidError where the drives are too short or too straight to tell."""
     if len(T_rig_odom) < MIN_KEYFRAMES:
         raise OmnidError(f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
                          f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive")
-    heading = se3.yaw(se3.inverse(T_rig_odom))
+    T_odom_rig = se3.inverse(T_rig_odom)
+    path_m = float(np.linalg.norm(np.diff(T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
+    if path_m < MIN_PATH_M:
+        raise OmnidError(f"calibrate drive: the path is {path_m:.1f} m long, {MIN_PATH_M:.0f} m are needed: turns on "
+                         "the spot show nothing from near and from far; take a longer drive")
+    heading = se3.yaw(T_odom_rig)
     change = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
     if np.ptp(np.concatenate([[0.0], np.cumsum(change)])) < MIN_TURN_RAD:
         raise OmnidError(f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
