@@ -214,10 +214,12 @@ def _by_steps(problem: DriveProblem, state: DriveState) -> Array:
     J = np.zeros((len(camera), 2, len(state.steps)))
     if problem.held:
         return J
+    in_rig = problem.in_rig(state, state.steps)
     for k, step in enumerate(STEP * np.eye(len(state.steps))):
         moved = [side for side in (0, 1) if parameters.moves_camera(side)[k]]
-        at = np.flatnonzero(np.isin(camera, moved))
-        ahead, behind = (project(parameters.at(steps), camera[at], problem.in_rig(state, steps)[at])
+        at, is_time = np.flatnonzero(np.isin(camera, moved)), k >= len(parameters.rig_names)
+        ahead, behind = (project(parameters.at(steps), camera[at],
+                                 problem.in_rig(state, steps)[at] if is_time else in_rig[at])
                          for steps in (state.steps + step, state.steps - step))
         J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
     return J

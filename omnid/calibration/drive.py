@@ -34,7 +34,7 @@ SETTLED = 1e-3  # relative change of the scale in a round, below which no furthe
 PAIR_ROUNDS = 3  # of matching columns, before the first round
 START_DISTORTION = ("p1", "p2")  # until the model is chosen
 # Larger changes are those of another rig; a nominal rig does not know how its cameras were mounted.
-MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.5), np.deg2rad(4.5)
+MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
 MAX_CHANGE_SIGMAS = 4.0  # of a nominal rig's sigmas: intrinsics
 TIMES = (UPPER_DELAY, LINE_TIME)
 # Times below these are those of synchronous cameras with global shutters.
@@ -86,6 +86,7 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     parameters = RigParameters.about(before, distortion, TIMES)
     steps = _straightened(logs[0], parameters, topics, config, report)
+    require_same_rig(parameters, steps)
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
     scores = tuple(_score(found, drives, terms) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
@@ -94,7 +95,7 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     if (best_distortion(scores), times) != (distortion, TIMES):
         parameters = RigParameters.about(before, best_distortion(scores), times)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
-    require_same_rig(found)
+    require_same_rig(parameters, found.state.steps)
     first_sigma = observation_sigma(before, found, drives.fixed)
     return _calibration(before, found, (scores, first_sigma), drives)
 
@@ -161,9 +162,8 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
                  if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma))
 
 
-def require_same_rig(found: DriveAdjustment) -> None:
+def require_same_rig(parameters: RigParameters, steps: Array) -> None:
     """Raise OmnidError where the drive asks for another rig than the one given."""
-    parameters, steps = found.parameters, found.state.steps
     first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
     change = (steps * parameters.units)[first:len(parameters.rig_names)]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
