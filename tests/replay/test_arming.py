@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from omnid.client import Robot
+from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
 from omnid.core.control.safety_rules import FAILED
 from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
 
@@ -48,6 +50,7 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, s
         assert operator.message("wheels") == "not armed since the start"
         assert omnid(daemon, "arm") == (0, "omnid is armed: it obeys commands from now on\n")
         wait_until(lambda: base.line.base.velocity_mps > 0.25, "motion")
+        expect_the_operator_drives(daemon, operator, base)
         assert omnid(daemon, "stop") == (0, "omnid stops: its wheels stay stopped until `omnid arm`\n")
         expect_stand(operator, base)
         operator.arm()
@@ -62,7 +65,21 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, s
         operator.arm()
         wait_until(lambda: base.drives, "motion after the fault")
         code, err = daemon.end()
+        assert err.count("two programs send commands as 'operator'") == 1
         assert code == 0 and f"the wheels stop: {FAILED}; they stay stopped until cmd/arm (`omnid arm`)" in err
+
+
+def expect_the_operator_drives(daemon: Daemon, operator: Operator, base: Base) -> None:
+    """Let a second program command as the operator, and a planner: backwards, at once with the operator."""
+    def ignored(reason: str) -> int:
+        return int(operator.values("wheels").get(f"ignored, {reason}", "0"))
+
+    with Robot(connect=(f"tcp/127.0.0.1:{daemon.port}",)) as second:
+        others, since_s = (second.driver(), second.driver(PLANNER)), time.monotonic()
+        wait_until(lambda: not any(driver.twist(-0.2, 0.5) for driver in others)
+                   and ignored(OTHER_SENDER) > 5 and ignored(LOWER_PRIORITY) > 5, "ignored commands")
+    assert operator.values("wheels")["source"] == OPERATOR
+    assert all(note.wheels_mps[0] > 0.25 for note in list(base.line.notes) if note.at_s > since_s)
 
 
 def test_without_a_robot_the_error_says_what_to_do(scene: Path) -> None:
