@@ -32,6 +32,13 @@ HOLD_NS = round(SETTINGS.sources.hold_s * 1e9)
 LEAD_RAD = longest_lead_rad(SETTINGS.heading, LIMITS)
 SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))
 TINY = 1e-9
+FAULTS = frozenset(rule.reason for rule in safety_rules.FAULTS)
+SLOW_SHARE = SETTINGS.trust.degraded_speed
+# Of some phases, what the motor controller reports and the poses show: its fault, volts, the speed of the wheels (None:
+# as commanded), the speed that is seen (NaN: unknown) and its standard deviation.
+USUAL = (0, 12.0, None, math.nan, 0.0)
+ODDITIES = ((7, 12.0, None, math.nan, 0.0), (0, 10.0, None, math.nan, 0.0), (0, 12.0, 2.0, math.nan, 0.0),
+            (0, 12.0, None, 0.0, 0.0), (0, 12.0, None, 1.5, 0.0), (0, 12.0, None, math.nan, 1.0))
 
 
 class RandomMotor:
@@ -39,6 +46,8 @@ class RandomMotor:
 
     def __init__(self) -> None:
         self.fault = ""  # "", "silent", "late", "expired"
+        self.number, self.battery_v = 0, 12.0
+        self.wheels_mps: float | None = None  # as commanded
         self.counted_rad = self.rate_radps = 0.0
         self.sent: VelocityCommand | None = None
 
@@ -49,7 +58,9 @@ class RandomMotor:
             raise DriverError("no answer")
         if self.fault == "late":
             raise LateReplyError("no answer yet")
-        return MotorStatus(0.0, self.counted_rad, self.rate_radps, self.fault == "expired", 0, math.nan)
+        velocity_mps = command.velocity_mps if self.wheels_mps is None else self.wheels_mps
+        return MotorStatus(velocity_mps, self.counted_rad, self.rate_radps, self.fault == "expired", self.number,
+                           self.battery_v)
 
     def close(self) -> None:
         """Release nothing."""
@@ -126,6 +137,7 @@ class Walk:
         self.controller = Controller(self.motor, settings, PERIOD_S, clock_ns=lambda: self.now_ns)
         self.motion, self.last_ns = STOP, self.now_ns  # that the base follows, and since when
         self.calm, self.quiet = True, False  # phases with few faults and with many, without commands
+        self.seen_mps, self.sigma_mps, self.resets, self.steady = math.nan, 0.0, 0, False
         self.main = SENDERS[0]  # source and sender of most commands of a phase
         self.heading_rad = self.reported_rad = 0.0  # in odom; in the count of the motor controller
         self.seen: Counter[str] = Counter()
@@ -135,6 +147,9 @@ class Walk:
         for tick in range(ticks):
             if tick % 100 == 0:
                 self.calm = self.rng.random() < 0.7
+                usual, self.steady = self.chance(0.7, 0.4), self.rng.random() < 0.5
+                oddity = USUAL if usual else self.rng.choice(ODDITIES)
+                self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
                 self.quiet, self.main = self.rng.random() < 0.1, self.rng.choice(SENDERS)
             self.events()
@@ -176,14 +191,16 @@ class Walk:
         self.heading_rad += rng.uniform(-0.05, 0.05) if self.chance(0.998, 0.95) else rng.uniform(-3, 3)
         state = "lost" if self.chance(0.002, 0.05) else rng.choice(("tracking", "tracking", "degraded"))
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.999, 0.95) else rng.uniform(-1, 1)
+        self.resets += not self.chance(0.9995, 0.99)
         pose = ControllerPose(self.now_ns - round(age_s * 1e9), wrap_angle(self.heading_rad), rng.uniform(-0.5, 0.5),
-                              state)
+                              state, self.seen_mps, self.sigma_mps, resets=self.resets)
         self.oracle.pose = pose
         self.controller.set_pose(pose)
 
     def send_command(self) -> None:
         rng = self.rng
         velocity_mps = rng.uniform(-3, 3) if self.chance(1.0, 0.95) else rng.choice((math.nan, math.inf))
+        velocity_mps = 3.0 if self.steady and self.calm else velocity_mps
         heading_rad = rng.choice((None, None, rng.uniform(-9, 9), math.nan if not self.calm else 0.0))
         source, sender = self.main if self.chance(0.98, 0.5) else rng.choice(SENDERS)
         setpoint = Setpoint(velocity_mps, heading_rad, rng.uniform(-5, 5))
@@ -204,11 +221,12 @@ class Walk:
         now = Twist(sent.velocity_mps, sent.yaw_rate_radps)
         self.expect_limits(now, sent.heading_rad)
         assert not state.armed or self.oracle.armed, "armed without a request, or after a stop or a fault"
+        assert not (state.armed and state.reason in FAULTS), "every fault disarms"
         if permitted is None:
             assert nearer(self.motion.velocity_mps, now.velocity_mps), (self.motion, now, state)
             assert nearer(self.motion.yaw_rate_radps, now.yaw_rate_radps), (self.motion, now, state)
         else:
-            self.expect_obeys(permitted.setpoint, now, state.reason)
+            self.expect_obeys(permitted.setpoint, now, state.reason, SLOW_SHARE if state.slowed_by else 1.0)
         if now != STOP and permitted:
             self.seen["driven"] += 1
             self.seen[f"driven by {permitted.source}"] += 1
@@ -237,16 +255,20 @@ class Walk:
         assert gained_mps <= LIMITS.acceleration_mps2 * dt_s + TINY
         assert abs(wrap_angle(goal_rad - self.reported_rad)) <= LEAD_RAD + TINY
 
-    def expect_obeys(self, setpoint: Setpoint, now: Twist, reason: str) -> None:
-        """Expect a motion on the way to the owner's setpoint, or to a stop where the controller is stricter."""
+    def expect_obeys(self, setpoint: Setpoint, now: Twist, reason: str, share: float) -> None:
+        """Expect a motion on the way to the owner's setpoint, or to a stop where the controller is stricter.
+
+        share: of the limits, while it drives slowly.
+        """
+        top_mps, top_radps = share * LIMITS.velocity_mps, share * LIMITS.yaw_rate_radps
         heading_rad = setpoint.heading_rad
         valid = math.isfinite(setpoint.velocity_mps) and (heading_rad is None or math.isfinite(heading_rad))
-        wanted_mps = max(-LIMITS.velocity_mps, min(LIMITS.velocity_mps, setpoint.velocity_mps)) if valid else 0.0
+        wanted_mps = max(-top_mps, min(top_mps, setpoint.velocity_mps)) if valid else 0.0
         wanted_mps = 0.0 if reason else wanted_mps
         low_mps, high_mps = sorted((self.motion.velocity_mps, wanted_mps))
         assert low_mps - TINY <= now.velocity_mps <= high_mps + TINY, (self.motion, setpoint, now, reason)
         if heading_rad is None and valid and not reason:
-            wanted_radps = max(-LIMITS.yaw_rate_radps, min(LIMITS.yaw_rate_radps, setpoint.yaw_rate_radps))
+            wanted_radps = max(-top_radps, min(top_radps, setpoint.yaw_rate_radps))
             low_radps, high_radps = sorted((self.motion.yaw_rate_radps, wanted_radps))
             assert low_radps - TINY <= now.yaw_rate_radps <= high_radps + TINY, (self.motion, setpoint, now)
 
