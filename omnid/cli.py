@@ -11,6 +11,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
+from omnid.commands.examples import add_examples
 from omnid.version import __version__
 
 COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "listen", "view", "record",
@@ -53,6 +54,7 @@ def _parser(words: Sequence[str]) -> Parser:
         names = () if "--version" in words else COMMANDS
     for name in names:
         import_module(f"omnid.commands.{MODULES.get(name, name)}").add_parser(subparsers)
+    add_examples(parser)
     return parser
 
 

@@ -62,7 +62,7 @@ ARROWS: Mapping[str, str] = {
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
         "calib.rig_covariance calib.se3 drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig "
         "omnid.core.stereo omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state",
-    "omnid.cli": "calib.errors drivers.errors omnid.engine omnid.errors omnid.version",
+    "omnid.cli": "calib.errors drivers.errors omnid.commands omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
         "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "

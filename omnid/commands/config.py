@@ -10,18 +10,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
 
-EXAMPLES = """examples:
-  omnid config --minimal > omnid.toml         the settings that a new robot needs, the rest as installed
-  omnid config check omnid.toml               errors, and what differs from the defaults
-  omnid config migrate omnid.toml > new.toml  keys of an earlier version under their new names
-"""
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `config` to the command line."""
     parser = subparsers.add_parser("config", help="print, check or migrate settings",
                                    description="Print all settings with their defaults as TOML; check or migrate a "
-                                   "file.", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+                                   "file.")
     parser.add_argument("action", nargs="?", choices=("print", "check", "migrate"), default="print",
                         help="default: print")
     parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="of check and migrate")

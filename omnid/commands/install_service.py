@@ -6,19 +6,13 @@ import argparse
 import sys
 from pathlib import Path
 
-EXAMPLES = """examples:
-  omnid install-service --dry-run        what would be done
-  sudo /opt/omnid/bin/omnid install-service
-"""
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `install-service` to the command line."""
     parser = subparsers.add_parser("install-service", help="install omnid as a systemd service",
                                    description="Install the systemd unit for this program, example udev rules, a "
                                    "minimal configuration and the user that it runs as. Files that people edit are "
-                                   "kept where they exist.", epilog=EXAMPLES,
-                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+                                   "kept where they exist.")
     parser.add_argument("--dry-run", action="store_true", help="list what would be done, change nothing")
     parser.add_argument("--yes", action="store_true", help="do not ask")
     parser.add_argument("--root", type=Path, default=Path("/"), metavar="DIR",

@@ -1,0 +1,49 @@
+"""Examples at the end of each command's help; a test parses them all."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+# Words after `omnid` of a command without subcommands -> its examples, without `omnid`.
+EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
+    "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated"),
+    "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --map map.ply --plan plan.png",
+               "replay drive.mcap --record out.mcap --method paper"),
+    "demo": ("demo", "demo --output /tmp/demo --quiet"),
+    "eval": ("eval est.txt truth.txt",),
+    "calibrate camera": ("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),
+    "calibrate rig": ("calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml",),
+    "calibrate check": ("calibrate check drive.mcap --rig rig.toml",),
+    "calibrate drive": ("calibrate drive drive.mcap --rig rig.toml -o better.toml",),
+    "calibrate import": ("calibrate import camchain.yaml -o rig.toml",),
+    "calibrate export": ("calibrate export rig.toml --format kalibr -o camchain.yaml",),
+    "cameras": ("cameras",),
+    "arm": ("arm", "arm --robot rover --connect tcp/robot:7447"),
+    "stop": ("stop", "stop --robot rover --connect tcp/robot:7447"),
+    "listen": ("listen", "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap"),
+    "view": ("view out.mcap", "view out.mcap -o out.rrd"),
+    "record": ("record recordings/ --rig rig.toml",),
+    "report": ("report out.mcap -o report.html",),
+    "log info": ("log info recordings/*.mcap",),
+    "log recover": ("log recover robot_20260131T235900Z_001.mcap.part",),
+    "diff": ("diff yesterday.mcap today.mcap",),
+    "doctor": ("doctor --config /etc/omnid/omnid.toml",),
+    "config": ("config --minimal > omnid.toml", "config check omnid.toml", "config migrate old.toml > new.toml"),
+    "install-service": ("install-service --dry-run",),
+})
+
+
+def add_examples(parser: argparse.ArgumentParser, words: str = "") -> None:
+    """Give a parser and those of its subcommands a description, which is their help, and examples."""
+    if words in EXAMPLES:
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
+        parser.epilog = "\n".join(("examples:", *(f"  omnid {example}" for example in EXAMPLES[words])))
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            helps = {choice.dest: choice.help or "" for choice in action._choices_actions}
+            for name, below in action.choices.items():
+                below.description = below.description or f"{helps[name][:1].upper()}{helps[name][1:]}."
+                add_examples(below, f"{words} {name}".strip())

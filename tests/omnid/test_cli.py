@@ -1,0 +1,36 @@
+"""The command line: help of every command."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Iterator
+
+import pytest
+
+from omnid.cli import COMMANDS, _parser
+from omnid.commands.examples import EXAMPLES
+
+
+def leaves(parser: argparse.ArgumentParser, words: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Yield the commands that have no subcommands."""
+    below = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not below:
+        yield words, parser
+    for action in below:
+        for name, child in action.choices.items():
+            yield from leaves(child, f"{words} {name}".strip())
+
+
+def test_every_command_has_a_description_and_an_example() -> None:
+    found = dict(leaves(_parser([])))
+    assert set(found) == set(EXAMPLES) and len(found) > len(COMMANDS)
+    for words, parser in found.items():
+        assert parser.description and parser.description.endswith("."), words
+        assert f"  omnid {EXAMPLES[words][0]}" in parser.format_help()
+
+
+@pytest.mark.parametrize("example", [example for examples in EXAMPLES.values() for example in examples])
+def test_every_example_is_accepted(example: str) -> None:
+    words = shlex.split(example.partition(" > ")[0])
+    assert _parser(words).parse_args(words).run
