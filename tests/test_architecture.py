@@ -96,7 +96,9 @@ ARROWS: Mapping[str, str] = {
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.se3 omnid.core.mapping omnid.errors",
     "omnid.messages": "omnid.core.mapping omnid.core.odometry omnid.tracking_state",
-    "omnid.monitor": "drivers.logs omnid.client omnid.engine omnid.errors omnid.formats omnid.sinks omnid.transport",
+    "omnid.monitor":
+        "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
+        "omnid.sinks omnid.transport",
     "omnid.recordings":
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
         "omnid.tracking_state omnid.transport",

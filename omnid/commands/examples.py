@@ -23,6 +23,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "cameras": ("cameras",),
     "arm": ("arm", "arm --robot rover --connect tcp/robot:7447"),
     "stop": ("stop", "stop --robot rover --connect tcp/robot:7447"),
+    "drive": ("drive", "drive --robot rover --connect tcp/robot:7447"),
     "listen": ("listen", "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap"),
     "view": ("view out.mcap", "view out.mcap -o out.rrd"),
     "record": ("record recordings/ --rig rig.toml",),

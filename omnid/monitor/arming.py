@@ -22,7 +22,7 @@ def arm(bus: BusConfig, answer_s: float = ANSWER_S) -> str:
     Raise OmnidError where it cannot be reached, does not obey this program, or does not answer in time.
     """
     with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
-        driver = _driver(robot)
+        driver = driver_of(robot)
         stamp_ns = driver.arm()
         deadline_s = time.monotonic() + answer_s
         while time.monotonic() < deadline_s:
@@ -40,7 +40,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S) -> bool:
     Raise OmnidError where it cannot be reached.
     """
     with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
-        driver, deadline_s = _driver(robot), time.monotonic() + answer_s
+        driver, deadline_s = driver_of(robot), time.monotonic() + answer_s
         while time.monotonic() < deadline_s:
             driver.stop()
             if _is_stopped(statuses):
@@ -48,7 +48,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S) -> bool:
     return False
 
 
-def _driver(robot: Robot) -> Driver:
+def driver_of(robot: Robot) -> Driver:
     """Return a sender as soon as the robot receives its commands. Raise OmnidError where it does not."""
     driver, deadline_s = robot.driver(), time.monotonic() + CONNECT_S
     while not driver.connected:

@@ -1,0 +1,162 @@
+"""Drive a robot by the keys of a terminal, which tells no release of a key: a motion ends when no key repeats it."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+from calib.bounded_toml import parse_toml
+from omnid.client import Diagnostics, Driver, Robot
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.errors import OmnidError
+from omnid.monitor.arming import driver_of
+from omnid.monitor.robot_state import plain
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.status_names import WHEELS, Key
+
+PERIOD_S: Final = 0.05  # of the commands
+REST_S: Final = 0.5  # after a motion zero is sent for so long; then nothing, so that others may drive
+HOLD_S: Final = 0.6  # a key counts as pressed for so long: longer than the pause before a terminal repeats it
+CONNECT_S: Final = 5.0
+FIRST_SHARE: Final = 0.4  # of the highest speeds, at the start
+SHARE_STEP: Final = 0.1
+READ_BYTES: Final = 256
+HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
+ARROWS: Final = {b"\x1b[A": (1, 0), b"\x1b[B": (-1, 0), b"\x1b[D": (0, 1), b"\x1b[C": (0, -1)}
+
+
+@dataclass
+class Stick:
+    """Keys as a stick: each axis is held for HOLD_S after its last key."""
+
+    limits: VelocityLimits
+    share: float = FIRST_SHARE
+    stop_asked: bool = False
+    arm_asked: bool = False
+    quit: bool = False
+    _axes: list[tuple[int, float]] = field(default_factory=lambda: [(0, -math.inf), (0, -math.inf)])
+
+    def press(self, data: bytes, now_s: float) -> None:
+        """Take the bytes of the keys pressed until now_s."""
+        while data:
+            arrow = next((code for code in ARROWS if data.startswith(code)), b"")
+            if arrow:
+                self._push(*ARROWS[arrow], now_s)
+            else:
+                self._letter(data[:1])
+            data = data[len(arrow) or 1:]
+
+    def twist(self, now_s: float) -> tuple[float, float]:
+        """Return forward speed [m/s] and yaw rate [rad/s]."""
+        forward, turn = (side if now_s - pressed_s <= HOLD_S else 0 for side, pressed_s in self._axes)
+        return (self.share * forward * self.limits.velocity_mps, self.share * turn * self.limits.yaw_rate_radps)
+
+    def commands(self, now_s: float) -> bool:
+        """Return True if there is a motion, or was one until a moment ago."""
+        return any(now_s - pressed_s <= HOLD_S + REST_S for _, pressed_s in self._axes)
+
+    def _push(self, forward: int, turn: int, now_s: float) -> None:
+        if forward:
+            self._axes[0] = forward, now_s
+        else:
+            self._axes[1] = turn, now_s
+
+    def _release(self) -> None:
+        self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
+
+    def _letter(self, letter: bytes) -> None:
+        if letter in (b"+", b"="):
+            self.share = min(1.0, self.share + SHARE_STEP)
+        elif letter == b"-":
+            self.share = max(SHARE_STEP, self.share - SHARE_STEP)
+        elif letter in (b"a", b"A"):
+            self.arm_asked = True
+        elif letter in (b"q", b"Q", b"\x04"):
+            self.quit = True
+        else:  # space, and any key that means nothing: in doubt the wheels stop
+            self.stop_asked = self.stop_asked or letter == b" "
+            self._release()
+
+
+def teleoperate(bus: BusConfig) -> int:
+    """Drive the robot until `q`; return the exit code. OmnidError without a terminal, or where it cannot be reached."""
+    if not sys.stdin.isatty():
+        raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
+    with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
+        driver, stick = driver_of(robot), Stick(limits_of(robot))
+        print(HELP)
+        with raw_keys() as keys:
+            try:
+                status = ""
+                while not stick.quit:
+                    stick.press(read_keys(keys), time.monotonic())
+                    report = statuses.newest()
+                    status = status if report is None else _status_line(report)
+                    _act(driver, stick, status)
+            finally:
+                driver.twist(0.0, 0.0)
+                print()
+    return 0
+
+
+def limits_of(robot: Robot) -> VelocityLimits:
+    """Return the limits in the robot's configuration; the defaults where it does not answer."""
+    try:
+        found = parse_toml(robot.query("config"))["controller"]["limits"]
+        return VelocityLimits(velocity_mps=float(found["velocity_mps"]), yaw_rate_radps=float(found["yaw_rate_radps"]))
+    except (ValueError, KeyError, TypeError):
+        return VelocityLimits()
+
+
+@contextmanager
+def raw_keys() -> Iterator[int]:
+    """Yield the terminal's file descriptor, on which keys arrive at once and are not shown; Ctrl-C stays a signal."""
+    keys = sys.stdin.fileno()
+    before = termios.tcgetattr(keys)
+    try:
+        tty.setcbreak(keys)
+        yield keys
+    finally:
+        termios.tcsetattr(keys, termios.TCSADRAIN, before)
+
+
+def read_keys(keys: int) -> bytes:
+    """Return the bytes of the keys pressed within PERIOD_S, after a full PERIOD_S; raise OmnidError at the end."""
+    due_s, data = time.monotonic() + PERIOD_S, b""
+    while (left_s := due_s - time.monotonic()) > 0:
+        if select.select([keys], [], [], left_s)[0]:
+            found = os.read(keys, READ_BYTES)
+            if not found:
+                raise OmnidError("the terminal was closed: the wheels stop")
+            data += found
+    return data
+
+
+def _act(driver: Driver, stick: Stick, status: str) -> None:
+    if stick.stop_asked:
+        driver.stop()
+    elif stick.arm_asked:
+        driver.arm()
+    stick.stop_asked = stick.arm_asked = False
+    now_s = time.monotonic()
+    velocity_mps, yaw_rate_radps = stick.twist(now_s)
+    if stick.commands(now_s):
+        driver.twist(velocity_mps, yaw_rate_radps)
+    line = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {100 * stick.share:.0f} %  {status}"
+    sys.stdout.write(f"\r\x1b[K{plain(line)[:os.get_terminal_size().columns - 1]}")
+    sys.stdout.flush()
+
+
+def _status_line(report: Diagnostics) -> str:
+    """Return whether the robot is armed, or why it stops."""
+    disarmed = report.value(WHEELS, Key.DISARMED_BY)
+    return f"not armed: {disarmed} (press a)" if disarmed else "armed"
