@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -14,7 +17,8 @@ import pytest
 
 from omnid.formats.tum import read_tum
 from tests.replay.command import Command
-from tests.replay.live import PATIENCE_S, ROOT, answers, free_port, robot, started, wait_until
+from tests.replay.edited import images, save
+from tests.replay.live import PATIENCE_S, ROOT, Base, answers, command_line, free_port, robot, started, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -49,6 +53,20 @@ def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, s
         last = base.line.notes[-20:]
         assert any(0.0 < note.wheels_mps[0] < 0.19 for note in last), "it slowed down before the end"
     assert all(line.startswith("omnid: ") for line in err.splitlines())
+
+
+def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> None:
+    """Before the wheels turn, in one line, with exit code 2."""
+    taken = images(scene / "log.mcap")
+    exchanged = [replace(image, camera="upper" if image.camera == "lower" else "lower") for image in taken]
+    shutil.copy(scene / "rig.toml", tmp_path / "rig.toml")
+    save(tmp_path / "log.mcap", exchanged)
+    with closing(Base(tmp_path)) as base:
+        command = command_line(tmp_path, free_port(), base.port)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        assert not base.line.moved_since(0.0)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done.stderr
+    assert "the images match better the other way round" in done.stderr
 
 
 def test_every_part_has_a_status(tmp_path: Path, scene: Path) -> None:
