@@ -14,7 +14,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
-from omnid.core.control.motion_monitor import Motion
+from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, Motion
 from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
 from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
@@ -136,7 +136,8 @@ class Controller:
             self.state.stops[reason] += 1
             if reason != ENDS:
                 latched = "; they stay stopped until cmd/arm (`omnid arm`)" if self._law.arming.needs_request else ""
-                self._report(f"the wheels stop: {reason}{latched}")
+                advice = f"; {ADVICE}" if reason in DISAGREEMENTS else ""
+                self._report(f"the wheels stop: {reason}{advice}{latched}")
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""

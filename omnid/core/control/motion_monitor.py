@@ -7,7 +7,8 @@ of it slows the base down, more stops it. While nothing is unexplained, the sum 
 
     commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.05 = 0.13 m/s: 0.13 m a second
 
-Wheels that are not driven may be pushed by hand: nothing is compared while the base is commanded to stand.
+The seen speed is that along x of the base, so the rig's T_base_rig must be right. Wheels that are not driven may be
+pushed by hand: nothing is compared while the base is commanded to stand.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ NOT_SEEN: Final = "the images do not show the commanded motion"
 NOT_COMMANDED: Final = "the images show a motion that was not commanded"
 NOT_FOLLOWED: Final = "the wheels do not follow the commands"
 DISAGREEMENTS: Final = (NOT_SEEN, NOT_COMMANDED, NOT_FOLLOWED)
+ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of the rig; see controller.motion"
 
 
 @dataclass(frozen=True, slots=True)

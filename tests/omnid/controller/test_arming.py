@@ -10,7 +10,7 @@ import pytest
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
-from omnid.core.control.motion_monitor import DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
+from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from tests.omnid.controller.bench import UNATTENDED, Bench
 
 
@@ -110,7 +110,8 @@ def test_a_fault_that_has_passed_keeps_the_wheels_stopped(driving: Bench, reason
     expect_stand(driving)
     state = driving.controller.state
     assert state.stops == {reason: 1} and state.disarmed_by == reason and state.needs_request
-    assert f"the wheels stop: {reason}; they stay stopped until cmd/arm (`omnid arm`)" in driving.lines
+    advice = f"; {ADVICE}" if reason in DISAGREEMENTS else ""
+    assert f"the wheels stop: {reason}{advice}; they stay stopped until cmd/arm (`omnid arm`)" in driving.lines
     driving.drive()
     assert driving.last.velocity_mps == 0.3
 
