@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
-from calib.models.ocam import VIEWS, OcamCamera, View
+from calib.models.ocam import DISTANCE_M, NO_WAVEFRONT, VIEWS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.validation import ValidatedTable, read_bytes
 
@@ -26,8 +26,10 @@ MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
-# Optional tangential terms of an ocam camera [1/px]; files without them are read as 0.
-TANGENTIAL_KEYS = ("p1", "p2")
+# Optional terms of an ocam camera: tangential [1/px], secondary astigmatism [1/px^2]; files without them are read as 0.
+TANGENTIAL_KEYS, ASTIGMATISM_KEYS = ("p1", "p2"), ("s1", "s2")
+# Optional wavefront [m], with the distance [m] at which the central model is exact.
+WAVEFRONT_KEYS = ("wavefront", "distance_m")
 
 
 def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
@@ -53,13 +55,15 @@ def _omni(table: ValidatedTable) -> UnifiedCamera:
 
 def _ocam(table: ValidatedTable) -> OcamCamera:
     values = table.table("intrinsics")
-    values.allow_only((*OCAM_KEYS, *TANGENTIAL_KEYS))
+    values.allow_only((*OCAM_KEYS, *TANGENTIAL_KEYS, *ASTIGMATISM_KEYS, *WAVEFRONT_KEYS))
     row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
-    p1, p2 = (values.number(key) if values.has(key) else 0.0 for key in TANGENTIAL_KEYS)
+    p1, p2, s1, s2 = (values.number(key) if values.has(key) else 0.0 for key in (*TANGENTIAL_KEYS, *ASTIGMATISM_KEYS))
+    wavefront = values.numbers("wavefront", len(NO_WAVEFRONT)) if values.has("wavefront") else NO_WAVEFRONT
+    distance_m = values.number("distance_m") if values.has("distance_m") else DISTANCE_M
     view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
     polynomial, size = values.numbers("polynomial"), table.size("size")
     try:
-        return OcamCamera(polynomial, (row, column), (c, d, e), size, view, (p1, p2))
+        return OcamCamera(polynomial, (row, column), (c, d, e), size, view, (p1, p2), (s1, s2), wavefront, distance_m)
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
@@ -160,9 +164,12 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
         numbers = (*camera.center_row_column, *camera.affine)
         named = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
         named += [f"{key} = {number_text(value)}" for key, value in zip(OCAM_KEYS[1:], numbers, strict=True)]
-        if any(camera.tangential):
-            named += [f"{key} = {number_text(value)}"
-                      for key, value in zip(TANGENTIAL_KEYS, camera.tangential, strict=True)]
+        for keys, terms in ((TANGENTIAL_KEYS, camera.tangential), (ASTIGMATISM_KEYS, camera.astigmatism)):
+            if any(terms):
+                named += [f"{key} = {number_text(value)}" for key, value in zip(keys, terms, strict=True)]
+        if any(camera.wavefront):
+            named += [f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
+                      f"distance_m = {number_text(camera.distance_m)}"]
     else:
         raise CalibError(f"rig file: {name}: expected an omni or ocam camera, found {type(camera).__name__}")
     return "\n".join(["", f"[{name}.intrinsics]", *named]) + "\n"

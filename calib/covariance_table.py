@@ -12,7 +12,8 @@ from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
 from calib.validation import ValidatedTable
 
 VERSION = 1
-OCAM_NAMES = (*(f"a{power}" for power in range(MAX_COEFFICIENTS)), "center_row", "center_column", "c", "d", "p1", "p2")
+OCAM_NAMES = (*(f"a{power}" for power in range(MAX_COEFFICIENTS)), "center_row", "center_column", "c", "d", "p1", "p2",
+              "s1", "s2", "w_a", "w_b", "w_x", "w_y", "w_s")
 
 
 def read_covariance(table: ValidatedTable, cameras: tuple[OmniCamera, OmniCamera]) -> RigCovariance:

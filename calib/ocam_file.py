@@ -88,9 +88,9 @@ def export_ocam(camera: OmniCamera) -> str:
     """Return the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
     if not isinstance(camera, OcamCamera):
         raise CalibError("export: calib_results.txt holds ocam cameras, found an omni camera; use --format kalibr")
-    if any(camera.tangential):
-        raise CalibError("export: calib_results.txt cannot hold the tangential terms p1, p2 of this camera; calibrate "
-                         "with --model ocam")
+    if any(camera.tangential) or any(camera.astigmatism) or any(camera.wavefront):
+        raise CalibError("export: calib_results.txt cannot hold the terms p1, p2, s1, s2, wavefront of this camera; "
+                         "calibrate with --model ocam")
     width, height = camera.size
     sections = (
         ("polynomial coefficients for the direct mapping: f(rho), constant first", _counted(camera.polynomial)),

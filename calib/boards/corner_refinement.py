@@ -17,6 +17,7 @@ from calib.boards.board import Board
 from calib.boards.board_shape import local_mapping, quadratic_terms
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import project_near
 
 # Mapping of board offsets (..., 2) from a corner [squares] to pixels (..., 2).
 ToImage = Callable[[Array], Array]
@@ -82,7 +83,7 @@ def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[Board,
 
     def to_image(xy: Array) -> Array:
         offset = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1) * board.square_m
-        return camera.project(se3.apply(T_cam_board, (point + offset).reshape(-1, 3))).reshape(xy.shape)
+        return project_near(camera, se3.apply(T_cam_board, (point + offset).reshape(-1, 3))).reshape(xy.shape)
 
     return to_image
 

@@ -65,6 +65,18 @@ class Observations:
 
 
 @dataclass(frozen=True, slots=True)
+class Prior:
+    """Independent normal distributions of the parameters before the adjustment; sigma infinite: none."""
+
+    center: Array  # (P,)
+    sigma: Array  # (P,)
+
+    def weights(self, kernel_px: float) -> Array:
+        """Return the weights (P,) of squared differences beside squared residuals, for a width of Huber's kernel."""
+        return np.asarray((kernel_px / HUBER_WIDTH / self.sigma) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
 class BundleResult:
     """The result of a bundle adjustment; residuals are measured minus modelled [px], NaN without a measurement."""
 
@@ -92,12 +104,14 @@ def residuals(camera: Projection, T_cam_board: Array, observed: Observations) ->
 
 
 def adjust_bundle(camera_of: CameraFactory, parameters: Array, T_cam_board: Array, observed: Observations, *,
-                  kernel_rounds: int = KERNEL_ROUNDS) -> BundleResult:
+                  kernel_rounds: int = KERNEL_ROUNDS, prior: Prior | None = None) -> BundleResult:
     """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
 
     kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
     """
-    state = _State(camera_of, observed, np.asarray(parameters, float), np.asarray(T_cam_board, float))
+    parameters = np.asarray(parameters, float)
+    none = Prior(np.zeros(len(parameters)), np.full(len(parameters), np.inf))
+    state = _State(camera_of, observed, parameters, np.asarray(T_cam_board, float), prior or none)
     sigma = np.inf
     for _ in range(kernel_rounds):
         sigma = min(sigma, _robust_sigma(state.residuals))
@@ -113,24 +127,27 @@ def _robust_sigma(residual: Array) -> float:
 class _State:
     """One iterate of the optimisation, with its residuals."""
 
-    __slots__ = ("camera_of", "observed", "parameters", "poses", "residuals")
+    __slots__ = ("camera_of", "observed", "parameters", "poses", "prior", "residuals")
 
-    def __init__(self, camera_of: CameraFactory, observed: Observations, parameters: Array, poses: Array) -> None:
+    def __init__(self, camera_of: CameraFactory, observed: Observations, parameters: Array, poses: Array, prior: Prior
+                 ) -> None:
         self.camera_of, self.observed, self.parameters, self.poses = camera_of, observed, parameters, poses
+        self.prior = prior
         self.residuals = residuals(camera_of(parameters), poses, observed)
 
     def moved(self, intrinsic: Array, pose: Array) -> _State | None:
         """Return the state after a step; None if the parameters are not those of a camera."""
         try:
-            return _State(self.camera_of, self.observed, self.parameters + intrinsic, se3.exp(pose) @ self.poses)
+            return _State(self.camera_of, self.observed, self.parameters + intrinsic, se3.exp(pose) @ self.poses,
+                          self.prior)
         except (CalibError, np.linalg.LinAlgError):
             return None
 
     def cost(self, kernel_px: float) -> float:
-        """Return the sum of Huber's function over the corners."""
+        """Return the sum of Huber's function over the corners, and of the prior."""
         length = np.linalg.norm(self.residuals, axis=2)
         huber = np.where(length <= kernel_px, length**2, kernel_px * (2 * length - kernel_px))
-        return float(np.nansum(huber))
+        return float(np.nansum(huber) + self.prior.weights(kernel_px) @ (self.parameters - self.prior.center) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,9 +206,12 @@ def _normal_equations(state: _State, kernel_px: float) -> _NormalEquations:
     root = np.sqrt(weight)[..., None, None]
     J_in, J_pose = ((root * J).reshape(K, 2 * residual.shape[1], J.shape[-1]) for J in (J_in, J_pose))
     r = (root[..., 0] * residual).reshape(K, -1)
+    prior = state.prior.weights(kernel_px)
     return _NormalEquations(
-        A=np.einsum("kri,krj->ij", J_in, J_in), B=J_in.swapaxes(1, 2) @ J_pose, C=J_pose.swapaxes(1, 2) @ J_pose,
-        a=np.einsum("kri,kr->i", J_in, r), c=np.einsum("kri,kr->ki", J_pose, r))
+        A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=J_in.swapaxes(1, 2) @ J_pose,
+        C=J_pose.swapaxes(1, 2) @ J_pose,
+        a=np.einsum("kri,kr->i", J_in, r) - prior * (state.parameters - state.prior.center),
+        c=np.einsum("kri,kr->ki", J_pose, r))
 
 
 def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.errors import CalibError
-from calib.fit.bundle import Observations, Projection, adjust_bundle
+from calib.fit.bundle import CameraFactory, Observations, Prior, Projection, adjust_bundle
 from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array, OmniCamera
 
@@ -21,17 +21,23 @@ def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observat
     Every fold refits the camera's parameters, starting from the fit to all views with poses T_cam_board (K, 4, 4), and
     then only the poses of the views left out.
     """
-    parameters, numbers = parameterise(camera), np.arange(len(observed.pixels))
-    errors: list[Array] = []
+    parameters = parameterise(camera)
+    return cross_validated_px(parameters.camera_at, len(parameters.names), T_cam_board, observed)
+
+
+def cross_validated_px(camera_of: CameraFactory, count: int, T_cam_board: Array, observed: Observations,
+                       prior: Prior | None = None) -> float:
+    """Return the mean error [px] of views left out, for cameras of count parameters that are 0 at the fit to all views.
+    """
+    numbers, errors = np.arange(len(observed.pixels)), list[Array]()
     for fold in range(FOLDS):
         held_out = numbers % FOLDS == fold
         if (~held_out).sum() < MIN_TRAINING_VIEWS or not held_out.any():
             continue
-        start = np.zeros(len(parameters.names))
         try:
-            trained = adjust_bundle(parameters.camera_at, start, T_cam_board[~held_out], observed.select(~held_out),
-                                    kernel_rounds=1)
-            fitted = parameters.camera_at(trained.parameters)
+            trained = adjust_bundle(camera_of, np.zeros(count), T_cam_board[~held_out], observed.select(~held_out),
+                                    kernel_rounds=1, prior=prior)
+            fitted = camera_of(trained.parameters)
         except (CalibError, np.linalg.LinAlgError):
             return float("inf")
         errors.append(_pose_errors_px(fitted, T_cam_board[held_out], observed.select(held_out)))

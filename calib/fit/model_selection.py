@@ -21,7 +21,7 @@ from calib.fit.camera_fit import (
 from calib.fit.camera_models import MODELS, FittedModel, Model
 from calib.fit.cross_validation import held_out_error_px
 from calib.fit.residual_structure import ResidualStructure, residual_structure
-from calib.models.ocam import View
+from calib.models.ocam import OcamCamera, View
 
 # "auto" fits every model and selects the best.
 ModelChoice = Literal["auto", "omni", "ocam", "ocam_tangential"]
@@ -54,6 +54,7 @@ class SelectedCalibration:
     calibration: CameraCalibration
     model: Model
     scores: tuple[ModelScore, ...]
+    polynomial: OcamCamera | None = None  # the most general polynomial camera that was fitted
 
     @property
     def score(self) -> ModelScore:
@@ -85,7 +86,8 @@ def select_calibration(views: Sequence[BoardView], board: Board, size: tuple[int
     least_px = min(score.held_out_px for score in scores)
     ties = [score for score in scores if score.held_out_px <= (1 + TIE_PART) * least_px]
     best = min(ties, key=lambda score: score.parameters).model
-    return SelectedCalibration(fitted[best], best, scores)
+    polynomials = [found.camera for found in fitted.values() if isinstance(found.camera, OcamCamera)]
+    return SelectedCalibration(fitted[best], best, scores, polynomials[-1] if polynomials else None)
 
 
 def refine_selection(found: SelectedCalibration, images: Mapping[str, NDArray[np.uint8]], view: View

@@ -13,7 +13,10 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 
 OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
-OCAM_TANGENTIAL_NAMES = ("p1", "p2")
+OCAM_TANGENTIAL_NAMES, OCAM_ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
+WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
+# One step of a wavefront's coefficient [m], about half a pixel of a board at half a metre.
+WAVEFRONT_UNIT_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +41,13 @@ class CameraParameterisation:
         return [(name, float(value), float(sigma)) for name, value, sigma in found]
 
 
-def parameterise(camera: OmniCamera, distortion: Collection[str] = ()) -> CameraParameterisation:
+def parameterise(camera: OmniCamera, distortion: Collection[str] = (), *, wavefront: bool = False
+                 ) -> CameraParameterisation:
     """Return the parameterisation about a camera: all parameters, and of distortion and polynomial the terms not 0.
 
-    distortion: names of an omni camera's terms that are parameters although they are 0.
+    distortion: names of an omni camera's terms that are parameters although they are 0. wavefront: with the terms of an
+    ocam camera's wavefront, and its secondary astigmatism, even if they are 0. Without, the wavefront stays: only near
+    objects such as boards show it.
     """
     scale = min(camera.size) / 2
     if isinstance(camera, UnifiedCamera):
@@ -54,12 +60,16 @@ def parameterise(camera: OmniCamera, distortion: Collection[str] = ()) -> Camera
     powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
     # p1 and p2 are correlated, so both are adjusted or neither.
     tangential = camera.tangential if any(camera.tangential) else ()
+    astigmatism = camera.astigmatism if wavefront or any(camera.astigmatism) else ()
+    waves = camera.wavefront if wavefront else ()
     start = np.array([*(camera.polynomial[power] for power in powers), *camera.center_row_column, *camera.affine[:2],
-                      *tangential])
+                      *tangential, *astigmatism, *waves])
     units = np.array([*(scale ** -float(power) for power in powers), 1.0, 1.0, 1 / scale, 1 / scale,
-                      *[1 / scale**2 for _ in tangential]])
+                      *[1 / scale**2 for _ in tangential], *[1 / scale**3 for _ in astigmatism],
+                      *[WAVEFRONT_UNIT_M for _ in waves]])
     names = (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d",
-             *OCAM_TANGENTIAL_NAMES[:len(tangential)])
+             *OCAM_TANGENTIAL_NAMES[:len(tangential)], *OCAM_ASTIGMATISM_NAMES[:len(astigmatism)],
+             *WAVEFRONT_NAMES[:len(waves)])
     return CameraParameterisation(camera, names, start, units)
 
 
@@ -75,5 +85,7 @@ def _ocam_camera(base: OmniCamera, values: dict[str, float]) -> OcamCamera:
     polynomial = tuple(values.get(f"a{power}", 0.0) for power in range(len(base.polynomial)))
     affine = (values["c"], values["d"], base.affine[2] + values["d"] - base.affine[1])
     p1, p2 = (values.get(name, 0.0) for name in OCAM_TANGENTIAL_NAMES)
+    s1, s2 = (values.get(name, 0.0) for name in OCAM_ASTIGMATISM_NAMES)
+    wavefront = tuple(values.get(name, now) for name, now in zip(WAVEFRONT_NAMES, base.wavefront, strict=True))
     return replace(base, polynomial=polynomial, center_row_column=(values["center_row"], values["center_column"]),
-                   affine=affine, tangential=(p1, p2))
+                   affine=affine, tangential=(p1, p2), astigmatism=(s1, s2), wavefront=wavefront)

@@ -12,17 +12,21 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.corner_refinement import refine_with_camera
 from calib.errors import CalibError
-from calib.fit.bundle import BundleResult, Observations, adjust_bundle
+from calib.fit.bundle import BundleResult, Observations, Prior, adjust_bundle
 from calib.fit.camera_fit import RejectedView, outlier_views
-from calib.fit.parameterisation import CameraParameterisation, parameterise
+from calib.fit.cross_validation import cross_validated_px
+from calib.fit.parameterisation import WAVEFRONT_NAMES, CameraParameterisation, parameterise
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.fit.rig_initialisation import RelativePoseInitialisation, ViewPair, initialise_relative_pose
 from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import OcamCamera, project_near
 
 MIN_PAIRS = 4
 MAX_REJECTIONS = 10
 # Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong.
 MAX_MEAN_PX = 3.0
+# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
+MIRROR_NAMES, MIRROR_SIGMA_STEPS = ("s1", "s2", *WAVEFRONT_NAMES), 1.0
 MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 Images = Mapping[str, NDArray[np.uint8]]
 # The lower and the upper camera.
@@ -92,8 +96,8 @@ class _PairCamera:
     def project(self, points: Array) -> Array:
         """Return pixels (M, 2) of points (M, 3) in the lower camera's frame."""
         both = points.reshape(-1, 2, self.corners, 3)
-        lower = self.lower.project(both[:, 0].reshape(-1, 3))
-        upper = self.upper.project(se3.apply(self.T_upper_lower, both[:, 1].reshape(-1, 3)))
+        lower = project_near(self.lower, both[:, 0].reshape(-1, 3))
+        upper = project_near(self.upper, se3.apply(self.T_upper_lower, both[:, 1].reshape(-1, 3)))
         return np.stack([pixels.reshape(-1, self.corners, 2) for pixels in (lower, upper)], axis=1).reshape(-1, 2)
 
 
@@ -113,6 +117,16 @@ class _RigParameterisation:
         lower, upper = (len(side.names) if self.refined else 0 for side in self.parameterisations)
         return lower, lower + upper, lower + upper + 6
 
+    @property
+    def prior(self) -> Prior:
+        """Return the prior of the terms of real mirrors, about 0."""
+        center, sigma = np.zeros(self.ends[-1]), np.full(self.ends[-1], np.inf)
+        for side, first in zip(self.parameterisations if self.refined else (), (0, self.ends[0]), strict=False):
+            for k, name in enumerate(side.names):
+                if name in MIRROR_NAMES:
+                    center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
+        return Prior(center, sigma)
+
     def camera(self, steps: Array) -> _PairCamera:
         """Return both cameras at the steps."""
         lower_end, upper_end, _ = self.ends
@@ -127,7 +141,8 @@ class _RigParameterisation:
 def calibrate_rig(views: Sequence[PairView], board: Board, cameras: Sides, refined: bool = True) -> RigCalibration:
     """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
 
-    cameras: start values, or the fixed cameras if not refined. Raises CalibError if fewer than MIN_PAIRS pairs are
+    cameras: start values, or the fixed cameras if not refined. The terms of real mirrors (MIRROR_NAMES) are fitted if a
+    start value has a wavefront. Raises CalibError if fewer than MIN_PAIRS pairs are
     consistent, or if the order of the board's corners is ambiguous.
     """
     # 1. Relative pose initialisation; inconsistent views are rejected.
@@ -211,18 +226,41 @@ def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> Pai
 def _solve(good: Sequence[PairView], board: Board, given: tuple[Sides, bool], start: tuple[Array, Array]
            ) -> tuple[BundleResult, _RigParameterisation]:
     """Adjust both cameras, the transform between them, and one pose of the board for every view."""
-    (lower, upper), refined = given
     T_upper_lower, T_lower_board = start
+    unknowns = _unknowns(board, given, T_upper_lower, T_lower_board)
+    fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, _observations(good, board),
+                        prior=unknowns.prior)
+    return fit, unknowns
+
+
+def _unknowns(board: Board, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+              ) -> _RigParameterisation:
+    (lower, upper), refined = given
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
     units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
-    unknowns = _RigParameterisation((parameterise(lower), parameterise(upper)), refined, T_upper_lower, units,
-                                    len(board.points))
+    sides = [parameterise(camera, wavefront=has_wavefront(camera)) for camera in (lower, upper)]
+    return _RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
+
+
+def _observations(good: Sequence[PairView], board: Board) -> Observations:
+    """Return the corners (K, 2N, 2) of both cameras, the lower one's first."""
     none = np.full((len(board.points), 2), np.nan)
     pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen])
                        for view in good])
-    observed = Observations(pixels, np.tile(board.points, (2, 1)))
-    return adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed), unknowns
+    return Observations(pixels, np.tile(board.points, (2, 1)))
+
+
+def rig_held_out_px(found: RigCalibration) -> float:
+    """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
+    unknowns = _unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
+    return cross_validated_px(unknowns.camera, unknowns.ends[-1], found.fit.T_cam_board,
+                              _observations(found.views, found.board), unknowns.prior)
+
+
+def has_wavefront(camera: OmniCamera) -> bool:
+    """True if a camera's rays do not meet in one point."""
+    return isinstance(camera, OcamCamera) and any(camera.wavefront)
 
 
 def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:

@@ -10,7 +10,7 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.parameterisation import parameterise
-from calib.fit.rig_fit import RigCalibration
+from calib.fit.rig_fit import RigCalibration, has_wavefront
 from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
@@ -69,7 +69,7 @@ def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
     change = dict(zip(names, changes.tolist(), strict=True))
     cameras = []
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
-        parameters = parameterise(mounted.camera)
+        parameters = parameterise(mounted.camera, wavefront=has_wavefront(mounted.camera))
         steps = [change.pop(f"{side} {name}", 0.0) / unit
                  for name, unit in zip(parameters.names, parameters.units, strict=True)]
         cameras.append(parameters.camera_at(np.array(steps)))

@@ -8,6 +8,10 @@ Two optional tangential (decentring) terms p1, p2 [1/px] describe a camera off t
 They act between the ideal point (x, y) and the affine:
 
     x' = x + 2 p1 x y + p2 (rho^2 + 2 x^2),    y' = y + p1 (rho^2 + 2 y^2) + 2 p2 x y
+
+Optional terms of real mirrors: secondary astigmatism s1, s2 [1/px^2] adds the gradient of rho^2 (s1 (x^2 - y^2) + 2 s2
+x y) to x', y'; wavefront (models/wavefront.py) describes rays that do not meet in one point. project() and lift() are
+central all the same: exact for points at distance_m. project_near() uses the points' own distances.
 """
 
 from __future__ import annotations
@@ -18,7 +22,8 @@ from typing import Literal
 import numpy as np
 
 from calib.errors import CalibError
-from calib.models.camera import Array
+from calib.models import wavefront as wavefronts
+from calib.models.camera import Array, OmniCamera
 
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")
@@ -29,7 +34,10 @@ MAX_COEFFICIENTS = 64
 TABLE_SIZE = 1025
 # Newton steps on one table interval: 3 reach the last bit, the others are for the model's end, where the slope is 0.
 SOLVE_STEPS = 8
-# Newton steps that invert the tangential terms; pixels without convergence have no ray.
+# A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
+DISTANCE_M, MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 0.05, 1e4
+NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
+# Newton steps that invert the tangential and astigmatic terms; pixels without convergence have no ray.
 TANGENTIAL_STEPS, TANGENTIAL_TOLERANCE_PX = 8, 1e-8
 # Least determinant of the affine.
 MIN_DETERMINANT = 1e-6
@@ -47,6 +55,9 @@ class OcamCamera:
     size: tuple[int, int]
     view: View = "mirror"
     tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2 [1/px]
+    astigmatism: tuple[float, float] = (0.0, 0.0)  # s1, s2 [1/px^2]
+    wavefront: tuple[float, ...] = NO_WAVEFRONT  # [m]
+    distance_m: float = DISTANCE_M
     _radii: Array = field(init=False, repr=False, compare=False)
     _angles: Array = field(init=False, repr=False, compare=False)
 
@@ -65,9 +76,17 @@ class OcamCamera:
         if len(self.polynomial) > MAX_COEFFICIENTS:
             raise CalibError(f"ocam camera: expected at most {MAX_COEFFICIENTS} polynomial coefficients, found "
                              f"{len(self.polynomial)}")
-        values = (*self.polynomial, *self.center_row_column, *self.affine, *self.tangential)
+        values = (*self.polynomial, *self.center_row_column, *self.affine, *self.tangential,
+                  *self.astigmatism, *self.wavefront, self.distance_m)
         if not self.polynomial or not np.isfinite(values).all():
             raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
+        largest = max(map(abs, self.wavefront), default=np.inf)
+        if len(self.wavefront) != wavefronts.TERMS or largest > wavefronts.MAX_COEFFICIENT_M:
+            raise CalibError(f"ocam camera: expected a wavefront of {wavefronts.TERMS} lengths below "
+                             f"{wavefronts.MAX_COEFFICIENT_M} m, found {self.wavefront}")
+        if not MIN_DISTANCE_M <= self.distance_m <= MAX_DISTANCE_M:
+            raise CalibError(f"ocam camera: expected distance_m of {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g}, found "
+                             f"{self.distance_m}")
         c, d, e = self.affine
         if self.polynomial[0] >= 0 or abs(c - d * e) < MIN_DETERMINANT or min(self.size) < 1 or self.view not in VIEWS:
             raise CalibError("ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, "
@@ -113,12 +132,15 @@ class OcamCamera:
         c, d, e = self.affine
         row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
         x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
-        if any(self.tangential):
-            x, y = self._without_tangential(x, y)
+        if self._is_distorted:
+            x, y = self._undistort(x, y)
         rho = np.hypot(x, y)
         z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
         rays = np.column_stack([x, y, self._sign * z])
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        if any(self.wavefront):
+            return wavefronts.points_at(self.distance_m, rays, self.wavefront, -self._sign)
+        return np.asarray(rays)
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN if no radius of the model has their ray.
@@ -126,37 +148,57 @@ class OcamCamera:
         Solves f(rho) exactly, instead of the inverse polynomial of OCamCalib's file.
         """
         points = np.asarray(points, float)
+        if any(self.wavefront):
+            norm = np.linalg.norm(points, axis=1, keepdims=True)
+            at = self.distance_m * points / np.where(norm > 0, norm, np.nan)
+            points = wavefronts.directions_to(at, self.wavefront, -self._sign)
+        return self._project_rays(points)
+
+    def project_near(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3) [m] at their own distances; like project() without a wavefront."""
+        points = np.asarray(points, float)
+        if any(self.wavefront):
+            points = wavefronts.directions_to(points, self.wavefront, -self._sign)
+        return self._project_rays(points)
+
+    def _project_rays(self, points: Array) -> Array:
         r = np.hypot(points[:, 0], points[:, 1])
         rho = self._radius(r, self._sign * points[:, 2])
         scale = rho / np.where(r > 0, r, 1.0)
         x, y = points[:, 0] * scale, points[:, 1] * scale
-        if any(self.tangential):
-            x, y = self._with_tangential(x, y)
+        if self._is_distorted:
+            x, y = self._distort(x, y)
         c, d, e = self.affine
         row, column = self.center_row_column
         return np.column_stack([e * x + y + column, c * x + d * y + row])
 
-    def _with_tangential(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Apply the tangential terms to ideal points x, y (N,) [px]."""
-        p1, p2 = self.tangential
-        rho2 = x * x + y * y
-        return (x + 2 * p1 * x * y + p2 * (rho2 + 2 * x * x), y + p1 * (rho2 + 2 * y * y) + 2 * p2 * x * y)
+    @property
+    def _is_distorted(self) -> bool:
+        return any(self.tangential) or any(self.astigmatism)
 
-    def _without_tangential(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Invert the tangential terms by Newton steps; NaN for points without convergence."""
-        p1, p2 = self.tangential
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Apply the tangential and astigmatic terms to ideal points x, y (N,) [px]."""
+        (p1, p2), (s1, s2) = self.tangential, self.astigmatism
+        rho2 = x * x + y * y
+        return (x + 2 * p1 * x * y + p2 * (rho2 + 2 * x * x) + 4 * s1 * x**3 + s2 * (6 * x * x * y + 2 * y**3),
+                y + p1 * (rho2 + 2 * y * y) + 2 * p2 * x * y - 4 * s1 * y**3 + s2 * (2 * x**3 + 6 * x * y * y))
+
+    def _undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Invert the tangential and astigmatic terms by Newton steps; NaN for points without convergence."""
+        (p1, p2), (s1, s2) = self.tangential, self.astigmatism
         ideal_x, ideal_y = x.copy(), y.copy()
         with np.errstate(all="ignore"):
             for _ in range(TANGENTIAL_STEPS):
-                distorted_x, distorted_y = self._with_tangential(ideal_x, ideal_y)
+                distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
                 error_x, error_y = distorted_x - x, distorted_y - y
-                xx = 1 + 2 * p1 * ideal_y + 6 * p2 * ideal_x
-                xy = 2 * p1 * ideal_x + 2 * p2 * ideal_y
-                yy = 1 + 6 * p1 * ideal_y + 2 * p2 * ideal_x
+                xx2, xy2, yy2 = ideal_x * ideal_x, ideal_x * ideal_y, ideal_y * ideal_y
+                xx = 1 + 2 * p1 * ideal_y + 6 * p2 * ideal_x + 12 * (s1 * xx2 + s2 * xy2)
+                xy = 2 * p1 * ideal_x + 2 * p2 * ideal_y + 6 * s2 * (xx2 + yy2)
+                yy = 1 + 6 * p1 * ideal_y + 2 * p2 * ideal_x + 12 * (s2 * xy2 - s1 * yy2)
                 determinant = xx * yy - xy * xy
                 ideal_x = ideal_x - (yy * error_x - xy * error_y) / determinant
                 ideal_y = ideal_y - (xx * error_y - xy * error_x) / determinant
-            distorted_x, distorted_y = self._with_tangential(ideal_x, ideal_y)
+            distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
             converged = np.hypot(distorted_x - x, distorted_y - y) < TANGENTIAL_TOLERANCE_PX
         return np.where(converged, ideal_x, np.nan), np.where(converged, ideal_y, np.nan)
 
@@ -183,3 +225,8 @@ class OcamCamera:
         derivative = np.polynomial.polynomial.polyder(np.array(self.polynomial))
         gradient = np.polynomial.polynomial.polyval(rho, derivative) * slope[0] - slope[1]
         return rho - value / np.where(gradient != 0, gradient, np.nan)
+
+
+def project_near(camera: OmniCamera, points: Array) -> Array:
+    """Return pixels (N, 2) of points (N, 3) [m] at their own distances, by a camera of any model."""
+    return camera.project_near(points) if isinstance(camera, OcamCamera) else camera.project(points)

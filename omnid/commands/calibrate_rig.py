@@ -15,6 +15,7 @@ from calib.camera_file import CameraFile, read_camera
 from calib.fit.camera_fit import RejectedView
 from calib.fit.model_selection import MODEL_CHOICES, refine_selection, select_calibration
 from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, refine_rig_calibration
+from calib.fit.rig_selection import select_rig
 from calib.fit.rig_uncertainty import drive_uncertainty, rig_covariance
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
@@ -135,15 +136,22 @@ def _fitted(images: PairedImages, board: Board, given: tuple[CameraFile, CameraF
     """Fit the rig to all boards; the cameras are fitted first, unless they are given."""
     views = _views(images, board, show_progress=not args.quiet)
     refined = given is None or args.refine_cameras
+    mirrors: tuple[OcamCamera, OcamCamera] | None = None
     if given:
         cameras, rejected = (given[0].camera, given[1].camera), list[RejectedView]()
     else:
-        cameras, views, rejected = _calibrated_cameras(views, images, board, args)
+        cameras, mirrors, views, rejected = _calibrated_cameras(views, images, board, args)
     if not refined:
         rejected += [RejectedView(view.name, f"only the {name} camera saw the board; with given cameras pairs are "
                                              "needed")
                      for view in views for name, seen in zip(SIDES, view.seen[::-1], strict=True) if seen is None]
-    found = calibrate_rig(views, board, cameras, refined)
+    if refined:
+        selected = select_rig(views, board, cameras, mirrors)
+        found = selected.calibration
+        for number, score in enumerate(selected.scores if not args.quiet else ()):
+            print(f"rig: {'compared' if number else 'selected'} {score}", file=sys.stderr)
+    else:
+        found = calibrate_rig(views, board, cameras, refined)
     found = refine_rig_calibration(found, images.sides, refined)
     return _with_rejected(found, rejected)
 
@@ -174,9 +182,13 @@ def _found(images: Images, board: Board, name: str, *, is_log: bool, show_progre
 
 
 def _calibrated_cameras(views: list[PairView], images: PairedImages, board: Board, args: argparse.Namespace
-                        ) -> tuple[Sides, list[PairView], list[RejectedView]]:
-    """Calibrate each camera by all its images; returns the cameras, the accepted views and the rejected ones."""
-    cameras, rejected = [], list[RejectedView]()
+                        ) -> tuple[Sides, tuple[OcamCamera, OcamCamera] | None, list[PairView], list[RejectedView]]:
+    """Calibrate each camera by all its images.
+
+    Returns the cameras, polynomial ones for the terms of real mirrors (None if these are not asked for), the accepted
+    views and the rejected ones.
+    """
+    cameras, polynomials, rejected = [], list[OcamCamera](), list[RejectedView]()
     for side, name in enumerate(SIDES):
         side_views = [seen for view in views if (seen := view.seen[side]) is not None]
         height, width = images.sides[side][side_views[0].name].shape if side_views else (0, 0)
@@ -184,9 +196,12 @@ def _calibrated_cameras(views: list[PairView], images: PairedImages, board: Boar
         print_scores(selected, f"{name} camera", args.quiet)
         found = refine_selection(selected, images.sides[side], args.view).calibration
         cameras.append(found.camera)
+        if selected.polynomial is not None:
+            polynomials.append(selected.polynomial)
         rejected += [RejectedView(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
         views = _without(views, side, {bad.name for bad in found.rejected})
-    return (cameras[0], cameras[1]), views, rejected
+    general = args.model == "auto" and len(polynomials) == len(SIDES)
+    return (cameras[0], cameras[1]), (polynomials[0], polynomials[1]) if general else None, views, rejected
 
 
 def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:

@@ -1,0 +1,134 @@
+"""Boards, rig, drive: rendered rigs of real mirrors from the calibration to the drive's error.
+
+`python -m tests.benchmark.boards_chain --seeds 1 2 --folder DIR`: for every seed another rig (tests/simulation/rigs.py:
+cameras tilted by 0.7 degrees below ray-traced mirrors, up to 1.5 % off shape), 24 pairs of images of a board, `omnid
+calibrate rig` with all defaults, and a drive of 5 m with a large turn. Images and logs that are in DIR already are used
+again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import omnid
+from calib import se3
+from calib.boards.board import Board
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from omnid.cli import main as omnid_main
+from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import evaluate
+from tests.simulation.boards import BoardRenderer, board_poses_around_rig
+from tests.simulation.logs import write_log
+from tests.simulation.recipes import build, mild_rig
+from tests.simulation.rigs import with_real_mirrors
+from tests.simulation.sensor import Exposure, Sensor
+
+BOARD = Board(9, 6, 0.05)
+SENSOR = Sensor(noise_sigma=2.0)
+SIZE, PAIRS, DRIVE = 768, 24, "two_walls"
+DISTANCE_M = (0.3, 0.7)
+
+
+def board_rig(seed: int, amount: float) -> tuple[Rig, Rig]:
+    """Return the rig of a seed with ray-traced mirrors, and the same one with perfect mirrors."""
+    perfect = mild_rig(seed, SIZE)
+    return (with_real_mirrors(perfect, seed, amount) if amount else perfect), perfect
+
+
+def render_boards(seed: int, amount: float, folder: Path) -> None:
+    """Write pairs of images as lower_*.jpg, upper_*.jpg, and the true corners as corners.npy (pairs, 2, N, 2)."""
+    if (folder / "corners.npy").exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    rig, perfect = board_rig(seed, amount)
+    sides = (("lower", rig.lower), ("upper", rig.upper))
+    renderers = {name: BoardRenderer(BOARD, mounted) for name, mounted in sides}
+    corners = []
+    for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
+        made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
+        for name, mounted in sides:
+            jpeg = Exposure.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
+            (folder / f"{name}_{k:02d}.jpg").write_bytes(jpeg)
+        corners.append([made[name].corners for name, _ in sides])
+    np.save(folder / "corners.npy", np.array(corners))
+
+
+def render_drive(seed: int, amount: float, folder: Path) -> None:
+    """Write the log of a drive of the rig."""
+    if not (folder / "log.mcap").exists():
+        run = build(DRIVE, seed, SIZE)
+        write_log(folder, board_rig(seed, amount)[0], run.poses, run.scene, sensor=run.sensor, seed=seed)
+
+
+def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> str:
+    """Calibrate by the images of a folder, and return the printed line."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        code = omnid_main(["calibrate", "rig", str(folder), "--corners", f"{BOARD.columns}x{BOARD.rows}", "--square-mm",
+                           f"{1e3 * BOARD.square_m:g}", "-o", str(output), *options])
+    if code != 0:
+        raise SystemExit(f"{folder}: calibrate ended with code {code}")
+    return text.getvalue().strip()
+
+
+def in_true_frame(found: Rig, truth: Rig) -> Rig:
+    """Return a calibrated rig in the frame of the true one, by the rays of the lower camera."""
+    rng, (u, v) = np.random.default_rng(0), truth.lower.visible.center
+    azimuth, part = rng.uniform(0, 2 * np.pi, 2000), np.sqrt(rng.uniform(0.05, 0.9, 2000))
+    radius = truth.lower.visible.outer_px * part
+    pixels = np.column_stack([u + radius * np.cos(azimuth), v + radius * np.sin(azimuth)])
+    left, _, right = np.linalg.svd(found.lower.camera.lift(pixels).T @ truth.lower.camera.lift(pixels))
+    T_found_true = se3.transform(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right, np.zeros(3))
+    T_lower_rig = T_found_true @ truth.lower.T_cam_rig
+    T_upper_lower = found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig)
+    return replace(found, lower=replace(found.lower, T_cam_rig=T_lower_rig),
+                   upper=replace(found.upper, T_cam_rig=T_upper_lower @ T_lower_rig))
+
+
+def drive(folder: Path, rig: Rig) -> str:
+    """Return the drive's errors with a rig."""
+    result = omnid.replay(folder / "log.mcap", rig=rig)
+    result.save_tum(folder / "estimate.txt")
+    found = evaluate(read_tum(folder / "estimate.txt"), read_tum(folder / "truth.txt"))
+    return (f"length {100 * found.length_error_ratio:+.3f} %, ATE {1e3 * found.ate_rmse_m:.2f} mm, heading at most "
+            f"{np.rad2deg(found.heading_max_rad):.3f} deg off")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the lines of every seed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmark.boards_chain")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[3, 4])
+    parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--amount", type=float, default=1.0, help="part of tilt and shape; 0: perfect mirrors")
+    parser.add_argument("--only", choices=("boards", "drive"), help="render and stop")
+    parser.add_argument("--options", nargs="*", default=[], help="further words for `calibrate rig`, like model=omni")
+    args = parser.parse_args(arguments)
+    for seed in args.seeds:
+        boards, log = (args.folder / f"{kind}_a{args.amount:g}_s{seed}" for kind in ("boards", "drive"))
+        if args.only != "drive":
+            render_boards(seed, args.amount, boards)
+        if args.only != "boards":
+            render_drive(seed, args.amount, log)
+        if args.only:
+            continue
+        options = [part for word in args.options for part in ("--" + word).split("=")]
+        line = calibrate(boards, boards / "rig.toml", options)
+        truth = board_rig(seed, args.amount)[0]
+        found = in_true_frame(read_rig(boards / "rig.toml"), truth)
+        print(f"seed {seed}, baseline {1e3 * truth.baseline_m:.2f} mm: {line}\n    {drive(log, found)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    cv2.setNumThreads(1)
+    sys.exit(main(sys.argv[1:]))
