@@ -19,7 +19,8 @@ from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_por
 
 # A busy machine is late with everything, and each fault would disarm.
 PATIENT = ("controller.arming=manual", "controller.deadlines.pose_s=8", "controller.deadlines.command_s=8",
-           "controller.deadlines.tick_s=8", "motor.watchdog_ms=8000")
+           "controller.deadlines.tick_s=8", "motor.watchdog_ms=8000", "controller.trust.velocity_sigma_mps=0",
+           "controller.trust.yaw_rate_sigma_radps=0", "controller.trust.odometry_reset=ignore")
 MANUAL = tuple(word for setting in PATIENT for word in ("--set", setting))
 WATCH_S = 0.5  # during which nothing may move
 HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
