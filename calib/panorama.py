@@ -59,9 +59,10 @@ class Cylinder:
         return np.asarray((columns + self.width / 2) % self.width - self.width / 2)
 
 
-def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0)) -> Cylinder:
-    """Return the panorama of the elevations that both cameras see; width 0: the resolution of the images."""
-    width = width_px or 8 * round(_horizon_px(rig) / 8)
+def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0), scale: float = 1.0
+                 ) -> Cylinder:
+    """Return the panorama of the elevations that both cameras see; width 0: the resolution of the images, scaled."""
+    width = width_px or 8 * round(scale * _horizon_px(rig) / 8)
     if width > MAX_WIDTH_PX:
         raise _too_large(f"{width} columns")
     focal = width / (2 * math.pi)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
+
+PROFILES: Final = {
+    "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
+}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,10 +30,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+class ChooseProfile(argparse.Action):
+    """Settings of a profile, as if --set came before all others."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: str | Sequence[Any] | None, option_string: str | None = None) -> None:
+        """Add the settings."""
+        namespace.overrides = [*PROFILES[str(values)], *namespace.overrides]
+
+
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the options --config and --set."""
+    """Add the options --config, --profile and --set."""
     parser.add_argument("--config", type=Path, metavar="FILE",
                         help="TOML file of settings; `omnid config` prints the defaults")
+    parser.add_argument("--profile", action=ChooseProfile, choices=tuple(PROFILES), default=argparse.SUPPRESS,
+                        help="settings that replace those of the file; small: half-size panoramas and half the "
+                        "landmarks, for a small computer")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
                         help="a setting that replaces that of the file; may be repeated")
 

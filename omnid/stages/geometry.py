@@ -44,7 +44,7 @@ class Geometry:
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
     """Return the geometry of a rig; of a camera without a mask the whole image is used."""
-    return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg))
+    return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg, config.scale))
 
 
 def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:

@@ -26,6 +26,7 @@ OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a vi
 STEPS = (2, 4)  # of Gauss-Newton in each round at most; a round takes the inliers of the one before
 ENOUGH_ROWS = 120  # disparities measured in a frame that are enough
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
+LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
 COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet warped to the new viewpoint
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
@@ -98,13 +99,17 @@ class FrameToMap:
         return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, tracks.visible,
                             len(tracks.landmarks), inliers, landmarks, views, variance[landmarks], rejected)
 
-    def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float]) -> Array:
+    def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
 
-        The search ends at the first hypothesis that keeps more than ENOUGH_RATIO (section IV.F).
+        The search ends at the first hypothesis that keeps more than ENOUGH_RATIO (section IV.F), and after the first
+        `likely` hypotheses if one of them keeps more than LIKELY_RATIO: then the view has changed by more than a turn,
+        and no other yaw would keep many.
         """
         best, highest = T_odom_rect, -1.0
-        for yaw_rad in yaws_rad:
+        for count, yaw_rad in enumerate(yaws_rad):
+            if count == likely and highest > LIKELY_RATIO:
+                break
             turned = T_odom_rect @ se3.exp([0, 0, 0, 0, 0, yaw_rad])
             tracks = self._map.track(frame.lower, turned, most=YAW_SAMPLE)
             ratio = len(tracks.landmarks) / max(1, tracks.visible)

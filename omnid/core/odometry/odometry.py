@@ -126,7 +126,7 @@ class VisualOdometry:
         peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable)
         T_unturned = self._T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
-        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps())
+        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks))
 
     def _is_good(self, estimate: PoseEstimate | None) -> bool:
         """True if no other guess is needed."""

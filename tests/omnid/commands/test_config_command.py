@@ -29,6 +29,14 @@ def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Comman
     assert '\nrobot = "rover"\n' in changed
 
 
+def test_a_profile_is_a_set_of_settings_and_gives_way_to_set(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    for words, scale in ((["--profile", "small"], 0.5), (["--set", "panorama.scale=0.7", "--profile", "small"], 0.7)):
+        file.write_text(omnid("config", "--minimal", *words).out)
+        config = load_config(file)
+        assert (config.panorama.scale, config.odometry.limits.features) == (scale, 250)
+
+
 def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
     file = tmp_path / "omnid.toml"
     file.write_text("[bus]\nrobot = 'rover'\n")

@@ -67,6 +67,15 @@ def test_a_pair_has_the_image_of_each_camera(rig_geometry: Geometry, frames: lis
     assert not np.array_equal(pair.lower, pair.upper)
 
 
+def test_panoramas_are_scaled_but_not_their_elevations() -> None:
+    rig = make_rig(size=768, baseline_m=0.2)
+    full, half = (geometry(rig, replace(CONFIG.panorama, scale=scale)).cylinder for scale in (1.0, 0.5))
+    assert half.width == pytest.approx(full.width / 2, abs=8)
+    assert half.height == pytest.approx(full.height / 2, rel=0.02)
+    assert half.row0 / half.focal_px == pytest.approx(full.row0 / full.focal_px, abs=0.01)
+    assert geometry(rig, replace(CONFIG.panorama, width_px=800, scale=0.5)).cylinder.width == 800
+
+
 def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
     (pair,), _ = run_pairs(rig_geometry, frames[:2])
     return Stereo(rig_geometry, CONFIG.stereo).process(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
