@@ -27,7 +27,7 @@ THRESHOLD_PX = 3.0  # largest error of a view in the consensus set
 MIN_MATCHES = 12  # matches, and inliers among them, below which a keyframe is not recognised
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
 MAX_KEYFRAMES = 8  # kept in memory
-MAX_MATCHED, MAX_DESCRIBED = 4, 2  # keyframes in one search, and those among them whose features are not yet known
+MAX_MATCHED, MAX_DESCRIBED = 4, 1  # keyframes in one search, and those among them whose features are not yet known
 ENOUGH_INLIERS = 60  # that end a search
 KEYFRAMES_APART_M = 0.3  # a keyframe nearer to the last one replaces it
 
