@@ -8,6 +8,7 @@ import time
 from typing import TextIO
 
 from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.messages import OdometryUpdate
 
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0
@@ -32,19 +33,21 @@ class Progress:
 
     def __call__(self) -> None:
         """Show the progress now."""
-        if self._statistics.poses:
-            self._show(self._line())
+        newest = self._statistics.newest
+        if newest is not None:
+            self._show(self._line(newest))
 
     def close(self) -> None:
         """Clear the bar."""
         if self._terminal and self._drawn:
             self._write("\r" + " " * self._drawn + "\r")
 
-    def _line(self) -> str:
-        done, newest = self._statistics.poses, self._statistics.newest
+    def _line(self, newest: OdometryUpdate) -> str:
+        done = newest.seq + 1  # with the pairs that were dropped
+        dropped = done - self._statistics.poses
         rate = done / max(1e-3, time.monotonic() - self._start_s)
-        state = newest.state if newest is not None else "starting"
-        return f"{self._share(done)} {rate:5.1f} pairs/s  {self._statistics.length_m:8.2f} m  {state}"
+        losses = f"  {dropped} dropped" if dropped > 0 else ""
+        return f"{self._share(done)} {rate:5.1f} pairs/s  {self._statistics.length_m:8.2f} m  {newest.state}{losses}"
 
     def _share(self, done: int) -> str:
         if not self._expected:

@@ -1,0 +1,28 @@
+"""The line that shows how far a run is."""
+
+from __future__ import annotations
+
+import io
+from types import SimpleNamespace
+from typing import Any, cast
+
+from omnid.diagnostics.progress import Progress
+from omnid.diagnostics.run_statistics import RunStatistics
+
+
+def line(seq: int, poses: int) -> str:
+    statistics, stream = RunStatistics(), io.StringIO()
+    statistics.newest, statistics.poses = cast("Any", SimpleNamespace(seq=seq, state="tracking")), poses
+    Progress(statistics, 99, stream)()
+    return stream.getvalue()
+
+
+def test_counts_the_pairs_that_were_dropped_too() -> None:
+    assert line(98, 58).startswith("omnid: 99/99 ") and line(98, 58).endswith("tracking  41 dropped\n")
+    assert line(49, 50).startswith("omnid: 50/99 ") and "dropped" not in line(49, 50)
+
+
+def test_shows_nothing_before_the_first_pose() -> None:
+    stream = io.StringIO()
+    Progress(RunStatistics(), 99, stream)()
+    assert stream.getvalue() == ""
