@@ -33,9 +33,10 @@ _MAX_LISTED = 8  # files in an error message
 
 PARSE_ERRORS = (McapError, struct.error, ValueError, OverflowError)
 
+_CONVERT = "convert it with `rosbags-convert --src {} --dst NEW_FOLDER --dst-storage mcap`, which comes with omnid"
 _OTHER_FORMATS = {  # first bytes -> advice
-    b"SQLite f": "an SQLite bag: convert it with `ros2 bag convert` to storage mcap",
-    b"#ROSBAG ": "a ROS 1 bag: convert it with `rosbags-convert --dst-storage mcap`",
+    b"SQLite f": f"part of an SQLite bag: {_CONVERT.format('ITS_FOLDER')}",
+    b"#ROSBAG ": f"a ROS 1 bag: {_CONVERT.format('FILE')}",
     b"\x28\xb5\x2f\xfd": "a zstd-compressed file: unpack it with `zstd -d`",
 }
 
@@ -127,6 +128,8 @@ def _file_in(path: Path) -> Path:
             raise DriverError(f"cannot read the log {str(path)!r}: it is no regular file; give a .mcap file")
         return path
     logs = sorted(path.glob("*.mcap"))
+    if not logs and any(path.glob("*.db3")):
+        raise DriverError(f"{str(path)!r} is an SQLite bag: {_CONVERT.format(path)}")
     if len(logs) != 1:
         names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
         raise DriverError(f"{str(path)!r} must contain exactly one .mcap file; found: {names}; give one file")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import random
 import struct
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -160,7 +162,7 @@ def test_ignores_a_corrupt_summary(tmp_path: Path) -> None:
         (b"", "it is empty"),
         (MAGIC[:5], "starts with"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), r"starts with b'\\x89PNG"),
-        (b"SQLite format 3\0" + bytes(50), "ros2 bag convert"),
+        (b"SQLite format 3\0" + bytes(50), "rosbags-convert --src ITS_FOLDER"),
         (b"#ROSBAG V2.0\n" + bytes(50), "ROS 1 bag"),
         (zstandard.compress(bytes(50)), "zstd -d"),
         (MAGIC, "no topics at all"),
@@ -174,10 +176,23 @@ def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: s
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_the_advice_for_other_bags_works(tmp_path: Path) -> None:
+    original, bag, converted = tmp_path / "log.mcap", tmp_path / "bag", tmp_path / "converted"
+    write_log(original, pairs(4))
+    for source, target, storage in ((original, bag, "sqlite3"), (bag, converted, "mcap")):
+        command = [Path(sys.executable).with_name("rosbags-convert"), "--src", source, "--dst", target, "--dst-storage",
+                   storage]
+        subprocess.run(command, check=True, capture_output=True)
+    assert payloads(LogReader(converted)) == payloads(LogReader(original))
+
+
 def test_refuses_unreadable_paths(tmp_path: Path) -> None:
     with pytest.raises(DriverError, match="No such file"):
         LogReader(tmp_path / "nowhere.mcap")
     with pytest.raises(DriverError, match="none"):
+        LogReader(tmp_path)
+    (tmp_path / "bag_0.db3").touch()
+    with pytest.raises(DriverError, match=f"rosbags-convert --src {tmp_path} --dst"):
         LogReader(tmp_path)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(DriverError, match="no regular file"):
