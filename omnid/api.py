@@ -98,7 +98,7 @@ class Odometry:
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
-            self._dewarp = Dewarp(place, settings.panorama)
+            self._dewarp = Dewarp(place, settings.panorama, settings.camera)
             gate = RigGate(place.cylinder, settings.stereo.rig_check)
             self._stereo = Stereo(place, settings.stereo_settings(), gate)
             self._odometry = OdometryStage(place, settings.odometry)

@@ -77,9 +77,20 @@ class LiveConfig:
 class PairConfig:
     """Synchronisation of the cameras."""
 
-    tolerance_ms: float = knob(10.0, "largest difference between the stamps of a pair, ms", low=0, high=1000)
+    tolerance_ms: float = knob(0.0, "largest difference between the stamps of a pair, ms; 0: half the period of the "
+                               "images, so that cameras may run freely", low=0, high=1000)
     repeated_images: str = knob("drop", "images with all pixels as before, which a frozen camera delivers; 'use' only "
                                 "for simulators without noise", choices=("drop", "use"))
+
+
+@dataclass(frozen=True, slots=True)
+class TimingConfig:
+    """Times of exposure of the cameras, beside the stamps."""
+
+    line_time_us: float = knob(0.0, "rolling shutter: time from the exposure of an image row to that of the next, us; "
+                               "the stamp is that of the first row; 0: global shutter", low=0, high=1000)
+    upper_delay_ms: float = knob(0.0, "time by which the upper camera's exposure is later than the stamps say, ms",
+                                 low=-1000, high=1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +192,7 @@ class Config:
     log: LogConfig = field(default_factory=LogConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     pair: PairConfig = field(default_factory=PairConfig)
+    camera: TimingConfig = field(default_factory=TimingConfig)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.tracking_state import TrackingState
@@ -18,12 +19,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramePair:
-    """Images of both cameras at one instant; the stamp is the lower camera's."""
+    """Images of both cameras at nearly one instant; the stamp is the lower camera's."""
 
     seq: int
     stamp_ns: int
     lower: NDArray[np.uint8]  # (H, W)
     upper: NDArray[np.uint8]  # (H, W)
+    skew_s: float = 0.0  # from the lower to the upper exposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +37,7 @@ class Panoramas:
     lower: PaddedPanorama
     upper: PaddedPanorama
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
+    times: ExposureTimes | None = None  # of the pixels; None: all are exposed at the stamp
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,11 +10,11 @@ from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
 from drivers.logs.mcap_reader import LogReader
 from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
-from omnid.config import Config
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
 # Number of pairs of a log that are used, evenly spread.
+TOLERANCE_NS = 10_000_000  # largest difference between the stamps of a pair: boards are held still
 LOG_PAIRS = 100
 
 
@@ -87,10 +87,9 @@ def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:
 
 def paired(frames: Iterator[Frame]) -> Iterator[tuple[Frame, Frame]]:
     """Yield pairs of lower and upper frames with nearly equal stamps, from frames in order of stamps, undecoded."""
-    tolerance_ns = round(Config().pair.tolerance_ms * 1e6)
     waiting: Frame | None = None
     for frame in frames:
-        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= tolerance_ns:
+        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= TOLERANCE_NS:
             yield (waiting, frame) if frame.camera == "upper" else (frame, waiting)
             waiting = None
         else:

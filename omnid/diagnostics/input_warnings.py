@@ -24,11 +24,11 @@ def input_warnings(
     if pairing.fault:
         yield f"{counts['broken']} images could not be decoded; the first: {pairing.fault}"
     if not counts["pairs"]:
-        yield _no_pair(pairing.closest_miss_ms, config.tolerance_ms)
+        yield _no_pair(pairing.closest_miss_ms, pairing.tolerance_ms)
     elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
         closest_ms = pairing.closest_miss_ms or 0.0
         yield (f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
-               f"pair.tolerance_ms is {config.tolerance_ms:g}; if no images are missing, synchronise the cameras")
+               f"pair.tolerance_ms is {pairing.tolerance_ms:g}; if no images are missing, synchronise the cameras")
     for camera, images in pairing.repeated.items():
         if images.longest >= FROZEN_IMAGES:
             yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "

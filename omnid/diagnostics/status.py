@@ -99,8 +99,12 @@ class StatusCollector:
         fault = self._pairing_fault(pair)
         values = {name: str(count) for name, count in counts.items()} | {
             "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "max_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
-            "skew_drift_ms": f"{skew.drift_ns * 1e-6:.3f}"}
-        return DiagnosticStatus(status_names.PAIRING, WARN if fault else OK, fault or "synchronised", values)
+            "skew_drift_ms": f"{skew.drift_ns * 1e-6:.3f}", "exposure_skew_ms": f"{skew.exposure_ns * 1e-6:.3f}",
+            "tolerance_ms": f"{pair.tolerance_ms:.3f}"}
+        state = "synchronised"
+        if skew.exposure_ns:
+            state = "not synchronised: the motion between the exposures is corrected"
+        return DiagnosticStatus(status_names.PAIRING, WARN if fault else OK, fault or state, values)
 
     def _pairing_fault(self, pair: Synchronise) -> str:
         """Return the fault that explains all others first; empty without a fault."""
@@ -115,7 +119,7 @@ class StatusCollector:
                    "check the camera and its driver"
         if rate_hz == 0:
             return "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
-        if abs(pair.skew.drift_ns) > MAX_SKEW_DRIFT_NS:
+        if pair.has_fixed_tolerance and abs(pair.skew.drift_ns) > MAX_SKEW_DRIFT_NS:
             return "the cameras drift apart in time: synchronise them"
         return ""
 

@@ -53,7 +53,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     """Join the stages from the pairs on; return those that are asked at the end."""
     rig_gate = RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
     stereo = Stereo(geometry, config.stereo_settings(), rig_gate)
-    panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama), pairs, direct=True)
+    panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama, config.camera), pairs, direct=True)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
     poses = Chain(stereo, OdometryStage(geometry, config.odometry, sinks.features))

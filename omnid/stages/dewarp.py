@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
-from omnid.config import PanoramaConfig
+from omnid.config import PanoramaConfig, TimingConfig
+from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import brightened, gain_of, mean_level, noise_sigma
 from omnid.errors import OmnidError
@@ -21,7 +22,7 @@ MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 class Dewarp:
     """Rectifies both images of a pair; the remap tables are computed once."""
 
-    def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
+    def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
         self._pad_px = config.pad_px
         rig, cylinder = geometry.rig, geometry.cylinder
         self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
@@ -29,6 +30,11 @@ class Dewarp:
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
+        timing = timing or TimingConfig()
+        self._upper_delay_s, line_s = timing.upper_delay_ms * 1e-3, timing.line_time_us * 1e-6
+        inner = slice(config.pad_px, -config.pad_px)
+        tables = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper)]
+        self._rows_s = tables if line_s else [None, None]
         self._noise_grey: dict[str, float] = {}  # of each camera before its gain
         self._pairs = 0
         if self._visible.mean() < MIN_SHARED_PART:
@@ -43,7 +49,13 @@ class Dewarp:
         self._pairs += 1
         lower = self._panorama(pair.lower, self._lower, "lower", measured)
         upper = self._panorama(pair.upper, self._upper, "upper", measured)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s))
+
+    def _times(self, skew_s: float) -> ExposureTimes | None:
+        """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""
+        skew_s += self._upper_delay_s
+        lower_s, upper_s = self._rows_s
+        return None if skew_s == 0 and lower_s is None else ExposureTimes(skew_s, lower_s, upper_s)
 
     def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool) -> PaddedPanorama:
         """Return a panorama, brightened if it is dim; measured: measure the noise of this camera again."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
+from statistics import median_low
 
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
@@ -11,34 +11,28 @@ from omnid.config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.decoder import Decoder, Image
 from omnid.stages.repeated_images import RepeatedImages
+from omnid.stages.skew import Skew
 
 MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
-SKEW_GAIN = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
+PERIOD_STEPS = 16  # recent steps between the stamps of a camera, whose median is its period
+SURE_NS = 5_000_000  # stamps so close make a pair also before the period is known
 OTHER: dict[Camera, Camera] = {"lower": "upper", "upper": "lower"}
 
 
-class Skew:
-    """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
+class Period:
+    """Period of a camera's images, by their stamps."""
 
     def __init__(self) -> None:
-        self.mean_ns = math.nan  # running mean
-        self.max_ns = 0  # largest absolute value
-        self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
-        self._pairs = 0
+        self._newest_ns: int | None = None
+        self._steps: deque[int] = deque(maxlen=PERIOD_STEPS)
+        self.ns: float | None = None  # median of the recent ones; None before the second image
 
-    def add(self, skew_ns: int) -> None:
-        """Add the skew of a pair."""
-        self._pairs += 1
-        gain = max(SKEW_GAIN, 1 / self._pairs)
-        self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
-        self.max_ns = max(self.max_ns, abs(skew_ns))
-        if self._pairs == round(1 / SKEW_GAIN):
-            self._settled_ns = self.mean_ns
-
-    @property
-    def drift_ns(self) -> float:
-        """Change of the running mean since it had settled; NaN before."""
-        return self.mean_ns - self._settled_ns
+    def add(self, stamp_ns: int) -> None:
+        """Add an image."""
+        if self._newest_ns is not None and stamp_ns > self._newest_ns:
+            self._steps.append(stamp_ns - self._newest_ns)
+            self.ns = float(median_low(self._steps))
+        self._newest_ns = stamp_ns
 
 
 class FrameMatcher:
@@ -46,10 +40,14 @@ class FrameMatcher:
 
     Frames of one camera come in the order of their stamps, those of both in any order. A match is final as soon as
     there is one within the tolerance: waiting for a nearer one would delay every pair by a period.
+
+    tolerance_ns 0: half the period of the faster camera, so that every image of the slower one finds its nearest
+    partner however the cameras stand to each other. Before the period is known, all but very close frames wait.
     """
 
     def __init__(self, tolerance_ns: int) -> None:
-        self._tolerance_ns = tolerance_ns
+        self.fixed_ns = tolerance_ns  # 0: none
+        self._periods: dict[Camera, Period] = {"lower": Period(), "upper": Period()}
         self._waiting: dict[Camera, deque[Frame]] = {"lower": deque(), "upper": deque()}
         self.unpaired: Counter[Camera] = Counter()
         self.closest_miss_ns: int | None = None  # smallest gap between frames of both cameras that made no pair
@@ -59,10 +57,31 @@ class FrameMatcher:
         """Number of frames that wait for a partner."""
         return sum(map(len, self._waiting.values()))
 
+    @property
+    def tolerance_ns(self) -> float:
+        """Largest difference between the stamps of a pair."""
+        periods = [period.ns for period in self._periods.values() if period.ns is not None]
+        return self.fixed_ns or (min(periods) / 2 if periods else SURE_NS)
+
+    def arrive(self, frame: Frame) -> None:
+        """Take note of a frame's stamp."""
+        self._periods[frame.camera].add(frame.stamp_ns)
+
+    def couple(self) -> tuple[Frame, Frame] | None:
+        """Return the first frames of both cameras that wait within the tolerance; None without any.
+
+        There are such frames only when the period has just become known.
+        """
+        for lower in self._waiting["lower"]:
+            nearest = self._nearest(lower)
+            if nearest is not None and _gap_ns(lower, nearest) <= self.tolerance_ns:
+                return lower, nearest
+        return None
+
     def partner(self, frame: Frame) -> Frame | None:
         """Return the waiting frame of the other camera that is nearest in time, None without one in the tolerance."""
         nearest = self._nearest(frame)
-        return nearest if nearest is not None and _gap_ns(frame, nearest) <= self._tolerance_ns else None
+        return nearest if nearest is not None and _gap_ns(frame, nearest) <= self.tolerance_ns else None
 
     def wait(self, frame: Frame) -> None:
         """Let a frame without a partner wait; the oldest one gives way when too many wait."""
@@ -132,6 +151,16 @@ class Synchronise:
         return None if miss_ns is None else miss_ns * 1e-6
 
     @property
+    def has_fixed_tolerance(self) -> bool:
+        """True if the tolerance was set: cameras whose clocks drift apart then make no pairs some day."""
+        return self._matcher.fixed_ns > 0
+
+    @property
+    def tolerance_ms(self) -> float:
+        """Largest difference between the stamps of a pair, ms, as set or as it follows from the period."""
+        return self._matcher.tolerance_ns * 1e-6
+
+    @property
     def waiting(self) -> int:
         """Number of frames that wait for a partner."""
         return self._matcher.waiting
@@ -152,6 +181,11 @@ class Synchronise:
     def process(self, frame: Frame) -> FramePair | None:
         """Return the pair that this frame completes; None where the frame waits, is broken or shows nothing new."""
         self.newest_ns[frame.camera] = frame.stamp_ns
+        self._matcher.arrive(frame)
+        waiting = self._matcher.couple()
+        if waiting is not None:
+            self._matcher.wait(frame)
+            return self._decoded(*waiting)
         image: Image | None = None
         while (partner := self._matcher.partner(frame)) is not None:
             image = self._decode(frame) if image is None else image
@@ -164,6 +198,16 @@ class Synchronise:
                 return self._joined({frame.camera: (frame, image), partner.camera: (partner, partner_image)})
         self._matcher.wait(frame)
         return None
+
+    def _decoded(self, lower: Frame, upper: Frame) -> FramePair | None:
+        """Return the pair of two frames that wait; None where one is broken, which no longer waits."""
+        lower_image, upper_image = self._decode(lower), self._decode(upper)
+        for frame, image in ((lower, lower_image), (upper, upper_image)):
+            if image is None:
+                self._matcher.remove(frame)
+        if lower_image is None or upper_image is None:
+            return None
+        return self._joined({"lower": (lower, lower_image), "upper": (upper, upper_image)})
 
     def finish(self) -> tuple[()]:
         """Count the frames that still wait."""
@@ -179,7 +223,7 @@ class Synchronise:
             return None
         seq = self._pairs
         self._pairs += 1
-        return FramePair(seq, lower.stamp_ns, lower_image, upper_image)
+        return FramePair(seq, lower.stamp_ns, lower_image, upper_image, self.skew.exposure_ns * 1e-9)
 
 
 def _gap_ns(frame: Frame, other: Frame) -> int:

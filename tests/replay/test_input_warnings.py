@@ -100,7 +100,7 @@ def test_warns_of_stamps_that_are_apart(
     omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, expected: str
 ) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
-    result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
+    result = omnid.replay(save(tmp_path / "log.mcap", taken), "--set", "pair.tolerance_ms=10", rig=scene / "rig.toml")
     assert result.code == 1 and expected in result.err and "pair.tolerance_ms" in result.err
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
@@ -108,7 +108,7 @@ def test_warns_of_stamps_that_are_apart(
 def test_warns_if_most_images_have_no_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
              for p in images(scene / "log.mcap")]
-    result = omnid.replay(save(tmp_path / "log.mcap", taken), rig=scene / "rig.toml")
+    result = omnid.replay(save(tmp_path / "log.mcap", taken), "--set", "pair.tolerance_ms=10", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
 
 

@@ -58,23 +58,22 @@ def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
     return free.astype(bool)
 
 
-def rows_in_upper(
-    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings, *, checked: bool = True
-) -> Array:
-    """Return rows (N,) in the upper panorama of points (N, 2) of the lower one, to sub-pixels; NaN without a match.
+def pixels_in_upper(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings,
+                    spread_px: Array | float = 0.0, *, checked: bool = True) -> Array:
+    """Return pixels (N, 2) in the upper panorama of points (N, 2) of the lower one; NaN without a match.
 
-    guess (N,) rows. A match passes the forward-backward check, if checked, and lies in the same column within CROSS_PX,
-    below the point.
+    guess (N, 2) pixels. A match passes the forward-backward check, if checked, and lies in the guessed column within
+    CROSS_PX and spread_px (N,), below the point.
     """
     lower, upper = pair
-    start = np.column_stack([points[:, 0], guess])
-    finite = np.flatnonzero(np.isfinite(guess))
-    there, good = (track if checked else flow)(lower, upper, points[finite], start[finite], klt)
-    aside = (there[:, 0] - points[finite, 0] + lower.width / 2) % lower.width - lower.width / 2
-    good &= (np.abs(aside) < CROSS_PX) & (there[:, 1] > points[finite, 1])
-    rows = np.full(len(points), np.nan)
-    rows[finite[good]] = there[good, 1]
-    return rows
+    finite = np.flatnonzero(np.isfinite(guess).all(axis=1))
+    there, good = (track if checked else flow)(lower, upper, points[finite], guess[finite], klt)
+    aside = (there[:, 0] - guess[finite, 0] + lower.width / 2) % lower.width - lower.width / 2
+    largest = CROSS_PX + np.broadcast_to(spread_px, len(points))[finite]
+    good &= (np.abs(aside) < largest) & (there[:, 1] > points[finite, 1])
+    pixels = np.full((len(points), 2), np.nan)
+    pixels[finite[good]] = there[good]
+    return pixels
 
 
 def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: int = REACH_PX) -> Array:

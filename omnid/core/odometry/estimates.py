@@ -26,14 +26,10 @@ class PoseEstimate:
     tracked: int
     inliers: int
     landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) rows of the local map
-    views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them in this frame, NaN: not in upper
+    views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them at the stamp, NaN: not in upper
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
-
-    @property
-    def pixels(self) -> Array:
-        """Pixels (M, 2) of the inliers in the lower panorama."""
-        return self.views[:, :2]
 
     @property
     def inlier_ratio(self) -> float:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import rows_in_upper
+from omnid.core.odometry.corners import pixels_in_upper
 from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.exposure_times import Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
-from omnid.core.odometry.pose_estimation import GaussNewtonResult, StereoModel, gauss_newton, ransac
+from omnid.core.odometry.pose_estimation import GaussNewtonResult, SharedError, StereoModel, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 
@@ -41,7 +42,7 @@ class CoarsePose:
 
     T_curr_odom: Array
     landmarks: Indices  # (M,) rows of the local map
-    disparity: Array  # (M,) px in this frame, NaN: not found in the upper panorama
+    disparity: Array  # (M,) px between the images of this frame, NaN: not found in the upper panorama
     variance: Array  # (M,) px^2 of the disparity by noise
     tracks: Tracks
 
@@ -54,50 +55,72 @@ class FrameToMap:
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         self._stereo_klt = replace(klt, levels=1)  # the predicted disparity is good to a few pixels
 
-    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array) -> CoarsePose | None:
+    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure | None = None
+                 ) -> CoarsePose | None:
         """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
 
         RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
-        place of the paper's eq. (9).
+        place of the paper's eq. (9). exposure: None where all pixels are exposed at the stamp.
         """
         if len(tracks.landmarks) < MIN_LANDMARKS:
             return None
-        views, variance = self._views(frame, tracks)
         T_guess_odom = se3.inverse(T_odom_guess)
         in_guess = se3.apply(T_guess_odom, self._map.store.table.points[tracks.landmarks])
+        shift = exposure.shift(in_guess) if exposure else None
+        spread_px = 2 * shift.column_sigma(exposure.motion) if exposure and shift else 0.0
+        views, variance = self._views(frame, tracks, shift, spread_px)
+        disparity = views[:, 2] - views[:, 1]
+        if shift:
+            views += np.column_stack([shift.lower, shift.upper[:, 1]])
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
-        landmarks, views, variance = tracks.landmarks[is_inlier], views[is_inlier], variance[is_inlier]
-        solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model)
+        landmarks = tracks.landmarks[is_inlier]
+        noise = shift.noise(exposure.motion)[is_inlier] if exposure and shift else None
+        solution, kept = self._solve(landmarks, views[is_inlier], T_curr_guess @ T_guess_odom, self._coarse_model,
+                                     noise)
         if solution is None:
             return None
-        disparity = (views[:, 2] - views[:, 1])[kept]
-        return CoarsePose(solution.T, landmarks[kept], disparity, variance[kept], tracks)
+        chosen = np.flatnonzero(is_inlier)[kept]
+        return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
 
-    def refine(self, frame: StereoFrame, coarse: CoarsePose) -> PoseEstimate | None:
+    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None = None) -> PoseEstimate | None:
         """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
 
-        The disparity of the tracked landmarks was measured between images of one instant, so it is kept and goes along
-        with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
+        The disparity of the tracked landmarks was measured between the images of this frame, so it is kept and goes
+        along with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
         supports of the pose: the number of inliers is the smaller one of both.
         """
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
         landmarks, _ = self._map.visible(T_odom_curr)
-        aligned = self._map.align(frame.lower, T_odom_curr, landmarks)
+        in_curr = se3.apply(coarse.T_curr_odom, self._map.store.table.points[landmarks])
+        shift = exposure.shift(in_curr) if exposure else None
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower if shift else 0.0)
         landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
         disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
         disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
         noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
-        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise)
+        by_motion: SharedError | None = None
+        if exposure and shift:
+            # The velocity is estimated along with the pose. Its prior is one measurement, no correlated ones.
+            views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
+            covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
+            by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
+        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
         # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
-        landmarks, views, tracks = landmarks[kept], views[kept], coarse.tracks
+        variance = variance[landmarks]
+        if exposure and by_motion:
+            # The velocity found here agrees with the depths in the map, so it must not correct them: a vertical one
+            # has the effect of another baseline, and the scale would drift. That of the filter is independent.
+            of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
+            variance += np.einsum("ni,ij,nj->n", of_depth, exposure.motion.covariance, of_depth)
+        landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
         inliers = min(len(coarse.landmarks), len(landmarks))
         return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, tracks.visible,
-                            len(tracks.landmarks), inliers, landmarks, views, variance[landmarks], rejected)
+                            len(tracks.landmarks), inliers, landmarks, views, pixels, variance[kept], rejected)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
@@ -119,23 +142,29 @@ class FrameToMap:
                 break
         return best
 
-    def _views(self, frame: StereoFrame, tracks: Tracks) -> tuple[Array, Array]:
+    def _views(self, frame: StereoFrame, tracks: Tracks, shift: ViewShift | None, spread_px: Array | float
+               ) -> tuple[Array, Array]:
         """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
 
-        Also returns the variances (M,) [px^2] of these rows by noise.
+        spread_px: standard deviations (M,) of the columns there, twice. Also returns the variances (M,) [px^2] of the
+        rows by noise.
         """
         pair = frame.lower, frame.upper
-        rows = tracks.pixels[:, 1] + tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        if len(rows) >= 2 * ENOUGH_ROWS:
+        guess = tracks.pixels.copy()
+        guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
+        if shift:
+            guess += shift.lower - shift.upper
+        elif len(guess) >= 2 * ENOUGH_ROWS:
             # The depths of landmarks change little from frame to frame: every second one in turn is measured.
-            rows[(self._map.store.table.id[tracks.landmarks] + frame.seq) % 2 == 1] = np.nan
+            guess[(self._map.store.table.id[tracks.landmarks] + frame.seq) % 2 == 1] = np.nan
         # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
-        rows = rows_in_upper(pair, tracks.pixels, rows, self._stereo_klt, checked=False)
-        rows, variance = align_rows(pair, tracks.pixels, rows)
+        near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
+        rows, variance = align_rows(pair, tracks.pixels, near)
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
-        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None
+        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None,
+        shared: SharedError | None = None,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
@@ -145,8 +174,9 @@ class FrameToMap:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
             of_views = None if noise is None else noise[kept]
+            of_all = None if shared is None else shared.of(kept)
             solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
-                                    of_views, steps)
+                                    of_views, steps, of_all)
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

@@ -53,7 +53,8 @@ class LandmarkTable:
     anchor: Indices  # (N,) seq of the keyframe that saw the landmark first
     anchor_points: Array  # (N, 3) m in the rectified frame of the anchor
     anchor_covariance: Array  # (N, 3, 3) m^2 in the same axes
-    views: Array  # (N, 3) px in the anchor: column, lower row, upper row
+    views: Array  # (N, 3) px in the anchor, at its stamp: column, lower row, upper row
+    anchor_pixels: Array  # (N, 2) px where the anchor's lower panorama shows it
     slopes: Array  # (N, 2) px/px of the disparity about the view, along column and row
     points: Array  # (N, 3) m in odom
     covariance: Array  # (N, 3, 3) m^2 in odom
@@ -64,8 +65,8 @@ class LandmarkTable:
     def empty() -> LandmarkTable:
         """Return a table without rows."""
         none, vectors, matrices = np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3))
-        return LandmarkTable(none, none, vectors, matrices, vectors, np.zeros((0, 2)), vectors, matrices,
-                             np.zeros((0, 2)), none)
+        pixels = np.zeros((0, 2))
+        return LandmarkTable(none, none, vectors, matrices, vectors, pixels, pixels, vectors, matrices, pixels, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +103,17 @@ class LandmarkStore:
     def __len__(self) -> int:
         return len(self.table.id)
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None) -> None:
+    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
+                     pixels: Array | None = None) -> None:
         """Add a keyframe with new landmarks, observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
 
-        noise: covariance (N, 3, 3) [px^2] of the views beside that of the model; None: none.
+        noise: covariance (N, 3, 3) [px^2] of the views beside that of the model; None: none. pixels (N, 2) in the
+        keyframe's panorama; None: those of the views, which are the same unless it was exposed at several times.
         Views that cannot be triangulated are left out. The oldest keyframe beyond the bound leaves.
         """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
+        pixels = (views[:, :2] if pixels is None else pixels)[finite]
         views, slopes, points = views[finite], slopes[finite], points[finite]
         covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px,
                                       None if noise is None else noise[finite])
@@ -117,8 +121,8 @@ class LandmarkStore:
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count
         in_odom = _in_odom(keyframe, points, covariance)
-        new = LandmarkTable(ids, np.full(count, keyframe.seq), points, covariance, views, slopes, *in_odom,
-                            pixels=views[:, :2], misses=np.zeros(count, np.intp))
+        new = LandmarkTable(ids, np.full(count, keyframe.seq), points, covariance, views, pixels, slopes, *in_odom,
+                            pixels=pixels, misses=np.zeros(count, np.intp))
         self.keyframes[keyframe.seq] = keyframe
         self.table = _joined(self.table, new)
         self._observe(ids, keyframe.seq, views)

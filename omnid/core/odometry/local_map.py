@@ -51,9 +51,10 @@ class LocalMap:
         self.store.clear()
         self._last = None
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None) -> None:
+    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
+                     pixels: Array | None = None) -> None:
         """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
-        self.store.add_keyframe(keyframe, views, slopes, noise)
+        self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
         self._last = keyframe.lower
 
     def update_tracked(self, lower: PaddedPanorama, landmarks: Indices, pixels: Array) -> None:
@@ -87,15 +88,16 @@ class LocalMap:
         rows = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices) -> AlignedPatches:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices,
+              shift: Array | float = 0.0) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
-        A patch is found where it has texture and moved little from its prediction.
+        A patch is found where it has texture and moved little from its prediction. shift: see ViewShift.lower.
         """
         table, keyframes = self.store.table, self.store.keyframes
         T_rect_odom = se3.inverse(T_odom_rect)
         points = se3.apply(T_rect_odom, table.points[landmarks])
-        predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2]
+        predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2] - shift
         anchors = table.anchor[landmarks]
         T_curr_ref = np.array([T_rect_odom @ keyframes[seq].T_odom_rect for seq in anchors.tolist()])
         warps = affine_warps(
@@ -104,6 +106,6 @@ class LocalMap:
         templates = np.zeros((len(landmarks), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
         for seq in np.unique(anchors).tolist():
             own = np.flatnonzero(anchors == seq)
-            pixels = table.views[landmarks[own], :2]
+            pixels = table.anchor_pixels[landmarks[own]]
             templates[own] = warped_templates(keyframes[seq].lower, pixels, warps[own], predicted[own])
         return align(templates, lower, predicted, anchors)

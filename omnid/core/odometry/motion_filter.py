@@ -48,6 +48,23 @@ class MotionFilter:
         P = self._filter.P[:6, :6]
         return np.asarray((P + P.T) / 2)
 
+    def motion(self, dt_s: float) -> tuple[Array, Array]:
+        """Return the velocity (6,) at the end of the last step of dt_s, and its covariance (6, 6).
+
+        The state holds the mean velocity of the step: at its end, half a step later, it is v + dt/2 a.
+        """
+        F = np.hstack([np.eye(6), dt_s / 2 * np.eye(6)])
+        P = F @ self._filter.P @ F.T
+        return F @ self._filter.x[:, 0], np.asarray((P + P.T) / 2)
+
+    def after(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> tuple[Array, Array]:
+        """Return the `motion` that an update with that measurement would lead to; the filter stays as it is."""
+        kept = self._filter.x.copy(), self._filter.P.copy()
+        self.update(T_prev_curr, covariance, dt_s)
+        found = self.motion(dt_s)
+        self._filter.x, self._filter.P = kept
+        return found
+
     def predict(self, dt_s: float) -> Array:
         """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
         F = np.eye(12)

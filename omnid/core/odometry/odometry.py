@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
-from omnid.core.odometry.frame_to_map import FrameToMap
+from omnid.core.odometry.exposure_times import Exposure, Motion
+from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
@@ -38,6 +39,8 @@ SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two
 GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
 LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
+SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 degrees
+START_ROUNDS = 2  # of starting a map again, once the velocity is known
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
@@ -61,7 +64,7 @@ class VisualOdometry:
                  relocaliser: KeyframeLocaliser, features: Callable[[], float] = lambda: 1.0) -> None:
         """features: called for each keyframe, the share of limits.features that it is to have."""
         self._features = features
-        self._limits = limits
+        self._limits, self._model = limits, model
         self._stereo_klt = replace(klt, levels=1)
         self._map = LocalMap(model, klt, limits.keyframes)
         self._frame_to_map = FrameToMap(self._map, model, klt)
@@ -74,6 +77,8 @@ class VisualOdometry:
         self._resets = 0
         self._most_inliers = 0  # since the last keyframe
         self._frames_since_keyframe = 0
+        # The frame that started the map, if it was exposed at several times, until the velocity is known.
+        self._unmoved: StereoFrame | None = None
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
@@ -85,6 +90,8 @@ class VisualOdometry:
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10).
         T_predicted = self._T_odom_rect @ self._filter.predict(min(dt_s, self._limits.max_gap_s))
 
+        exposure = self._exposure(frame, Motion(*self._filter.motion(dt_s)))
+
         # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
@@ -95,10 +102,10 @@ class VisualOdometry:
 
             # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
             #    on the bearings in both panoramas (IV.C, in place of eq. 9).
-            coarse = self._frame_to_map.estimate(frame, tracks, T_guess)
+            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
 
             # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-            refined = self._frame_to_map.refine(frame, coarse) if coarse else None
+            refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
             estimate = _with_more_inliers(estimate, refined)
             if self._is_good(estimate):
                 break
@@ -110,11 +117,59 @@ class VisualOdometry:
         if estimate is None or not self._is_plausible(estimate, dt_s):
             return self._refuse(frame, usable, T_predicted, dt_s)
 
+        if self._unmoved is not None:
+            estimate = self._start_again(frame, usable, estimate, dt_s)
+
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
-        new = self._update_map(frame, usable, estimate)
+        new = self._update_map(frame, usable, estimate, self._exposure(frame, Motion(*self._filter.motion(dt_s))))
         features = Features(estimate.pixels, estimate.rejected, new)
         return self._result(estimate.tracked, estimate.inliers, features)
+
+    def _exposure(self, frame: StereoFrame, motion: Motion | None) -> Exposure | None:
+        """Return the exposure of a frame, None where one instant is shown; motion: None for that of the filter."""
+        if frame.times is None:
+            return None
+        return Exposure(frame.times, motion or Motion(*self._filter.motion(0.0)), self._model)
+
+    def _refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None, dt_s: float
+                ) -> PoseEstimate | None:
+        """Refine a pose; where the velocity matters, once more with the velocity that the pose implies."""
+        refined = self._frame_to_map.refine(frame, coarse, exposure)
+        if refined is None or exposure is None or not 0 < dt_s <= self._limits.max_gap_s:
+            return refined
+        T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
+        if self._is_sudden(T_prev_curr, dt_s):
+            return refined
+        motion = Motion(*self._filter.after(T_prev_curr, refined.covariance, dt_s))
+        exposure = self._exposure(frame, motion)
+        coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
+        return self._frame_to_map.refine(frame, coarse, exposure)
+
+    def _is_sudden(self, T_prev_curr: Array, dt_s: float) -> bool:
+        """True if a motion differs so much from the predicted one that it tells no velocity during the exposures."""
+        change = se3.log(T_prev_curr) - self._filter.velocity * dt_s
+        return bool(np.linalg.norm(change[3:]) > SUDDEN_RAD)
+
+    def _start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float) -> PoseEstimate:
+        """Start the map again at its first frame, whose motion the second one shows; return the second one's pose.
+
+        The depths of the first frame were measured as if it stood still, so the motion is wrong by a few per cent of
+        what happens between two exposures: each round reduces the error so much.
+        """
+        first, self._unmoved = self._unmoved, None
+        for _ in range(START_ROUNDS if first is not None and 0 < dt_s <= self._limits.max_gap_s else 0):
+            assert first is not None
+            T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
+            motion = Motion(*self._filter.after(T_prev_curr, estimate.covariance, dt_s))
+            self._map.clear()
+            self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
+            exposure = self._exposure(frame, motion)
+            tracks = self._map.track(frame.lower, estimate.T_odom_rect)
+            coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
+            again = self._refine(frame, coarse, exposure, dt_s) if coarse else None
+            estimate = again if again is not None else replace(estimate, landmarks=estimate.landmarks[:0])
+        return estimate
 
     def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[Array]:
         """Yield guesses of the pose: the prediction; then, if it was not good, the best yaw hypothesis there (IV.F).
@@ -158,7 +213,10 @@ class VisualOdometry:
             self._filter.reset()
         else:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
+            is_sudden = frame.times is not None and self._is_sudden(T_prev_curr, dt_s)
             self._filter.update(T_prev_curr, estimate.covariance, dt_s)
+            if is_sudden:
+                self._filter.reset()
         self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
@@ -181,12 +239,13 @@ class VisualOdometry:
 
     def _start_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks."""
-        new = self._add_keyframe(frame, usable, np.zeros((0, 2)))
+        new = self._add_keyframe(frame, usable, np.zeros((0, 2)), self._exposure(frame, None))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._advance(FrameFacts(FrameOutcome.NOT_STARTED, dt_s))
             return self._result(0, 0)
         self._previous = frame.lower
+        self._unmoved = frame if frame.times is not None else None
         self._advance(FrameFacts(FrameOutcome.STARTED, dt_s))
         return self._result(len(self._map), len(self._map), Features(new=new))
 
@@ -198,7 +257,8 @@ class VisualOdometry:
         if after_s > before_s:
             self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
 
-    def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate) -> Array:
+    def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure | None
+                    ) -> Array:
         """Remove lost landmarks and add a keyframe where too few are left; return the pixels (N, 2) of new ones."""
         limits, store, inliers = self._limits, self._map.store, len(estimate.landmarks)
         ids = store.table.id[estimate.landmarks]
@@ -206,35 +266,43 @@ class VisualOdometry:
         store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
-            return self._add_keyframe(frame, usable, np.zeros((0, 2)))
+            return self._add_keyframe(frame, usable, np.zeros((0, 2)), exposure)
         self._most_inliers = max(self._most_inliers, inliers)
         self._frames_since_keyframe += 1
         sparse = inliers < limits.refresh * self._wanted() and self._frames_since_keyframe >= limits.sparse_every
         if sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers:
-            new = self._add_keyframe(frame, usable, estimate.pixels)
+            new = self._add_keyframe(frame, usable, estimate.pixels, exposure)
             store.add_observations(frame.seq, ids, estimate.views)
             return new
         return np.zeros((0, 2))
 
-    def _add_keyframe(self, frame: StereoFrame, usable: Flags, known: Array) -> Array:
+    def _add_keyframe(self, frame: StereoFrame, usable: Flags, known: Array, exposure: Exposure | None) -> Array:
         """Add a keyframe with new landmarks between the known ones (N, 2); return the pixels (M, 2) of the new ones.
 
         They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
         """
         free = clear_around(usable, known, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._wanted() - len(known))
-        guess = points[:, 1] + nearby_disparity(frame.disparity, points)
+        guess = np.column_stack([points[:, 0], points[:, 1] + nearby_disparity(frame.disparity, points)])
+        spread_px: Array | float = 0.0
+        if exposure:
+            guess[:, 0], spread_px = exposure.upper_columns(points, guess[:, 1])
         pair = frame.lower, frame.upper
-        rows, variance = align_rows(pair, points, rows_in_upper(pair, points, guess, self._stereo_klt))
+        near = pixels_in_upper(pair, points, guess, self._stereo_klt, spread_px)
+        rows, variance = align_rows(pair, points, near)
         located = np.isfinite(rows)
         keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._covariance)
         slopes = disparity_slopes(frame.disparity, points[located], (rows - points[:, 1])[located])
-        noise = view_noise(np.zeros((len(points), 2, 2)), variance)
-        self._map.add_keyframe(keyframe, np.column_stack([points, rows])[located], slopes, noise[located])
+        points, rows, noise = points[located], rows[located], view_noise(np.zeros((2, 2)), variance[located])
+        views = np.column_stack([points, rows])
+        if exposure:
+            views, by_motion = exposure.corrected(points, rows)
+            noise += by_motion
+        self._map.add_keyframe(keyframe, views, slopes, noise, points)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames_since_keyframe = 0
-        return points[located]
+        return points
 
     def _wanted(self) -> int:
         """Return the number of landmarks wanted in a keyframe."""

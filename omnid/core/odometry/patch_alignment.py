@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
 
 HALF_BASE_PX = 4.0  # half the base of the difference quotients that give the warp
-CROSS_PX = 1.0  # largest horizontal difference of a patch in the two panoramas
+CROSS_PX = 0.5  # by which a patch may move sideways in the upper panorama from where it was tracked to
 MAX_STRETCH, MIN_AREA = 2.0, 0.25  # of a warp: largest element and smallest determinant
 SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the disparity is measured
 SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface
@@ -94,18 +94,18 @@ def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: I
     return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
 
 
-def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, rows: Array) -> tuple[Array, Array]:
-    """Align patches of the lower panorama at points (N, 2) with the upper one near rows (N,), NaN where unknown.
+def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near: Array) -> tuple[Array, Array]:
+    """Align patches of the lower panorama at points (N, 2) with the upper one near pixels (N, 2), NaN where unknown.
 
     Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by the noise. Gain and offset of
     the two cameras may differ.
     """
-    known = np.flatnonzero(np.isfinite(rows))
-    predicted = np.column_stack([points[known, 0], rows[known]])
+    known = np.flatnonzero(np.isfinite(near).all(axis=1))
+    predicted = near[known]
     upright = np.broadcast_to(np.eye(2), (len(known), 2, 2))
     templates = warped_templates(pair[0], points[known], upright, predicted)
     found = align(templates, pair[1], predicted, np.zeros(len(known), np.intp))
-    fits = found.found & (np.abs(found.pixels[:, 0] - points[known, 0]) < CROSS_PX)
+    fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < CROSS_PX)
     aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
     aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
     return aligned, variance
@@ -114,9 +114,9 @@ def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, rows:
 def view_noise(covariance: Array, row_variance: Array) -> Array:
     """Return covariances (N, 3, 3) [px^2] of views whose upper row is the lower row plus a disparity.
 
-    covariance (N, 2, 2) of the pixels in the lower panorama, row_variance (N,) of the disparities.
+    covariance (N, 2, 2) or (2, 2) of the pixels in the lower panorama, row_variance (N,) of the disparities.
     """
-    noise = covariance[:, [0, 1, 1]][:, :, [0, 1, 1]]
+    noise = np.broadcast_to(covariance, (len(row_variance), 2, 2))[:, [0, 1, 1]][:, :, [0, 1, 1]]
     noise[:, 2, 2] += row_variance
     return noise
 

@@ -24,6 +24,23 @@ DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks
 
 
 @dataclass(frozen=True, slots=True)
+class SharedError:
+    """An unknown error of K components that all N views have in common, such as that of a velocity."""
+
+    derivatives: Array  # (N, 3, K) px: of the true views by the error
+    covariance: Array  # (K, K)
+
+    @staticmethod
+    def none(count: int) -> SharedError:
+        """Return the error of no components for count views."""
+        return SharedError(np.zeros((count, 3, 0)), np.zeros((0, 0)))
+
+    def of(self, chosen: Flags) -> SharedError:
+        """Return the error of the views that are flagged (N,)."""
+        return SharedError(self.derivatives[chosen], self.covariance)
+
+
+@dataclass(frozen=True, slots=True)
 class StereoModel:
     """Projection of points into views: the panorama's cylinder, the baseline, and the noise of a tracked corner."""
 
@@ -116,43 +133,60 @@ class GaussNewtonResult:
     T: Array
     covariance: Array
     squared: Array  # (N,) squared Mahalanobis distance
+    shared: Array  # (K,) the shared error that was found
+    shared_covariance: Array  # (K, K)
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS) -> GaussNewtonResult:
+                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS, shared: SharedError | None = None
+                 ) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
-    corner and landmark; noise as in `whitening`. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is
-    biased short.
+    corner and landmark; noise as in `whitening`. A shared error is estimated along with the motion. It replaces eq. (9)
+    of Dang et al. 2012, which measures in 3-D and is biased short.
     """
     W = whitening(landmarks, covariance, views, T, model, noise)
     clean = np.where(np.isnan(views), 0.0, views)
-    H, g, squared = _normal_equations(landmarks, clean, T, W, model)
+    if shared is None:
+        shared = SharedError.none(len(views))
+    error = np.zeros(len(shared.covariance))
+    H, g, squared = _normal_equations(landmarks, clean, T, W, model, shared, error)
     for _ in range(steps):
         step = np.linalg.solve(H, g)
-        T = se3.exp(step) @ T
-        if np.abs(step).max() < CONVERGED:
+        T, error = se3.exp(step[:6]) @ T, error + step[6:]
+        if np.abs(step[:6]).max() < CONVERGED:
             break  # the last equations hold here as well
-        H, g, squared = _normal_equations(landmarks, clean, T, W, model)
-    return GaussNewtonResult(T, np.asarray(np.linalg.inv(H), float), squared)
+        H, g, squared = _normal_equations(landmarks, clean, T, W, model, shared, error)
+    spread = np.asarray(np.linalg.inv(H), float)
+    return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])
 
 
-def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel
-                      ) -> tuple[Array, Array, Array]:
-    """Return H (6, 6), g (6,) of H step = g for a step [t; r] on the left of T, and the squared errors (N,)."""
+def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel, shared: SharedError,
+                      error: Array) -> tuple[Array, Array, Array]:
+    """Return H, g of H [step; change] = g, and the squared errors (N,) of the views.
+
+    step: [t; r] on the left of T; change (K,): of the shared error (K,).
+    """
     points = se3.apply(T, landmarks)
-    error = (W @ model.residual(points, views)[:, :, None])[:, :, 0]
-    squared = (error**2).sum(axis=1)
+    residual = (W @ model.residual(points, views + shared.derivatives @ error)[:, :, None])[:, :, 0]
+    squared = (residual**2).sum(axis=1)
     weight = 1 / (1 + squared / KERNEL_WIDTH**2)
     by_point = W @ view_jacobian(points, model.cylinder, model.baseline_m)
     # The rotation's part is points x rows of by_point.
     x, y, z = points.T[:, :, None]
-    J = np.empty((len(points), 3, 6))
+    J = np.empty((len(points), 3, 6 + len(error)))
     J[:, :, :3] = by_point
     J[:, :, 3] = y * by_point[:, :, 2] - z * by_point[:, :, 1]
     J[:, :, 4] = z * by_point[:, :, 0] - x * by_point[:, :, 2]
     J[:, :, 5] = x * by_point[:, :, 1] - y * by_point[:, :, 0]
-    flat = J.reshape(-1, 6)
+    if len(error):
+        J[:, :, 6:] = -W @ shared.derivatives
+    flat = J.reshape(-1, J.shape[2])
     weighted = flat * np.repeat(weight, 3)[:, None]
-    return weighted.T @ flat + DAMPING * np.eye(6), weighted.T @ error.ravel(), squared
+    H, g = weighted.T @ flat + DAMPING * np.eye(J.shape[2]), weighted.T @ residual.ravel()
+    if len(error):
+        prior = np.linalg.inv(shared.covariance)
+        H[6:, 6:] += prior
+        g[6:] -= prior @ error
+    return H, g, squared

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.tracking import PaddedPanorama
 
 
@@ -20,6 +21,7 @@ class StereoFrame:
     upper: PaddedPanorama
     disparities: NDArray[np.float32] | Callable[[], NDArray[np.float32]]  # the image, or the function that returns it
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
+    times: ExposureTimes | None = None  # None: all pixels are exposed at the stamp
 
     @property
     def disparity(self) -> NDArray[np.float32]:

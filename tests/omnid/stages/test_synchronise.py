@@ -173,3 +173,33 @@ def test_finds_the_drift_between_the_cameras(pair: Synchronise, drift_ns: int) -
         made(pair, shot("lower", index), shot("upper", index, index * drift_ns + noise_ns))
     expected_ns = drift_ns * (300 - 50 - 25)  # the slow mean lags by 50 images, the first one by 25
     assert pair.skew.drift_ns == pytest.approx(expected_ns, abs=0.6 * MS)
+
+
+@pytest.fixture
+def free(rig: Rig) -> Synchronise:
+    """Cameras that run freely: the default tolerance."""
+    return Synchronise(rig, PairConfig(repeated_images="use"))
+
+
+@pytest.mark.parametrize("skew_ms", [0.0, 15.0, -15.0, 16.6, 3.0])
+def test_free_running_cameras_make_a_pair_of_every_image(free: Synchronise, skew_ms: float) -> None:
+    """Also of the first ones, which wait until the period is known."""
+    taken = [shot(c, index, round(skew_ms * MS) * (c == "upper")) for index in range(60) for c in ("lower", "upper")]
+    found = made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))
+    assert [p.stamp_ns for p in found] == [shot("lower", index).stamp_ns for index in range(60)]
+    assert unpaired(free) == (0, 0) and free.tolerance_ms == pytest.approx(PERIOD_NS * 0.5e-6, abs=0.01)
+    assert all(p.skew_s == pytest.approx(1e-3 * skew_ms, abs=1e-6) for p in found[10:])
+
+
+def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchronise) -> None:
+    taken = [shot(c, index, 14 * MS * (c == "upper")) for index in range(60) for c in ("lower", "upper")
+             if (c, index) not in (("lower", 20), ("upper", 31))]
+    found = made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))
+    free.finish()
+    assert len(found) == 58 and unpaired(free) == (1, 1)
+    assert all(p.skew_s == pytest.approx(0.014, abs=1e-6) for p in found)
+
+
+def test_a_slower_camera_decides_how_many_pairs_there_are(free: Synchronise) -> None:
+    taken = [shot("lower", index) for index in range(90)] + [shot("upper", index, 12 * MS) for index in range(0, 90, 3)]
+    assert len(made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))) == 30

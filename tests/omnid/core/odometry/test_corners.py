@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, rows_in_upper
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
 from tests.omnid.core.scenery import texture, turned, wrapped
 
@@ -93,6 +94,30 @@ def test_refuses_a_match_in_another_column_or_above_the_point() -> None:
     )
     above = wrapped(np.roll(lower, -6, axis=0))
     assert np.isnan(rows_in_upper((wrapped(lower), above), points, points[:, 1] - 6, KltSettings(levels=1))).all()
+
+
+def rows_in_upper(
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: NDArray[np.float64], guess: NDArray[np.float64],
+    klt: KltSettings,
+) -> NDArray[np.float64]:
+    """Rows (N,) where the guessed rows are in the columns of the points."""
+    return pixels_in_upper(pair, points, np.column_stack([points[:, 0], guess]), klt)[:, 1]
+
+
+def test_a_match_may_lie_aside_as_far_as_the_motion_may_have_moved_it() -> None:
+    lower = texture(3)
+    upper = wrapped(np.roll(np.roll(lower, 9, axis=0), 4, axis=1))
+    points = corners(wrapped(lower), np.ones(lower.shape, bool), 60)
+    points = points[(points[:, 1] > 20) & (points[:, 1] < 90)]
+    guess = points + np.array([2.0, 9.0])
+    pair, klt = (wrapped(lower), upper), KltSettings(levels=1)
+    assert np.isnan(pixels_in_upper(pair, points, guess, klt)).mean() > 0.9
+    found = pixels_in_upper(pair, points, guess, klt, np.full(len(points), 2.0))
+    known = np.isfinite(found[:, 0])
+    assert known.mean() > 0.9
+    aside = (found - points)[known] - [4.0, 9.0]
+    aside[:, 0] = (aside[:, 0] + 240) % 480 - 240
+    assert np.median(np.abs(aside)) < 0.05
 
 
 def test_noise_is_no_corner() -> None:

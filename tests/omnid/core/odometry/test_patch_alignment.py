@@ -120,11 +120,11 @@ def test_rows_in_the_upper_panorama_are_found_where_its_exposure_differs() -> No
     lower = texture(5)
     upper = np.clip(np.roll(lower, 7, axis=0) * 0.6 + 20, 0, 255).astype(np.uint8)
     points = np.array([[60.0, 40.0], [200.0, 60.0], [330.0, 52.0], [410.0, 70.0]])
-    guess = points[:, 1] + [7.6, 6.5, 7.3, np.nan]
+    guess = points + np.array([[0, 7.6], [0, 6.5], [0, 7.3], [0, np.nan]])
     rows, variance = align_rows((wrapped(lower), wrapped(upper)), points, guess)
     np.testing.assert_allclose(rows[:3], points[:3, 1] + 7, atol=0.02)
     assert np.isnan(rows[3]) and (variance[:3] > 0).all()
-    aside = wrapped(np.roll(upper, 2, axis=1))
+    aside = wrapped(np.roll(upper, 1, axis=1))
     assert np.isnan(align_rows((wrapped(lower), aside), points, guess)[0]).all()
 
 

@@ -1,0 +1,132 @@
+"""Views at one instant from exposures at several: cameras that are not synchronised, and rolling shutters.
+
+A pixel that is exposed tau after the pair's stamp shows a point where it is seen from T_odom_rect exp(V tau), with the
+velocity V of the rectified frame. The difference between that and the view at the stamp is added to what was measured,
+so that all else works with views of one instant. Its error is that of V, which is passed on as covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+
+Array = NDArray[np.float64]
+
+ROUNDS = 3  # of triangulation and correction: each reduces the error by the ratio of motion to distance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposureTimes:
+    """Times of exposure of a pair's panorama pixels, s after the stamp of the pair."""
+
+    skew_s: float = 0.0  # of the upper image's first row
+    lower_rows_s: NDArray[np.float32] | None = None  # (H, W) of each pixel after the first image row; None: at once
+    upper_rows_s: NDArray[np.float32] | None = None
+
+    def lower(self, pixels: Array) -> Array:
+        """Return the times (N,) of pixels (N, 2) of the lower panorama."""
+        return _read(self.lower_rows_s, pixels)
+
+    def upper(self, pixels: Array) -> Array:
+        """Return the times (N,) of pixels (N, 2) of the upper panorama."""
+        return self.skew_s + _read(self.upper_rows_s, pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Velocity [m/s; rad/s] of the rectified frame in its own axes, with its covariance (6, 6)."""
+
+    twist: Array  # (6,)
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class ViewShift:
+    """Differences between the views of N points at the stamp and the views when they were exposed."""
+
+    lower: Array  # (N, 2) px: column, row
+    upper: Array  # (N, 2) px
+    by_motion: Array  # (N, 4, 6) derivatives by the velocity: of lower column and row, upper row and column
+
+    def noise(self, motion: Motion) -> Array:
+        """Return the covariance (N, 3, 3) [px^2] of corrected views by the uncertainty of the velocity."""
+        J = self.by_motion[:, :3]
+        return np.asarray(J @ motion.covariance @ np.swapaxes(J, 1, 2))
+
+    def column_sigma(self, motion: Motion) -> Array:
+        """Return the standard deviation (N,) [px] of the upper column by the uncertainty of the velocity."""
+        J = self.by_motion[:, 3]
+        return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", J, motion.covariance, J)))
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Times of exposure of a frame and the motion during it."""
+
+    times: ExposureTimes
+    motion: Motion
+    model: StereoModel
+
+    def shift(self, points: Array) -> ViewShift:
+        """Return the shifts of points (N, 3) [m] in the rectified frame at the stamp."""
+        cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
+        seen = view(points, cylinder, baseline_m)
+        lower_s, upper_s = self.times.lower(seen[:, :2]), self.times.upper(seen[:, [0, 2]])
+        in_lower, in_upper = (view(self._later(points, s), cylinder, baseline_m) for s in (lower_s, upper_s))
+        lower, upper = seen[:, :2] - in_lower[:, :2], seen[:, [0, 2]] - in_upper[:, [0, 2]]
+        lower[:, 0], upper[:, 0] = cylinder.wrap(lower[:, 0]), cylinder.wrap(upper[:, 0])
+        of_point = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(points)], axis=2)
+        J = (view_jacobian(points, cylinder, baseline_m) @ of_point)[:, [0, 1, 2, 0]]
+        times_s = np.column_stack([lower_s, lower_s, upper_s, upper_s])
+        return ViewShift(lower, upper, times_s[:, :, None] * J)
+
+    def _later(self, points: Array, times_s: Array) -> Array:
+        """Return points (N, 3) in the rectified frame at times (N,) after the stamp: exp(-V tau) p to second order."""
+        turn = self.motion.twist[3:]
+        rate, tau = self.motion.twist[:3] + np.cross(turn, points), times_s[:, None]
+        return np.asarray(points - tau * rate + tau**2 / 2 * np.cross(turn, rate))
+
+    def upper_columns(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
+        """Return the columns (N,) in the upper panorama of pixels (N, 2) at about upper rows (N,), and their spread.
+
+        The spread (N,) [px] is twice the standard deviation by the uncertainty of the velocity. NaN where the views
+        cannot be triangulated.
+        """
+        views, _ = self.corrected(pixels, rows)
+        points = triangulate(views, self.model.cylinder, self.model.baseline_m)
+        known = np.isfinite(points).all(axis=1)
+        columns, spread_px = np.full((2, len(pixels)), np.nan)
+        shift = self.shift(points[known])
+        columns[known], spread_px[known] = views[known, 0] - shift.upper[:, 0], 2 * shift.column_sigma(self.motion)
+        return columns, spread_px
+
+    def corrected(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
+        """Return views (N, 3) at the stamp of pixels (N, 2) and upper rows (N,) as seen, and their noise (N, 3, 3).
+
+        The shift depends on the depth, and the depth on the corrected view: so both are computed in turn.
+        """
+        views = np.column_stack([pixels, rows])
+        noise = np.zeros((len(views), 3, 3))
+        for _ in range(ROUNDS):
+            points = triangulate(views, self.model.cylinder, self.model.baseline_m)
+            known = np.isfinite(points).all(axis=1)
+            shift = self.shift(points[known])
+            views = np.column_stack([pixels, rows])
+            views[known] += np.column_stack([shift.lower, shift.upper[:, 1]])
+            noise[known] = shift.noise(self.motion)
+        return views, noise
+
+
+def _read(table: NDArray[np.float32] | None, pixels: Array) -> Array:
+    """Return the values (N,) of a table (H, W) at the nearest of pixels (N, 2); zeros without a table."""
+    if table is None:
+        return np.zeros(len(pixels))
+    columns = np.rint(pixels[:, 0]).astype(np.intp) % table.shape[1]
+    rows = np.clip(np.rint(pixels[:, 1]), 0, len(table) - 1).astype(np.intp)
+    return np.asarray(table[rows, columns], float)

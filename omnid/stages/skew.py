@@ -1,0 +1,63 @@
+"""Skew between the two cameras: its statistics, and the time between the exposures that it tells."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+SKEW_GAIN: Final = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
+RECENT: Final = 30  # pairs to which a line is fitted
+MIN_FITTED: Final = 8  # of fewer the median is taken
+JUMP_NS: Final = 5_000_000  # from the line: an image was lost, or a camera started again
+# Cameras that are triggered together have stamps that scatter about each other. Their mean difference is 0 unless it is
+# larger than twice the scatter and than the least that stamps can tell.
+SCATTERS: Final = 2.0
+LEAST_NS, LEAST_AT_START_NS = 1_000_000, 3_000_000
+
+
+class Skew:
+    """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
+
+    def __init__(self) -> None:
+        self.mean_ns = math.nan  # running mean
+        self.max_ns = 0  # largest absolute value
+        self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
+        self._pairs = 0
+        self._recent: deque[int] = deque(maxlen=RECENT)
+        self.exposure_ns = 0.0  # from the lower to the upper exposure of the newest pair
+
+    def add(self, skew_ns: int) -> None:
+        """Add the skew of a pair."""
+        self._pairs += 1
+        gain = max(SKEW_GAIN, 1 / self._pairs)
+        self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
+        self.max_ns = max(self.max_ns, abs(skew_ns))
+        if self._pairs == round(1 / SKEW_GAIN):
+            self._settled_ns = self.mean_ns
+        self.exposure_ns = self._between_exposures(skew_ns)
+
+    @property
+    def drift_ns(self) -> float:
+        """Change of the running mean since it had settled; NaN before."""
+        return self.mean_ns - self._settled_ns
+
+    def _between_exposures(self, skew_ns: int) -> float:
+        """Return the skew without the scatter of the stamps; 0 where it cannot be told from simultaneous exposures.
+
+        Free-running cameras drift against each other, so a line is fitted to the recent skews.
+        """
+        recent = self._recent
+        if recent and abs(skew_ns - recent[-1]) > JUMP_NS:
+            recent.clear()
+        recent.append(skew_ns)
+        if len(recent) < MIN_FITTED:
+            median = float(np.median(recent))
+            return median if abs(median) > LEAST_AT_START_NS else 0.0
+        index = np.arange(len(recent), dtype=float)
+        slope, start = np.polyfit(index, np.array(recent, float), 1)
+        line = start + slope * index
+        scatter = math.sqrt(float(((np.array(recent) - line) ** 2).sum()) / (len(recent) - 2))
+        return float(line[-1]) if abs(line[-1]) > max(SCATTERS * scatter, LEAST_NS) else 0.0
