@@ -39,7 +39,7 @@ class ExposureTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class RigVelocity:
     """Velocity [m/s; rad/s] of the rectified frame in its own axes, with its covariance (6, 6)."""
 
     twist: Array  # (6,)
@@ -54,12 +54,12 @@ class ViewShift:
     upper: Array  # (N, 2) px
     by_motion: Array  # (N, 4, 6) derivatives by the velocity: of lower column and row, upper row and column
 
-    def noise(self, motion: Motion) -> Array:
+    def noise(self, motion: RigVelocity) -> Array:
         """Return the covariance (N, 3, 3) [px^2] of corrected views by the uncertainty of the velocity."""
         J = self.by_motion[:, :3]
         return np.asarray(J @ motion.covariance @ np.swapaxes(J, 1, 2))
 
-    def column_sigma(self, motion: Motion) -> Array:
+    def column_sigma(self, motion: RigVelocity) -> Array:
         """Return the standard deviation (N,) [px] of the upper column by the uncertainty of the velocity."""
         J = self.by_motion[:, 3]
         return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", J, motion.covariance, J)))
@@ -70,7 +70,7 @@ class Exposure:
     """Times of exposure of a frame and the motion during it."""
 
     times: ExposureTimes
-    motion: Motion
+    motion: RigVelocity
     model: StereoModel
 
     def shift(self, points: Array) -> ViewShift:

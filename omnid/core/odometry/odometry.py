@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure, Motion
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
@@ -90,7 +90,7 @@ class VisualOdometry:
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10).
         T_predicted = self._T_odom_rect @ self._filter.predict(min(dt_s, self._limits.max_gap_s))
 
-        exposure = self._exposure(frame, Motion(*self._filter.motion(dt_s)))
+        exposure = self._exposure(frame, RigVelocity(*self._filter.motion(dt_s)))
 
         # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
         after_refusal = self._status.refused_frames > 0
@@ -122,15 +122,15 @@ class VisualOdometry:
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
-        new = self._update_map(frame, usable, estimate, self._exposure(frame, Motion(*self._filter.motion(dt_s))))
+        new = self._update_map(frame, usable, estimate, self._exposure(frame, RigVelocity(*self._filter.motion(dt_s))))
         features = Features(estimate.pixels, estimate.rejected, new)
         return self._result(estimate.tracked, estimate.inliers, features)
 
-    def _exposure(self, frame: StereoFrame, motion: Motion | None) -> Exposure | None:
+    def _exposure(self, frame: StereoFrame, motion: RigVelocity | None) -> Exposure | None:
         """Return the exposure of a frame, None where one instant is shown; motion: None for that of the filter."""
         if frame.times is None:
             return None
-        return Exposure(frame.times, motion or Motion(*self._filter.motion(0.0)), self._model)
+        return Exposure(frame.times, motion or RigVelocity(*self._filter.motion(0.0)), self._model)
 
     def _refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None, dt_s: float
                 ) -> PoseEstimate | None:
@@ -141,7 +141,7 @@ class VisualOdometry:
         T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
         if self._is_sudden(T_prev_curr, dt_s):
             return refined
-        motion = Motion(*self._filter.after(T_prev_curr, refined.covariance, dt_s))
+        motion = RigVelocity(*self._filter.after(T_prev_curr, refined.covariance, dt_s))
         exposure = self._exposure(frame, motion)
         coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
         return self._frame_to_map.refine(frame, coarse, exposure)
@@ -161,7 +161,7 @@ class VisualOdometry:
         for _ in range(START_ROUNDS if first is not None and 0 < dt_s <= self._limits.max_gap_s else 0):
             assert first is not None
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            motion = Motion(*self._filter.after(T_prev_curr, estimate.covariance, dt_s))
+            motion = RigVelocity(*self._filter.after(T_prev_curr, estimate.covariance, dt_s))
             self._map.clear()
             self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
             exposure = self._exposure(frame, motion)

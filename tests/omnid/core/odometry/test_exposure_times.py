@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, Motion
+from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
 from omnid.core.odometry.pose_estimation import SharedError, StereoModel, gauss_newton
 from omnid.core.stereo.triangulation import triangulate, view
 
@@ -55,7 +55,7 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: ExposureTimes) -
     points = world()
     truth = view(points, MODEL.cylinder, MODEL.baseline_m)
     lower, upper = seen(points, times, TWIST)
-    exposure = Exposure(times, Motion(TWIST, SIGMA**2), MODEL)
+    exposure = Exposure(times, RigVelocity(TWIST, SIGMA**2), MODEL)
     shift = exposure.shift(points)
     for raw, moved, expected in ((lower, shift.lower, truth[:, :2]), (upper, shift.upper, truth[:, [0, 2]])):
         error = expected - raw - moved
@@ -73,10 +73,10 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: ExposureTimes) -
 
 def test_the_derivative_is_that_of_the_shift() -> None:
     points, times = world(20), TIMES[3]
-    shift = Exposure(times, Motion(TWIST, SIGMA**2), MODEL).shift(points)
+    shift = Exposure(times, RigVelocity(TWIST, SIGMA**2), MODEL).shift(points)
     for k in range(6):
         step = 1e-3 * np.eye(6)[k]
-        more, less = (Exposure(times, Motion(TWIST + s * step, SIGMA**2), MODEL).shift(points) for s in (1, -1))
+        more, less = (Exposure(times, RigVelocity(TWIST + s * step, SIGMA**2), MODEL).shift(points) for s in (1, -1))
         numeric = np.column_stack([more.lower - less.lower, (more.upper - less.upper)[:, ::-1]]) / 2e-3
         np.testing.assert_allclose(shift.by_motion[:, :, k], numeric, atol=0.1 * np.abs(numeric).max() + 1e-3)
 
@@ -88,7 +88,7 @@ def test_the_noise_of_the_views_is_that_of_an_unknown_velocity() -> None:
     lower, upper = seen(points, times, TWIST)
     rng, z2 = np.random.default_rng(1), []
     for _ in range(40):
-        believed = Motion(TWIST + SIGMA @ rng.standard_normal(6), SIGMA**2)
+        believed = RigVelocity(TWIST + SIGMA @ rng.standard_normal(6), SIGMA**2)
         views, noise = Exposure(times, believed, MODEL).corrected(lower, upper[:, 1])
         z2.append((views - truth)[:, 2] ** 2 / noise[:, 2, 2])
     assert 0.7 < np.sqrt(np.mean(z2)) < 1.3
@@ -98,7 +98,7 @@ def test_velocity_and_pose_are_estimated_together() -> None:
     """The rows of a rolling shutter tell the velocity where the landmarks are known."""
     points, times = world(), TIMES[2]
     lower, upper = seen(points, times, TWIST)
-    believed = Motion(TWIST + np.array([0.05, -0.05, 0.02, 0.1, -0.1, 0.1]), SIGMA**2)
+    believed = RigVelocity(TWIST + np.array([0.05, -0.05, 0.02, 0.1, -0.1, 0.1]), SIGMA**2)
     shift = Exposure(times, believed, MODEL).shift(points)
     views = np.column_stack([lower + shift.lower, upper[:, 1] + shift.upper[:, 1]])
     shared = SharedError(shift.by_motion[:, :3], SIGMA**2)
@@ -111,7 +111,7 @@ def test_velocity_and_pose_are_estimated_together() -> None:
 
 
 def test_points_that_cannot_be_triangulated_stay_as_they_are() -> None:
-    exposure = Exposure(TIMES[0], Motion(TWIST, SIGMA**2), MODEL)
+    exposure = Exposure(TIMES[0], RigVelocity(TWIST, SIGMA**2), MODEL)
     pixels = np.array([[100.0, 50.0], [200.0, 60.0]])
     views, noise = exposure.corrected(pixels, np.array([48.0, np.nan]))  # diverging rays; not found
     assert not np.isfinite(triangulate(views, MODEL.cylinder, MODEL.baseline_m)).any()
