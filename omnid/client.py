@@ -53,6 +53,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 _QUERY_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.002
 _MAX_RETRY_S: Final = 0.5
+_MATCH_S: Final = 2.0
 _SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 
 
@@ -267,8 +268,12 @@ class Driver:
     def arm(self) -> int:
         """Ask the robot to arm; it refuses while a fault holds. Return the stamp, which its status repeats, ns.
 
-        Only commands that arrive after it move the wheels. See omnid.monitor.arming for a request with an answer.
+        Only commands that arrive after it move the wheels. It waits for a new connection to be complete, for at most
+        2 s: the request is sent once. See omnid.monitor.arming for one with an answer.
         """
+        deadline_s = time.monotonic() + _MATCH_S
+        while not self.connected and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
         stamp_ns = time.time_ns()
         self._put(ARM, codec.header_cdr(stamp_ns))
         return stamp_ns

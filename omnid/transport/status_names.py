@@ -64,12 +64,12 @@ class Key(StrEnum):
     EXPIRIES = "expiries"
     COMMANDS = "commands"
     STOPS = "stops"
-    SOURCE = "source"  # of the commands that drive, empty while none does
+    SOURCE = "source"  # of the commands that drive; no key while none does
     ARMED = "armed"  # 1 or 0
-    DISARMED_BY = "disarmed_by"  # the reason, empty while armed; DISARMED_BY_STOP after a stop
-    REMEDY = "remedy"  # the way to arm, empty where none is needed
+    DISARMED_BY = "disarmed_by"  # the reason, no key while armed; DISARMED_BY_STOP after a stop
+    REMEDY = "remedy"  # the way to arm, no key where none is needed
     ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
-    ARM_REFUSAL = "arm_refusal"  # the reason, empty where it was accepted
+    ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
 
 
 # Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.

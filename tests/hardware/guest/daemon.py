@@ -61,6 +61,8 @@ max_gap_s = 60.0
 port = "/dev/omnid/motor"
 rate_hz = 2.0
 watchdog_ms = 5000
+[controller]
+arming = "automatic"
 [controller.motion]
 check = false
 [controller.deadlines]
