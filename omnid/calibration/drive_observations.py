@@ -179,9 +179,9 @@ def _updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> I
     for pair in filter(None, map(pairing.process, reader.frames())):
         update = odometry.process(stereo.process(dewarp.process(pair)))
         states[update.state] += 1
+        if gate.exchanged:
+            raise OmnidError(f"{log}: {gate.warning}")
         yield update
-    if gate.exchanged:
-        raise OmnidError(f"{log}: {gate.warning}")
     if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
         raise OmnidError(f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
                          "rig; start from one that is nearer to the truth, or take a drive where there is more to see")
