@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
@@ -34,7 +35,7 @@ class Wheels:
     def __init__(self) -> None:
         self.commands: list[VelocityCommand] = []
         self.silent = self.expired = self.closed = False
-        self.heading_rad = math.nan
+        self.heading_rad, self.drive = math.nan, DifferentialDrive()
         self.fault, self.battery_v = 0, math.nan  # of its reports
         self.velocity_mps: float | None = 0.0  # of its reports; None: as commanded
 
@@ -43,8 +44,10 @@ class Wheels:
         if self.silent:
             raise DriverError("motor on /dev/x gave no answer")
         self.commands.append(command)
-        velocity_mps = command.velocity_mps if self.velocity_mps is None else self.velocity_mps
-        return MotorStatus(velocity_mps, self.heading_rad, 0.0, self.expired, self.fault, self.battery_v)
+        velocity_mps, yaw_rate_radps = self.drive.limited(command)
+        if self.velocity_mps is not None:
+            velocity_mps, yaw_rate_radps = self.velocity_mps, 0.0
+        return MotorStatus(velocity_mps, self.heading_rad, yaw_rate_radps, self.expired, self.fault, self.battery_v)
 
     def close(self) -> None:
         """Note that it was closed."""
@@ -52,14 +55,16 @@ class Wheels:
 
 
 class Bench:
-    """A controller on a clock that is set by hand."""
+    """A controller on a clock that is set by hand; drive: limits the commands, as the driver of a real base does."""
 
-    def __init__(self, settings: ControllerSettings = SETTINGS) -> None:
+    def __init__(self, settings: ControllerSettings = SETTINGS, drive: DifferentialDrive | None = None) -> None:
         self.now_ns = 10**12
         self.unattended = settings.arming == AUTOMATIC
         self.wheels = Wheels()
         self.lines: list[str] = []
-        self.controller = Controller(self.wheels, settings, PERIOD_S, self.lines.append, clock_ns=lambda: self.now_ns)
+        self.wheels.drive = drive or self.wheels.drive
+        self.controller = Controller(self.wheels, settings, PERIOD_S, self.lines.append, clock_ns=lambda: self.now_ns,
+                                     limited=drive.limited if drive else None)
         self.statistics = ControllerStatistics(StageStats("motor"))
 
     @property

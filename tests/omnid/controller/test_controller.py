@@ -11,6 +11,7 @@ from itertools import pairwise
 import pytest
 
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
@@ -394,3 +395,28 @@ def test_reports_each_tick(driving: Bench) -> None:
     tick = driving.controller.tick()
     assert tick.command is None and math.isnan(tick.to_wheel_s)
     assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.state.missed == 3
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool) -> None:
+    """A base whose wheels turn at 0.1 m/s at most is driven at 0.3 m/s; that is no fault if the limit is known."""
+    slow = DifferentialDrive(max_wheel_mps=0.1)
+    bench = Bench(UNATTENDED, slow if known else None)
+    bench.wheels.drive, bench.wheels.velocity_mps = slow, None
+    for _ in range(200):
+        bench.send_pose(velocity_mps=0.1, sigma_mps=0.01)
+        bench.send_setpoint()
+        bench.tick()
+    assert (not bench.controller.state.stops and not bench.controller.state.slowed) == known
+
+
+def test_a_base_that_follows_drives_for_a_minute(bench: Bench) -> None:
+    """Starts, turns, stops; the images show the motion of the commands 0.1 s before."""
+    bench.wheels.velocity_mps = None
+    for tick in range(1200):
+        done = bench.wheels.commands[-2:][0] if bench.wheels.commands else None
+        bench.send_pose(age_s=0.1, velocity_mps=done.velocity_mps if done else 0.0, sigma_mps=0.01,
+                        rate_radps=done.yaw_rate_radps if done else 0.0)
+        bench.send_setpoint(Setpoint(0.4 if tick % 200 < 120 else 0.0, None, 0.6 if tick % 90 < 30 else 0.0))
+        bench.tick()
+    assert not bench.controller.state.stops and not bench.controller.state.slowed and bench.lines == []
