@@ -5,7 +5,7 @@ plausible if it lies between the lowest and the highest speed of the last delay_
 and three standard deviations. The part of it beyond, integrated over time, is the unexplained motion in m and rad: some
 of it slows the base down, more stops it. While nothing is unexplained, the sum falls again.
 
-    commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.05 = 0.13 m/s: 0.13 m a second
+    commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.02 = 0.16 m/s: 0.16 m a second
 
 The seen speed is that along x of the base, so the rig's T_base_rig must be right. Wheels that are not driven may be
 pushed by hand: nothing is compared while the base is commanded to stand.
@@ -43,7 +43,7 @@ class MotionSettings:
     check: bool = knob(True, "compare the motion that is commanded, reported by the wheels and seen by the cameras")
     delay_s: float = knob(0.5, "time after which the base must follow a command, s", low=0.05, high=5)
     slip: float = knob(0.4, "plausible slip of the wheels, as a share of the speed", low=0, high=0.95)
-    speed_mps: float = knob(0.05, "difference in speed that means nothing, m/s", low=0, high=1)
+    speed_mps: float = knob(0.02, "difference in speed that means nothing, m/s", low=0, high=1)
     yaw_rate_radps: float = knob(0.15, "difference in yaw rate that means nothing, rad/s", low=0, high=3)
     slow_m: float = knob(0.05, "unexplained motion that slows the base down, m", low=0.001, high=10)
     stop_m: float = knob(0.15, "unexplained motion that stops the base, m", low=0.001, high=10)

@@ -17,7 +17,17 @@ from typing import Final, Literal
 
 from calib.panorama import Cylinder
 from omnid.core.odometry.tracking import PaddedPanorama
-from omnid.core.rig.rig_check import BROKEN_DEG, MIN_MATCHES, Flags, Matches, RigFinding, judge, match, together
+from omnid.core.rig.rig_check import (
+    BROKEN_DEG,
+    DRIFTED_DEG,
+    MIN_MATCHES,
+    Flags,
+    Matches,
+    RigFinding,
+    judge,
+    match,
+    together,
+)
 
 ROUND_PAIRS: Final = 2  # pairs of a round with enough matches
 MOST_ROUND_PAIRS: Final = 8  # pairs of a round where matches are few
@@ -92,8 +102,8 @@ def start_finding(straight: RigFinding, exchanged_matches: int) -> StartFinding:
         condition = "exchanged"
     elif straight.misfit_deg > BROKEN_DEG:
         condition = "turned"
-    elif straight.condition == "good":
-        condition = "fits"
-    elif straight.drift is not None:
+    elif straight.misfit_deg > DRIFTED_DEG:
         condition = "drifted"
+    elif straight.drift is not None:
+        condition = "fits"
     return StartFinding(condition, straight, exchanged_matches)
