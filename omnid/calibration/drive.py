@@ -86,7 +86,7 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     parameters = RigParameters.about(before, distortion, TIMES)
     steps = _straightened(logs[0], parameters, topics, config, report)
-    require_same_rig(parameters, steps)
+    require_same_rig(parameters, steps, tracked=False)
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
     scores = tuple(_score(found, drives, terms) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
@@ -162,11 +162,14 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
                  if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma))
 
 
-def require_same_rig(parameters: RigParameters, steps: Array) -> None:
-    """Raise OmnidError where the drive asks for another rig than the one given."""
+def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
+    """Raise OmnidError where the drive asks for another rig than the one given.
+
+    tracked: False before the motion is known: an upper camera that is exposed late then looks as if it stood aside.
+    """
     first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
     change = (steps * parameters.units)[first:len(parameters.rig_names)]
-    turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+    turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
     limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
     hint = "; is the rig that of these cameras? Nothing is written for another one: start from its own or nominal rig"
     if max(turn, lean) > limit:

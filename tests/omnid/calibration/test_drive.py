@@ -58,6 +58,13 @@ def test_the_same_rig_is_accepted(rig: Rig, changes: dict[str, float]) -> None:
     require_same_rig(*changed(rig, changes))
 
 
+def test_a_camera_aside_is_judged_after_tracking_only() -> None:
+    """A late exposure of the upper camera looks the same before the motion is known."""
+    require_same_rig(*changed(MEASURED, {"e_y": np.deg2rad(4)}), tracked=False)
+    with pytest.raises(OmnidError, match=r"3\.0 deg turned"):
+        require_same_rig(*changed(MEASURED, {"r_x": np.deg2rad(3)}), tracked=False)
+
+
 def test_nominal_rigs_are_recognised() -> None:
     assert is_nominal(nominal_rig(with_real_mirrors(MEASURED, 1)))
     assert not is_nominal(MEASURED)
