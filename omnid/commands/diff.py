@@ -7,6 +7,8 @@ import logging
 import math
 from pathlib import Path
 
+from omnid.commands.json_output import add_json, print_json
+
 AGREE, DIFFER = 0, 1
 
 
@@ -26,6 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--align", action="store_true", help="align B with A at their first common pose: for runs "
                         "that began at different images")
     parser.add_argument("--topic", metavar="TOPIC", help="the odometry topic of both, where there are several")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -39,13 +42,20 @@ def run(args: argparse.Namespace) -> int:
     limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
     a, b = (read_run_series(path, args.topic) for path in (args.a, args.b))
     if _identical(a.path, b.path):
+        if args.json:
+            print_json({"agree": True, "identical": True, "differences": []})
+            return AGREE
         print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
         return AGREE
     tolerance = Tolerance(limits[0] * 1e-3, math.radians(limits[1]), limits[2] * 1e-2)
     comparison = RunComparison(a, b, tolerance, align=args.align)
     for warning in (*a.warnings, *b.warnings):
         log_unlimited(logging.WARNING, warning)
-    print("\n".join(map(plain, comparison.lines())))
+    if args.json:
+        differences = comparison.differences
+        print_json({"agree": not differences, "identical": False, "differences": differences})
+    else:
+        print("\n".join(map(plain, comparison.lines())))
     return DIFFER if comparison.differences else AGREE
 
 

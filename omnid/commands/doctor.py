@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.json_output import add_json, print_json
 
 if TYPE_CHECKING:
     from omnid.config import Config
@@ -21,6 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `doctor` to the command line."""
     parser = subparsers.add_parser("doctor", help="check cameras, USB, motor, rig, clock, rights, bus and disk")
     add_settings(parser)
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -31,9 +33,13 @@ def run(args: argparse.Namespace) -> int:
 
     found: list[Finding] = []
     for finding in examine(load_config(args.config, args.overrides)):
-        print(finding, flush=True)
+        if not args.json:
+            print(finding, flush=True)
         found.append(finding)
-    print(summary(found))
+    if args.json:
+        print_json(found)
+    else:
+        print(summary(found))
     return int(any(finding.level == "error" for finding in found))
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from omnid.commands.json_output import add_json, print_json
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `eval` to the command line."""
@@ -14,6 +16,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         help="the same format, of the same rig frame in any world frame")
     parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS",
                         help="largest difference between the stamps of two poses; default %(default)s")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -22,5 +25,9 @@ def run(args: argparse.Namespace) -> int:
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
 
-    print(format_metrics(evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3)))
+    metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3)
+    if args.json:
+        print_json(metrics)
+    else:
+        print(format_metrics(metrics))
     return 0

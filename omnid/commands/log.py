@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from omnid.commands.json_output import add_json, print_json
+
 if TYPE_CHECKING:
     from drivers.logs.mcap_info import LogInfo
     from drivers.logs.mcap_recovery import Recovery
@@ -21,6 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
     info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
     info.add_argument("logs", type=Path, nargs="+", metavar="FILE", help=".mcap or .mcap.part")
+    add_json(info)
     info.set_defaults(run=run_info)
     recover = actions.add_parser("recover", help="write all readable messages of a cut or corrupt log to a new one")
     recover.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any program")
@@ -34,7 +37,7 @@ def run_info(args: argparse.Namespace) -> int:
     from drivers.errors import DriverError
     from drivers.logs.mcap_info import LogState, read_log_info
 
-    code = 0
+    code, logs = 0, []
     for number, path in enumerate(args.logs):
         try:
             found = read_log_info(path)
@@ -42,8 +45,12 @@ def run_info(args: argparse.Namespace) -> int:
             print(f"omnid: {_shown(str(error))}", file=sys.stderr)
             code = 2
             continue
-        print(*[""] * bool(number), *_described(found), sep="\n")
+        logs.append(found)
+        if not args.json:
+            print(*[""] * bool(number), *_described(found), sep="\n")
         code = max(code, int(found.state is LogState.BROKEN))
+    if args.json:
+        print_json(logs)
     return code
 
 

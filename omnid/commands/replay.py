@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.json_output import add_json, print_json
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -25,6 +26,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_outputs(parser)
     _add_computation(parser)
     add_settings(parser)
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -62,10 +64,10 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
-    return replay_and_print(args.log, config, options, quiet=args.quiet)
+    return replay_and_print(args.log, config, options, quiet=args.quiet, as_json=args.json)
 
 
-def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet: bool) -> int:
+def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet: bool, as_json: bool = False) -> int:
     """Replay a log, print its warnings and its summary, and return the exit code; quiet: without progress."""
     from dataclasses import replace
 
@@ -76,13 +78,13 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet
     try:
         result = run_log(log, config, options if quiet else replace(options, progress=Progress))
     except RunFailedError as error:
-        _print_result(error.result, options)
+        _print_result(error.result, options, as_json)
         raise
-    _print_result(result, options)
+    _print_result(result, options, as_json)
     return 128 + result.signal if result.signal else int(result.counters.no_pose)
 
 
-def _print_result(result: RunResult, options: ReplayOptions) -> None:
+def _print_result(result: RunResult, options: ReplayOptions, as_json: bool) -> None:
     """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
     from omnid.diagnostics.run_summary import run_summary
     from omnid.sinks.files import on_stdout
@@ -90,6 +92,10 @@ def _print_result(result: RunResult, options: ReplayOptions) -> None:
     for warning in result.warnings:
         print(f"omnid: warning: {warning}", file=sys.stderr)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
+    if as_json:
+        print_json({"counters": result.counters, "timings": dict(result.timings), "warnings": result.warnings,
+                    "signal": result.signal}, stream)
+        return
     print(run_summary(result.counters, result.timings.values()), file=stream)
 
 

@@ -51,18 +51,22 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01)
 
 
 def format_metrics(metrics: Metrics) -> str:
-    """Return the metrics as aligned lines for a terminal, in metres, per cent and degrees."""
+    """Return the metrics as aligned lines for a terminal, in m, mm, per cent and degrees."""
     m = metrics
     length = f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"
     heading = f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"
     rows = [
         ("associated poses", f"{m.pairs} ({m.coverage:.1%} of the truth)"),
         ("path length", length),
-        ("position error (ATE)", f"rmse {m.ate_rmse_m:.4f} m, max {m.ate_max_m:.4f} m, end {m.end_error_m:.4f} m"),
+        ("position error (ATE)", f"rmse {_mm(m.ate_rmse_m)}, max {_mm(m.ate_max_m)}, end {_mm(m.end_error_m)}"),
         ("heading error", heading),
-        ("step error (RPE)", f"rmse {m.rpe_translation_rmse_m:.5f} m, {_deg(m.rpe_rotation_rmse_rad)}"),
+        ("step error (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}"),
     ]
     return "\n".join(f"{name:<21} {value}" for name, value in rows)
+
+
+def _mm(distance_m: float) -> str:
+    return f"{1e3 * distance_m:.2f} mm"
 
 
 def _percent(ratio: float) -> str:

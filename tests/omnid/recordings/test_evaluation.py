@@ -128,7 +128,7 @@ def test_bad_tolerance(tolerance_s: float) -> None:
 
 def test_format_is_for_people() -> None:
     text = format_metrics(evaluate(straight(11, 0.099, heading_rad=-0.02), straight(11, 0.1)))
-    for part in ("11 (100.0% of the truth)", "0.9900 m, truth 1.0000 m (-1.00 %)", "end 0.0100 m", "end -1.146 deg"):
+    for part in ("11 (100.0% of the truth)", "0.9900 m, truth 1.0000 m (-1.00 %)", "end 10.00 mm", "end -1.146 deg"):
         assert part in text
 
 

@@ -1,0 +1,45 @@
+"""`--json` of the commands that have results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.conftest import PAIRS
+from tests.replay.command import Command
+
+
+def loaded(omnid: Command, *words: object, code: int = 0) -> Any:
+    done = omnid(*words, "--json")
+    assert done.code == code, done.err
+    return json.loads(done.out)
+
+
+def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path) -> None:
+    tum, a, b = tmp_path / "est.txt", tmp_path / "a.mcap", tmp_path / "b.mcap"
+    words = ("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--inline")
+    first = loaded(omnid, *words, "--tum", tum, "--record", a)
+    assert first["counters"]["poses"] == PAIRS and first["counters"]["states"]["tracking"] == PAIRS
+    assert first["timings"]["odometry"]["n"] == PAIRS and first["signal"] == 0 and first["warnings"] == []
+    metrics = loaded(omnid, "eval", tum, scene / "truth.txt")
+    assert metrics["pairs"] == PAIRS and 0 < metrics["ate_rmse_m"] < 0.05
+    info = loaded(omnid, "log", "info", scene / "log.mcap", a)
+    assert [entry["path"] for entry in info] == [str(scene / "log.mcap"), str(a)]
+    assert info[1]["topics"]["/omnid/odom"] == ["nav_msgs/msg/Odometry", PAIRS]
+    assert loaded(omnid, "diff", a, a) == {"agree": True, "identical": True, "differences": []}
+    loaded(omnid, *words, "--record", b, "--set", "stereo.noise_px=2.0", "--set", "odometry.noise_px=2.0")
+    again = loaded(omnid, "diff", a, b, "--tolerance-mm", 0, "--tolerance-deg", 0, code=1)
+    assert (again["agree"], again["identical"]) == (False, False) and "poses" in again["differences"]
+
+
+def test_numbers_that_are_not_finite_are_null(omnid: Command, tmp_path: Path) -> None:
+    still = tmp_path / "still.txt"
+    still.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    assert loaded(omnid, "eval", still, still)["length_error_ratio"] is None
+
+
+def test_findings_of_the_doctor_as_json(omnid: Command) -> None:
+    findings = loaded(omnid, "doctor", "--set", "cameras.lower=/dev/none", "--set", "cameras.upper=/dev/none", code=1)
+    assert {"level", "subject", "found", "advice"} == set(findings[0])
+    assert any(entry["level"] == "error" for entry in findings)
