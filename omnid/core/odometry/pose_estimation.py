@@ -1,4 +1,4 @@
-"""RigVelocity from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
+"""Motion from landmarks and their views in both cameras: RANSAC on three points, then Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _inverse_cholesky(S: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonResult:
-    """RigVelocity T_curr_ref with its covariance (6, 6) [t; r] in curr, and the squared error of each view."""
+    """Motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and the squared error of each view."""
 
     T: Array
     covariance: Array

@@ -1,4 +1,4 @@
-"""RigVelocity between two clouds of the same points: RANSAC and Gauss-Newton of Dang et al. 2012, IV.B and IV.C."""
+"""Motion between two clouds of the same points: RANSAC and Gauss-Newton of Dang et al. 2012, IV.B and IV.C."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ X, Y, Z = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """RigVelocity M (4, 4) of the points, b = M a, and its covariance (6, 6) [t; r] on the left of M."""
+    """Motion M (4, 4) of the points, b = M a, and its covariance (6, 6) [t; r] on the left of M."""
 
     M: Array
     covariance: Array
