@@ -12,6 +12,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.stereo.photometry import Light
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ class Panoramas:
     upper: PaddedPanorama
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
     times: ExposureTimes | None = None  # of the pixels; None: all are exposed at the stamp
+    light: Light = field(default_factory=Light)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +112,7 @@ class OdometryUpdate:
     tracks: int  # landmarks that were tracked
     depth: StereoDepth
     features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
+    light: Light = field(default_factory=Light)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

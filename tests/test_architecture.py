@@ -95,7 +95,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.se3 omnid.core.mapping omnid.errors",
-    "omnid.messages": "omnid.core.mapping omnid.core.odometry omnid.tracking_state",
+    "omnid.messages": "omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
         "omnid.sinks omnid.transport",

@@ -12,6 +12,7 @@ from omnid.stages.rig_gate import RigGate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
+DARK_SHARE: Final = 0.1  # of the pairs
 REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
                    "use": "they were used, as pair.repeated_images says"}
 
@@ -35,6 +36,9 @@ def input_warnings(
                    f"{images.longest} in a row; {REPEATED[config.repeated_images]}")
     if rig_gate.warning:
         yield rig_gate.warning
+    if statistics.dark > statistics.poses * DARK_SHARE:
+        yield (f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
+               "contrast; more light, a longer exposure (cameras.exposure_us) or less gain")
     lost = statistics.states[TrackingState.LOST]
     if lost > statistics.poses / 2:
         yield (f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "

@@ -21,6 +21,7 @@ class RunStatistics:
         self.length_m = 0.0
         self.states: Counter[str] = Counter()
         self.resets = 0
+        self.dark = 0  # pairs that were too dark
         self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
 
@@ -31,6 +32,7 @@ class RunStatistics:
             self.length_m += float(np.linalg.norm(position - self._position))
         self._position, self.newest = position, odometry
         self.states[odometry.state] += 1
+        self.dark += odometry.light.is_too_dark
         self.resets = odometry.reset_counter
         self.poses += 1
 

@@ -91,6 +91,11 @@ class StatusCollector:
                   **_times(status_names.CAPTURE_TO_POSE, self._sources.to_pose)}
         if age_s > TIMEOUT_S:
             return DiagnosticStatus(status_names.ODOMETRY, STALE, "no new pose", values)
+        if math.isfinite(newest.light.level_grey):
+            values |= {"level_grey": f"{newest.light.level_grey:.0f}",
+                       "contrast_to_noise": f"{newest.light.contrast_to_noise:.1f}"}
+        if newest.light.is_too_dark and newest.state != TrackingState.LOST:
+            return DiagnosticStatus(status_names.ODOMETRY, WARN, f"{newest.state}: it is too dark", values)
         return DiagnosticStatus(status_names.ODOMETRY, LEVELS[newest.state], newest.state, values)
 
     def _pairing(self) -> DiagnosticStatus:

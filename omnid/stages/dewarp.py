@@ -10,7 +10,7 @@ from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig, TimingConfig
 from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.tracking import PaddedPanorama
-from omnid.core.stereo.photometry import brightened, gain_of, mean_level, noise_sigma
+from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
@@ -47,9 +47,10 @@ class Dewarp:
         """Return the panoramas of a pair."""
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower = self._panorama(pair.lower, self._lower, "lower", measured)
-        upper = self._panorama(pair.upper, self._upper, "upper", measured)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s))
+        lower, lower_light = self._panorama(pair.lower, self._lower, "lower", measured)
+        upper, upper_light = self._panorama(pair.upper, self._upper, "upper", measured)
+        dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s), dimmer)
 
     def _times(self, skew_s: float) -> ExposureTimes | None:
         """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""
@@ -57,15 +58,17 @@ class Dewarp:
         lower_s, upper_s = self._rows_s
         return None if skew_s == 0 and lower_s is None else ExposureTimes(skew_s, lower_s, upper_s)
 
-    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool) -> PaddedPanorama:
+    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool
+                  ) -> tuple[PaddedPanorama, Light]:
         """Return a panorama, brightened if it is dim; measured: measure the noise of this camera again."""
         remapped = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
         inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
         if measured:
             self._noise_grey[camera] = noise_sigma(inner, self._visible)
-        level = mean_level(inner, self._visible)
-        gain = gain_of(level)
-        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * self._noise_grey[camera], gain, level)
+        noise_grey = self._noise_grey[camera]
+        found = light(inner, self._visible, noise_grey)
+        gain = gain_of(found.level_grey)
+        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain), found
 
 
 def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:

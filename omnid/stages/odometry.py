@@ -57,7 +57,7 @@ class OdometryStage:
         return OdometryUpdate(
             depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity, self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, depth), estimate.resets, estimate.inliers, estimate.tracked, depth,
-            estimate.features,
+            estimate.features, depth.panoramas.light,
         )
 
     def _in_rig(self, covariance: Array) -> Array:
@@ -66,8 +66,9 @@ class OdometryStage:
 
 
 def _state(state: TrackingState, depth: StereoDepth) -> TrackingState:
-    """Return the state of a pose, which is at best DEGRADED where the images contradict the rig."""
-    return TrackingState.DEGRADED if state is TrackingState.TRACKING and not depth.rig_fits else state
+    """Return the state of a pose: at best DEGRADED where the images contradict the rig, and where it is too dark."""
+    doubtful = not depth.rig_fits or depth.panoramas.light.is_too_dark
+    return TrackingState.DEGRADED if state is TrackingState.TRACKING and doubtful else state
 
 
 def in_axes(T_a_b: Array, covariance: Array) -> Array:

@@ -116,6 +116,7 @@ def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene:
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
+    assert f"too dark in {PAIRS} of {PAIRS} pairs" in result.err
 
 
 def test_names_an_unknown_encoding(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,7 +27,6 @@ class PaddedPanorama:
     pad_px: int
     noise_grey: float = 1.0  # standard deviation of the noise, grey levels
     gain: float = 1.0  # by which the image was multiplied because it was dim
-    level_grey: float = math.nan  # mean of the visible part before that
 
     @property
     def width(self) -> int:

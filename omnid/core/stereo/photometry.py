@@ -7,6 +7,9 @@ changed: what is left of gain and offset, `core/odometry/patch_fit.py` finds for
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,8 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
+LEAST_CONTRAST_TO_NOISE = 1.0
+LEAST_NOISE_GREY = 0.3  # that of rounding
 MAX_GAIN = 8.0  # of 8 bit images: more only magnifies their steps
 # Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
 FINE_PX, COARSE_PX = 0.8, 1.6
@@ -27,9 +32,24 @@ MIN_BLOCKS = 20  # fewer visible ones tell nothing
 UNKNOWN_NOISE = 1.0  # grey levels
 
 
-def mean_level(panorama: Image, visible: Flags) -> float:
-    """Return the mean grey level of a panorama (H, W) where it is visible (H, W)."""
-    return float(cv2.mean(panorama, visible.view(np.uint8))[0])
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Brightness of a pair, of the dimmer camera, before any gain."""
+
+    level_grey: float = math.nan  # mean
+    contrast_to_noise: float = math.inf  # standard deviations
+
+    @property
+    def is_too_dark(self) -> bool:
+        """True if a dim image has more noise than contrast: poses are then not to be relied on."""
+        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < LEAST_CONTRAST_TO_NOISE
+
+
+def light(panorama: Image, visible: Flags, noise_grey: float) -> Light:
+    """Return the light of a panorama (H, W) where it is visible (H, W), with noise of noise_grey."""
+    mean, spread = (float(value.item()) for value in cv2.meanStdDev(panorama, mask=visible.view(np.uint8)))
+    contrast = math.sqrt(max(0.0, spread**2 - noise_grey**2))
+    return Light(mean, contrast / max(noise_grey, LEAST_NOISE_GREY))
 
 
 def gain_of(level: float) -> float:

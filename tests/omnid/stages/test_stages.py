@@ -145,7 +145,11 @@ def test_a_dim_image_is_brightened_and_its_noise_is_known(rig_geometry: Geometry
     np.testing.assert_array_equal(bright.upper.image, dark.upper.image)
     shown = dark.lower.panorama[dark.visible]
     assert dark.lower.gain > 1.5 and abs(shown.mean() - 80) < 2
-    assert dark.lower.level_grey < 50 < bright.lower.level_grey
+    assert dark.light.level_grey < 50 < bright.light.level_grey
+    assert dark.light.contrast_to_noise < 0.4 * bright.light.contrast_to_noise
+    assert not dark.light.is_too_dark and not bright.light.is_too_dark
+    night = np.clip(np.rint(0.02 * pair.lower + 5 + noise), 0, 255).astype(np.uint8)
+    assert Dewarp(rig_geometry, Config().panorama).process(replace(pair, lower=night)).light.is_too_dark
     assert 2.0 < dark.lower.noise_grey / dark.lower.gain < 6.0  # interpolation makes it less than 5
     assert bright.lower.noise_grey < 3.0
 

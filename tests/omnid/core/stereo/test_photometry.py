@@ -11,7 +11,7 @@ from omnid.core.stereo.photometry import (
     UNKNOWN_NOISE,
     brightened,
     gain_of,
-    mean_level,
+    light,
     noise_sigma,
 )
 from tests.omnid.core.scenery import texture
@@ -47,8 +47,8 @@ def test_dim_panoramas_are_brought_to_one_level_and_bright_ones_are_left() -> No
     image[:80] = 10
     visible = EVERYWHERE.copy()
     visible[:80] = False
-    gain = gain_of(mean_level(image, visible))
-    assert mean_level(brightened(image, gain), visible) == pytest.approx(TARGET_LEVEL, abs=0.5)
+    gain = gain_of(light(image, visible, 1.0).level_grey)
+    assert light(brightened(image, gain), visible, 1.0).level_grey == pytest.approx(TARGET_LEVEL, abs=0.5)
     bright = np.full(SHAPE, 120, np.uint8)
-    assert brightened(bright, gain_of(mean_level(bright, visible))) is bright
+    assert brightened(bright, gain_of(light(bright, visible, 1.0).level_grey)) is bright
     assert gain_of(0.0) == MAX_GAIN
