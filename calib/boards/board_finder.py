@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from itertools import islice
 
 import cv2
@@ -42,6 +43,8 @@ MAX_STRIP_PX = 2400
 STRIP_INNER_PART, STRIP_OUTER_PART = 1 / 16, 1 / 2
 # CLAHE (contrast limited adaptive histogram equalisation): clip limit and number of tiles per axis.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
+# OpenCV's detectors, and the distance at which their corners are the same, in parts of a square and at least.
+DETECTORS, SAME_PART, SAME_PX = 2, 0.25, 1.0
 # A smaller grid is not reported as a board of another size.
 MIN_HINT_CORNERS = 12
 MIN_HINT_SIDE = 3
@@ -79,8 +82,14 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
             if view is not None:
                 return BoardSearch(view)
             largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
-    for grid in _opencv_grids(image, board) if thorough else ():
+    detected = list(_opencv_grids(image, board)) if thorough else []
+    for grid in detected:
         view = _checked_view(image, grow_grid(blurred, grid), board, name)
+        if view is not None:
+            return BoardSearch(view)
+    # The outermost squares of a near board lie outside the image or in shadow: two detectors that agree are enough.
+    if len(detected) == DETECTORS and _are_same(detected[0], detected[1]):
+        view = _checked_view(image, detected[0], board, name, complete=False)
         if view is not None:
             return BoardSearch(view)
     is_hint = min(largest) >= MIN_HINT_SIDE and largest[0] * largest[1] >= MIN_HINT_CORNERS
@@ -105,19 +114,32 @@ def _contrasted(image: Image) -> Image:
 def _unrolled(image: Image, start_rad: float) -> _SearchImage:
     """Return the log-polar strip about the image's middle: azimuth to the right, logarithm of the radius upwards."""
     height, width = image.shape
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    inner, outer = min(image.shape) * STRIP_INNER_PART, max(image.shape) * STRIP_OUTER_PART
-    scale = min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)  # pixels per radian
+    strip = cv2.remap(image, *_strip_maps((height, width), start_rad), cv2.INTER_CUBIC)
+    return _SearchImage(strip.astype(np.uint8, copy=False), partial(_strip_to_source, (height, width), start_rad))
 
-    def to_source(pixels: Array) -> Array:
-        azimuth, radius = start_rad + pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
-        return np.asarray(middle + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
 
+def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
+    """Return inner and outer radius [px] of a strip, and its pixels per radian."""
+    inner, outer = min(shape) * STRIP_INNER_PART, max(shape) * STRIP_OUTER_PART
+    return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
+
+
+def _strip_to_source(shape: tuple[int, int], start_rad: float, pixels: Array) -> Array:
+    """Return the pixels (N, 2) of an image of that shape for pixels (N, 2) of its strip."""
+    _, outer, scale = _strip_scale(shape)
+    azimuth, radius = start_rad + pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    return np.asarray(middle + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
+
+
+@lru_cache(maxsize=2)
+def _strip_maps(shape: tuple[int, int], start_rad: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the tables of a strip for cv2.remap; the images of a camera have one shape."""
+    inner, outer, scale = _strip_scale(shape)
     columns, rows = np.meshgrid(np.arange(int(2 * np.pi * scale)), np.arange(int(np.log(outer / inner) * scale)))
-    maps = to_source(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)).astype(np.float32)
-    u, v = maps.T.reshape(2, *columns.shape)
-    strip = cv2.remap(image, np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.INTER_CUBIC)
-    return _SearchImage(strip.astype(np.uint8, copy=False), to_source)
+    maps = _strip_to_source(shape, start_rad, np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
+    u, v = maps.astype(np.float32).T.reshape(2, *columns.shape)
+    return np.ascontiguousarray(u), np.ascontiguousarray(v)
 
 
 def _grids(searched: _SearchImage, board: Board) -> Iterator[Grid]:
@@ -145,6 +167,14 @@ def _opencv_grids(image: Image, board: Board) -> Iterator[Grid]:
             yield _with_clockwise_axes(array_to_grid(np.asarray(corners, float).reshape(board.rows, board.columns, 2)))
 
 
+def _are_same(grid: Grid, other: Grid) -> bool:
+    """True if every corner of a grid is one of another grid, within a part of the squares."""
+    mine, theirs = (np.array(list(corners.values())) for corners in (grid, other))
+    apart = np.linalg.norm(mine[:, None] - theirs, axis=2).min(axis=1)
+    sizes = np.array([spacing(grid, cell) for cell in grid])
+    return bool((apart < np.maximum(SAME_PART * sizes, SAME_PX)).all())
+
+
 def _to_source_pixels(grid: Grid, searched: _SearchImage) -> Grid:
     """Return the grid in pixels of the source image."""
     pixels = searched.to_source(np.array(list(grid.values())))
@@ -162,8 +192,11 @@ def _is_clockwise(grid: Grid) -> bool:
     return bool(np.sum(np.sign(turns)) >= 0)
 
 
-def _checked_view(image: Image, grid: Grid, board: Board, name: str) -> BoardView | None:
-    """Return the board's view in a grid, or None if a check of its corners or squares fails."""
+def _checked_view(image: Image, grid: Grid, board: Board, name: str, *, complete: bool = True) -> BoardView | None:
+    """Return the board's view in a grid, or None if a check of its corners or squares fails.
+
+    complete: the squares around the corners are checked as well.
+    """
     placed = select_board_window(grid, board)
     if placed is None:
         return None
@@ -171,7 +204,9 @@ def _checked_view(image: Image, grid: Grid, board: Board, name: str) -> BoardVie
     refined = refine_corners(image, orient_corners(blurred, placed, board))
     good = _without_outliers(blurred, refined)
     part = float(np.isfinite(good[..., 0]).mean())
-    if part < MIN_GOOD or not has_checker_pattern(blurred, good) or not is_complete_board(blurred, refined):
+    if part < MIN_GOOD or not has_checker_pattern(blurred, good):
+        return None
+    if complete and not is_complete_board(blurred, refined):
         return None
     return BoardView(name, good.reshape(-1, 2), part * (1 - float(np.nanmean(grid_irregularity(good)))))
 

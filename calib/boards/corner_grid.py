@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 
@@ -31,6 +32,8 @@ MIN_SPACING_PX = 3
 MIN_QUALITY = 0.15
 # Least contrast of a predicted corner, in parts of the grid's median contrast.
 MIN_CONTRAST_PART = 0.25
+# Corners of which that median is taken: measuring all of them takes long on a wall full of corners.
+CONTRAST_CELLS = 64
 # cv2.cornerSubPix: half window in parts of the corner spacing and its limits, iterations, convergence.
 WINDOW_PART, MIN_WINDOW_PX, MAX_WINDOW_PX = 0.3, 2, 15
 SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3
@@ -87,11 +90,12 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
 def grow_grid(image: Grey, grid: Grid) -> Grid:
     """Return the grid with every corner added that its neighbours predict and the image shows."""
     grid, refused = dict(grid), set[Cell]()
+    contrast = _usual_contrast(image, grid)
     for _ in range(MAX_ROUNDS):
         guesses = {cell: guess for cell in _border(grid) - refused if (guess := predict(grid, cell)) is not None}
         if not guesses or len(grid) > MAX_CELLS:
             break
-        found = _accept_predicted(image, grid, guesses)
+        found = _accept_predicted(image, grid, guesses, contrast)
         refused |= set(guesses) - set(found)
         # A refused cell may be predicted better with a new neighbour.
         for cell in found:
@@ -130,22 +134,21 @@ def _extrapolations(grid: Grid, cell: Cell) -> Iterator[Array]:
 def spacing(grid: Grid, cell: Cell) -> float:
     """Return the smallest distance [px] of a cell from adjacent corners, measured among its neighbours; 0: unknown."""
     i, j = cell
-    steps = [np.linalg.norm(one - other) for di, dj in STEPS
+    steps = [math.dist(one, other) for di, dj in STEPS
              if (one := grid.get((i + di, j + dj))) is not None
              and (other := grid.get(cell, grid.get((i + 2 * di, j + 2 * dj)))) is not None]
-    beside = [np.linalg.norm(one - other) for di, dj in STEPS for side in (1, -1)
+    beside = [math.dist(one, other) for di, dj in STEPS for side in (1, -1)
               if (one := grid.get((i + di, j + dj))) is not None
               and (other := grid.get((i + di - side * dj, j + dj + side * di))) is not None]
     return float(min(steps or beside, default=0.0))
 
 
-def _accept_predicted(image: Grey, grid: Grid, guesses: Grid) -> Grid:
-    """Return the predicted corners that the image shows."""
+def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -> Grid:
+    """Return the predicted corners that the image shows; contrast: the usual one of the grid's corners."""
     sizes = np.array([spacing(grid, cell) for cell in guesses])
     start = np.array(list(guesses.values()))
     refined = refine_subpixel(image, start, sizes)
     seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, RING_PART * sizes))
-    contrast = _usual_contrast(image, grid)
     near = np.linalg.norm(refined - start, axis=1) < np.maximum(MIN_SEARCH_PX, SEARCH_PART * sizes)
     good = near & (sizes > MIN_SPACING_PX) & (seen.quality > MIN_QUALITY)
     good &= seen.contrast > MIN_CONTRAST_PART * contrast
@@ -153,8 +156,10 @@ def _accept_predicted(image: Grey, grid: Grid, guesses: Grid) -> Grid:
 
 
 def _usual_contrast(image: Grey, grid: Grid) -> float:
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    return float(np.median(describe_corners(image, np.array(list(grid.values())), rings).contrast))
+    """Return the median contrast of the grid's corners, of some evenly chosen ones if there are many."""
+    cells = list(grid)[::-(-len(grid) // CONTRAST_CELLS)]
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in cells])
+    return float(np.median(describe_corners(image, np.array([grid[cell] for cell in cells]), rings).contrast))
 
 
 def refine_subpixel(image: Grey, pixels: Array, sizes: Array) -> Array:

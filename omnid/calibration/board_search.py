@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import BoardSearch, find_board
-from omnid.calibration.images import Images
+from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
 
 def find_boards(images: Images, board: Board, *, thorough: bool, show_progress: bool) -> list[BoardView]:
-    """Find the views of a board in images; raises OmnidError if there is none, with other grids that were found."""
+    """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other grids."""
     views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
-    for number, (name, image) in enumerate(images.items(), 1):
-        search = find_board(image, board, name, thorough=thorough)
-        if search.view is not None:
-            views.append(search.view)
-        if search.grid_size != (0, 0):
-            other_grids[_sorted(search.grid_size)] += 1
-        if show_progress:
-            print(f"[{number}/{len(images)}] {name}: {_progress(search)}", file=sys.stderr)
+
+    def search_of(named: tuple[str, Image]) -> tuple[str, BoardSearch]:
+        return named[0], find_board(named[1], board, named[0], thorough=thorough)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for number, (name, search) in enumerate(pool.map(search_of, images.items()), 1):
+            if search.view is not None:
+                views.append(search.view)
+            if search.grid_size != (0, 0):
+                other_grids[_sorted(search.grid_size)] += 1
+            if show_progress:
+                print(f"[{number}/{len(images)}] {name}: {_progress(search)}", file=sys.stderr)
     if not views:
         raise OmnidError(_none_found(len(images), board, other_grids))
     return views

@@ -16,7 +16,7 @@ from calib.errors import CalibError
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from tests.simulation.boards import BoardRenderer, board_poses_around_camera
+from tests.simulation.boards import SQUARE_PX, BoardRenderer, board_poses_around_camera, board_texture
 from tests.simulation.sensor import Sensor
 
 BOARD = Board(6, 5, 0.03)
@@ -151,3 +151,17 @@ def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
 def test_refuses_an_impossible_board(columns: int, rows: int, square_m: float) -> None:
     with pytest.raises(CalibError, match="board: expected"):
         Board(columns, rows, square_m)
+
+
+def test_finds_a_board_whose_outer_squares_are_hidden_by_a_frame() -> None:
+    """The squares around the corners cannot be checked: OpenCV's two detectors have to agree."""
+    sheet = cv2.resize(board_texture(BOARD), None, fx=3, fy=3, interpolation=cv2.INTER_AREA)
+    hidden = round(3 * SQUARE_PX * 1.65)
+    image = np.full_like(sheet, 90)
+    image[hidden:-hidden, hidden:-hidden] = sheet[hidden:-hidden, hidden:-hidden]
+    image = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
+    view = find_board(image, BOARD).view
+    assert view is not None and np.isfinite(view.pixels).mean() > 0.9
+    x, y = np.meshgrid(np.arange(6), np.arange(5))
+    truth = 3 * SQUARE_PX * (np.column_stack([x.ravel(), y.ravel()]) + 2.0) - 0.5
+    assert np.nanmax(errors_px(view.pixels, truth)) < 0.3
