@@ -157,7 +157,8 @@ class DriveLandmarks:
             at = np.flatnonzero(anchors == a)
             templates[at] = warped_templates(self._keyframes[a].lower, self._views[index[at], :2], warps[at], near[at])
         aligned = align(templates, current.upper if upper else current.lower, near, anchors)
-        return aligned.pixels % [self._model.cylinder.width, np.inf], aligned.found
+        pixels = np.where(aligned.found[:, None], aligned.pixels, near)
+        return np.column_stack([pixels[:, 0] % self._model.cylinder.width, pixels[:, 1]]), aligned.found
 
 
 def _is_set(flags: Flags, pixels: Array) -> Flags:
