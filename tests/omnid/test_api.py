@@ -161,6 +161,13 @@ def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pai
     assert np.array_equal(odometry.process(*pairs[1]).T_odom_rig, whole.process(*pairs[1]).T_odom_rig)
 
 
+def test_exchanged_images_are_refused(scene: Path, pairs: list[Pair]) -> None:
+    odometry = omnid.Odometry(scene / "rig.toml")
+    with pytest.raises(OmnidError, match="the other way round"):
+        for stamp_ns, lower, upper in pairs[:6]:
+            odometry.process(stamp_ns, upper, lower)
+
+
 def test_images_may_be_views(scene: Path, pairs: list[Pair]) -> None:
     odometry = omnid.Odometry(scene / "rig.toml")
     stamp_ns, lower, upper = pairs[0]
