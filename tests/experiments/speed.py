@@ -110,7 +110,12 @@ def _one_thread() -> Iterator[None]:
 
 
 def _depth(times: Times, name: str, process: Callable[[Panoramas], StereoDepth], now: Panoramas) -> StereoDepth:
-    depth: StereoDepth = times.run(f"depth: {name}", lambda: process(now))
+    def computed() -> StereoDepth:
+        depth = process(now)
+        depth.dense()  # it is computed when it is first read
+        return depth
+
+    depth: StereoDepth = times.run(f"depth: {name}", computed)
     return depth
 
 

@@ -1,7 +1,7 @@
-"""Semi-global matching at a quarter of the resolution, refined at full resolution by the SAD near it.
+"""Semi-global matching at half the resolution, refined at full resolution by the SAD near it.
 
 Where a texture repeats, the window of a pixel cannot distinguish its candidates. The path costs of Hirschmueller 2008
-carry the answer from where it is unambiguous. OpenCV's StereoSGBM (8 paths) computes them on transposed panoramas; the
+carry the answer from where it is unambiguous. OpenCV's StereoSGBM (5 paths) computes them on transposed panoramas; the
 SAD at full resolution then searches near this prior only.
 """
 
@@ -23,9 +23,9 @@ LEFT_RIGHT_PX = 1  # largest disagreement of the disparities of both panoramas
 PREFILTER_CAP = 31  # at which StereoSGBM cuts off the gradients it compares
 SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel
 STEP_ROWS = 16  # StereoSGBM searches a multiple of so many disparities
-SCALE = 4  # the prior is computed at a quarter of the resolution: 8 paths there cost as much as one pass of the SAD
+SCALE = 2  # the prior is computed at half the resolution: at a quarter the courses of a brick wall are one grey
 FILL_PX = 5  # at the prior's resolution: unknown pixels take the largest disparity so near: no holes
-REACH_PX = 3  # searched about the prior
+REACH_PX = 2  # searched about the prior
 
 
 class SemiGlobalPrior:
@@ -39,7 +39,7 @@ class SemiGlobalPrior:
         self._matcher = cv2.StereoSGBM.create(
             minDisparity=0, numDisparities=self._rows, blockSize=BLOCK_PX, P1=SMALL_STEP_PENALTY,
             P2=LARGE_STEP_PENALTY, disp12MaxDiff=LEFT_RIGHT_PX, preFilterCap=PREFILTER_CAP, uniquenessRatio=0,
-            mode=cv2.STEREO_SGBM_MODE_HH)
+            mode=cv2.STEREO_SGBM_MODE_SGBM)
 
     def disparity(self, lower: Image, upper: Image) -> tuple[Floats, NDArray[np.bool_]]:
         """Return disparities (H, W) float32 [px at full size], good to about a pixel, and flags of the known ones.
