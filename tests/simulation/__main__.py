@@ -15,6 +15,7 @@ from tests.simulation.logs import write_log
 from tests.simulation.readout import Readout
 from tests.simulation.recipes import RECIPES, build
 from tests.simulation.rigs import with_real_mirrors
+from tests.simulation.sensor import DIM
 
 
 def main() -> None:
@@ -38,6 +39,7 @@ def main() -> None:
     parser.add_argument("--line-time-us", type=float, nargs="+", default=[0.0], metavar="US",
                         help="rolling shutter: time from row to row, of both cameras or of lower and upper; a stamp is "
                              "that of the first row")
+    parser.add_argument("--dim", action="store_true", help="dim images with much noise, whose brightness changes")
     arguments = parser.parse_args()
     run = build(arguments.name, arguments.seed, arguments.size, arguments.pairs)
     rig = with_real_mirrors(run.rig, arguments.seed, arguments.mirrors) if arguments.mirrors else run.rig
@@ -49,7 +51,8 @@ def main() -> None:
         left_s = (time.monotonic() - started) / done * (total - done)
         sys.stderr.write(f"\r{arguments.name} {done}/{total} pairs, {left_s:.0f} s left  ")
 
-    write_log(arguments.out, rig, run.poses, run.scene, sensor=run.sensor, seed=arguments.seed,
+    sensor = DIM if arguments.dim else run.sensor
+    write_log(arguments.out, rig, run.poses, run.scene, sensor=sensor, seed=arguments.seed,
               supersample=arguments.supersample, readout=readout, progress=progress)
     sys.stderr.write("\n")
 

@@ -27,6 +27,7 @@ class Sensor:
     jpeg_quality: int = 90
     vignette: float = 0.0  # how much darker the rim is, 0 to 1
     flicker: float = 0.0  # standard deviation of the brightness from frame to frame
+    brightness: float = 1.0  # factor on the ideal image
     strut_angles_deg: tuple[float, ...] = ()
     strut_width: float = 0.014
     hub: float = 0.0  # radius
@@ -51,6 +52,10 @@ def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
     return np.asarray(1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1), np.float32)
 
 
+# Mean grey of about 30 of 255; the brightness of each image differs by 20 %.
+DIM = Sensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
+
+
 @dataclass(frozen=True, slots=True)
 class Exposure:
     """One camera's sensor with its fixed patterns, computed once."""
@@ -67,7 +72,7 @@ class Exposure:
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
         """Return the sensor's image (H, W) uint8 of an ideal one."""
         s = self.sensor
-        gain = max(0.0, 1 + s.flicker * float(rng.standard_normal()))
+        gain = s.brightness * max(0.0, 1 + s.flicker * float(rng.standard_normal()))
         grey = (ideal * self.falloff * np.float32(gain)) * (1 - self.hidden) + FITTING_GREY * self.hidden
         if s.blur_px > 0:
             grey = cv2.GaussianBlur(grey, (0, 0), s.blur_px)
