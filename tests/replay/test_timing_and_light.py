@@ -37,8 +37,8 @@ def test_the_motion_between_the_exposures_is_corrected(tmp_path: Path) -> None:
     skew = driven(tmp_path / "skew", readout=Readout(speed, (15.0, 15.0)))
     assert abs(skew.length_error_ratio) < 0.0015 and skew.ate_rmse_m < 0.002
     rolling = Readout(speed, line_time_us=(LINE_TIME_US, LINE_TIME_US))
-    told = driven(tmp_path / "told", f"camera.line_time_us={LINE_TIME_US}", readout=rolling)
-    assert abs(told.length_error_ratio) < 0.0015 and told.ate_rmse_m < 0.002
+    known = driven(tmp_path / "known", f"camera.line_time_us={LINE_TIME_US}", readout=rolling)
+    assert abs(known.length_error_ratio) < 0.0015 and known.ate_rmse_m < 0.002
 
 
 @pytest.mark.slow
