@@ -18,8 +18,10 @@ from calib.models.ocam import OcamCamera
 
 # The polynomial of a round mirror has even powers; higher ones are not needed for mirrors near the paraboloid.
 POWERS = (0, 2, 4)
-# Start value of a wavefront [m] whose terms are fitted.
-START_M = 1e-9
+# Number of radii at which polynomials are compared.
+RADII = 60
+# Start values of terms that are fitted: a wavefront [m], tangential terms [1/px].
+START_M, START_TANGENTIAL = 1e-9, (1e-12, 1e-12)
 # The more general rig is selected if its held-out error is lower by this part.
 MIN_IMPROVEMENT = 0.01
 
@@ -71,9 +73,18 @@ def select_rig(views: Sequence[PairView], board: Board, cameras: Sides, mirrors:
 
 
 def mirror_start(camera: OcamCamera) -> OcamCamera:
-    """Return the camera from which the terms of a real mirror are fitted: even powers, and a wavefront of almost 0."""
-    even = tuple(value if power in POWERS else 0.0 for power, value in enumerate(camera.polynomial[:POWERS[-1] + 1]))
-    return replace(camera, polynomial=even, wavefront=(START_M,) * len(camera.wavefront))
+    """Return the camera from which the terms of a real mirror are fitted: even powers, terms of almost 0.
+
+    The even powers are fitted to the camera's polynomial over the image: leaving out its odd ones would spoil the poses
+    of the boards from which the fit starts.
+    """
+    radii = np.linspace(0, min(camera.size) / 2, RADII) / min(camera.size)
+    found = np.linalg.lstsq(radii[:, None] ** POWERS, camera.height(radii * min(camera.size)), rcond=None)[0]
+    even = np.zeros(POWERS[-1] + 1)
+    even[list(POWERS)] = found / float(min(camera.size)) ** np.array(POWERS)
+    tangential = camera.tangential if any(camera.tangential) else START_TANGENTIAL
+    return replace(camera, polynomial=tuple(even.tolist()), tangential=tangential,
+                   wavefront=(START_M,) * len(camera.wavefront))
 
 
 def _may_be_better(central: RigCalibration, general: RigCalibration) -> bool:
