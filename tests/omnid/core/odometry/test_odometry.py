@@ -92,7 +92,7 @@ def test_the_velocity_is_in_the_rig_frame(odometry: VisualOdometry, frames: list
 def test_landmarks_are_observed_in_several_keyframes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     """Each observation agrees with the projection of the landmark into that keyframe."""
     odometry = visual_odometry(cameras.model, OdometryLimits(refresh=1.0))
-    run(odometry, frames[:5])
+    run(odometry, frames[:10])
     store = odometry._map.store
     rows = np.searchsorted(store.table.id, store.observations.landmark)
     later = np.flatnonzero(store.observations.keyframe != store.table.anchor[rows])
