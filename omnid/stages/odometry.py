@@ -49,7 +49,8 @@ class OdometryStage:
         dt_s = 0.0 if self._last_ns is None else (depth.stamp_ns - self._last_ns) * 1e-9
         self._last_ns = depth.stamp_ns
         pair = depth.panoramas
-        frame = StereoFrame(depth.seq, pair.lower, pair.upper, lambda: depth.disparity, pair.visible, pair.times)
+        usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
+        frame = StereoFrame(depth.seq, pair.lower, pair.upper, lambda: depth.disparity, usable, pair.times)
         estimate = self._method.process(frame, dt_s)
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         covariance = in_axes(T_odom_rig, self._in_rig(estimate.covariance))

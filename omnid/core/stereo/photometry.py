@@ -19,6 +19,7 @@ Flags = NDArray[np.bool_]
 
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
 LEAST_CONTRAST_TO_NOISE = 1.0
+NOTHING_BUT_NOISE = 0.5  # contrast to noise: corners and patches are then those of noise
 LEAST_NOISE_GREY = 0.3  # that of rounding
 MAX_GAIN = 8.0  # of 8 bit images: more only magnifies their steps
 # Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
@@ -43,6 +44,11 @@ class Light:
     def is_too_dark(self) -> bool:
         """True if a dim image has more noise than contrast: poses are then not to be relied on."""
         return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < LEAST_CONTRAST_TO_NOISE
+
+    @property
+    def shows_nothing(self) -> bool:
+        """True if a dim image has so little contrast that its corners are noise: a map of them would be wrong."""
+        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < NOTHING_BUT_NOISE
 
 
 def light(panorama: Image, visible: Flags, noise_grey: float) -> Light:
