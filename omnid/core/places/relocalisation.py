@@ -15,6 +15,7 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.signature import Signature, signature, similarity
 from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]
@@ -51,6 +52,7 @@ class Relocaliser:
         self._apart_m = apart_m
         self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
         self._descriptors: dict[int, KeyframeDescriptor] = {}
+        self._signatures: dict[int, Signature] = {}
         self._searched = 0  # keyframes that the searches since the last addition or success have matched
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
@@ -58,27 +60,30 @@ class Relocaliser:
         if self._kept and _distance_m(self._kept[-1][1], keyframe) < self._apart_m:
             self._kept.pop()
         self._kept.append((frame, keyframe))
+        self._signatures[frame.seq] = signature(frame.lower.panorama)
         self._searched = 0
         kept = {frame.seq for frame, _ in self._kept}
         self._descriptors = {seq: features for seq, features in self._descriptors.items() if seq in kept}
+        self._signatures = {seq: found for seq, found in self._signatures.items() if seq in kept}
 
     def clear(self) -> None:
         """Remove all keyframes."""
         self._kept.clear()
         self._descriptors.clear()
+        self._signatures.clear()
 
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
         """Return the pose with the most inliers among some keyframes, None where none of them is recognised.
 
-        The newest keyframes come first, and a search of the next frame goes on where this one ends: all at once would
-        take a second, in which the robot has no pose at all.
+        The most similar keyframes come first, and a search of the next frame goes on where this one ends: all at once
+        would take a second, in which the robot has no pose at all.
         """
-        here = _describe(frame, self._model)
-        newest_first = deque(reversed(self._kept))
-        newest_first.rotate(-self._searched)
+        here, seen = _describe(frame, self._model), signature(frame.lower.panorama)
+        ranked = deque(sorted(self._kept, key=lambda kept: -similarity(seen, self._signatures[kept[0].seq])))
+        ranked.rotate(-self._searched)
         best: PoseEstimate | None = None
         unknown = 0
-        for kept, keyframe in list(newest_first)[:MAX_MATCHED]:
+        for kept, keyframe in list(ranked)[:MAX_MATCHED]:
             unknown += kept.seq not in self._descriptors
             if unknown > MAX_DESCRIBED:
                 break

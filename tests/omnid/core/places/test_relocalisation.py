@@ -75,12 +75,25 @@ def test_the_newest_keyframes_are_kept_up_to_the_bound(
     assert not any([relocaliser.locate(nearby) for _ in range(4)])
 
 
-def test_searches_go_on_with_older_keyframes_where_the_last_one_ended(
+def test_the_most_similar_keyframe_is_searched_first(
     cameras: RenderedCameras, keyframe: StereoFrame, nearby: StereoFrame
 ) -> None:
-    """Each search describes one keyframe at most, newest first."""
     relocaliser = Relocaliser(cameras.model)
     _add(relocaliser, keyframe, T_ODOM_KEYFRAME)
     for k in range(6):
         _add(relocaliser, cameras.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
-    assert [relocaliser.locate(nearby) is not None for _ in range(7)] == [*6 * [False], True]
+    assert relocaliser.locate(nearby) is not None
+
+
+def test_searches_go_on_with_other_keyframes_where_the_last_one_ended(
+    cameras: RenderedCameras, keyframe: StereoFrame
+) -> None:
+    """Each search describes one keyframe at most; here all look the same, and none is recognised."""
+    relocaliser = Relocaliser(cameras.model)
+    for k in range(3):
+        _add(relocaliser, cameras.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
+    described = []
+    for _ in range(4):
+        assert relocaliser.locate(keyframe) is None
+        described.append(len(relocaliser._descriptors))
+    assert described == [1, 2, 3, 3]
