@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Final, NamedTuple
@@ -31,7 +31,10 @@ from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.settings_dump import dump
-from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
+from omnid.transport import codec
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.decode import decode_diagnostics, decode_pose
+from omnid.transport.pose_attachment import PoseAttachment
 from tests.faults.mutation import mutated
 from tests.simulation import build, write_log
 
@@ -69,15 +72,11 @@ def read_log(path: Path) -> None:
     recover(path, path.with_name("recovered.mcap"))
 
 
-def read_messages(path: Path) -> None:
-    """Decode the bytes as each message of the bus; the first two bytes choose the length of the attachment."""
-    data = path.read_bytes()
-    split = int.from_bytes(data[:2], "little") % (len(data) + 1)
-    for decode in (decode_pose, decode_diagnostics, decode_cloud, decode_map):
-        try:
-            decode(data[split:], data[:split])
-        except EXPECTED:
-            continue
+def messages() -> Mapping[str, bytes]:
+    """Return a message of each kind that clients decode."""
+    status = DiagnosticStatus("omnid: wheels", 1, "no command", {"commands": "4", "armed": "1"})
+    return {"odom": codec.odometry_cdr(10**18, np.eye(4), np.eye(6), np.arange(6.0), np.eye(6)),
+            "status": codec.diagnostics_cdr(10**18, [status] * 5)}
 
 
 def camera_text(folder: Path) -> bytes:
@@ -95,7 +94,10 @@ FORMATS: Final = {
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
     "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),
     "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_log),
-    "message.cdr": Format(lambda _: random.Random(0).randbytes(3000), read_messages),
+    "odom.cdr": Format(lambda _: messages()["odom"], lambda path: decode_pose(path.read_bytes(), b"")),
+    "status.cdr": Format(lambda _: messages()["status"], lambda path: decode_diagnostics(path.read_bytes())),
+    "attachment.json": Format(lambda _: PoseAttachment(7, "tracking", 0, 50, 60, 10**18).to_bytes(),
+                              lambda path: PoseAttachment.from_bytes(path.read_bytes())),
 }
 
 

@@ -46,6 +46,12 @@ def test_a_goal_moves_by_no_more_than_the_turn(goal: HeadingGoal) -> None:
         before_rad = after_rad
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_base_that_still_turns_away_from_a_far_heading_is_led_at_its_rate(goal: HeadingGoal, side: int) -> None:
+    goal.update(0.0, side * 0.5)
+    assert goal.towards(side * 0.05, -side * 3.0) == pytest.approx(side * 0.05)
+
+
 def test_the_goal_does_not_pass_the_wanted_heading(goal: HeadingGoal) -> None:
     goal.update(1.0, 0.5)
     for error_rad, turn_rad, expected_rad in ((0.1, 0.5, 1.1), (-0.1, -0.5, 0.9), (0.1, -0.5, 1.0), (0.0, 0.5, 1.0)):
