@@ -67,7 +67,7 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, s
         wait_until(lambda: base.drives, "motion after the fault")
         code, err = daemon.end()
         assert err.count("two programs send commands as 'operator'") == 1
-        assert code == 0 and f"the wheels stop: {FAILED}; they stay stopped until cmd/arm (`omnid arm`)" in err
+        assert code == 0 and f"arming is refused: {FAILED}" in err  # the wheels may have stood already: the log turns
 
 
 def expect_the_operator_drives(daemon: Daemon, operator: Operator, base: Base) -> None:
