@@ -20,7 +20,7 @@ from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
 from omnid.engine.flow import nothing
 
-LATCHED = "they stay stopped until cmd/arm (`omnid arm`)"
+UNTIL_ARMED = "they stay stopped until cmd/arm (`omnid arm`)"
 
 class Controller:
     """Take poses and setpoints, of which the newest count; each call is one tick.
@@ -120,7 +120,7 @@ class Controller:
             self._report(f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm")
         # The stop of a drive is reported with its reason; a fault that comes while the wheels stand ends no drive.
         if state.armed and arming.needs_request and state.reason:
-            self._report(f"disarmed while the wheels stand: {arming.reason}; {LATCHED}")
+            self._report(f"disarmed while the wheels stand: {arming.reason}; {UNTIL_ARMED}")
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, answer
         state.needs_request = arming.needs_request
         state.refused = commands.refused
@@ -139,7 +139,7 @@ class Controller:
         if reason and not before:
             self.state.stops[reason] += 1
             if reason != ENDS:
-                latched = f"; {LATCHED}" if self._law.arming.needs_request else ""
+                latched = f"; {UNTIL_ARMED}" if self._law.arming.needs_request else ""
                 advice = f"; {ADVICE}" if reason in DISAGREEMENTS else ""
                 self._report(f"the wheels stop: {reason}{advice}{latched}")
 
