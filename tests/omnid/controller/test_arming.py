@@ -116,15 +116,15 @@ def test_a_fault_that_has_passed_keeps_the_wheels_stopped(driving: Bench, reason
     assert driving.last.velocity_mps == 0.3
 
 
-def test_a_fault_while_the_wheels_stand_is_told(driving: Bench) -> None:
+def test_a_fault_while_the_wheels_stand_is_reported(driving: Bench) -> None:
     for _ in range(60):  # the operator has let go of the stick: a stale command stops the wheels and disarms nothing
         driving.send_pose()
         driving.tick()
     assert is_stop(driving.last) and driving.controller.state.armed
     report_a_fault(driving)
     driving.tick()
-    told = [line for line in driving.lines if line.startswith("disarmed while the wheels stand")]
-    assert told == [f"disarmed while the wheels stand: {safety_rules.MOTOR_FAULT}; "
+    reported = [line for line in driving.lines if line.startswith("disarmed while the wheels stand")]
+    assert reported == [f"disarmed while the wheels stand: {safety_rules.MOTOR_FAULT}; "
                     "they stay stopped until cmd/arm (`omnid arm`)"]
 
 
