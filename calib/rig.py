@@ -12,6 +12,20 @@ from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
 from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3
+MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterTimes:
+    """Times of exposure against the stamps: of the upper camera, and from one image row of a camera to the next."""
+
+    upper_delay_s: float = 0.0
+    line_time_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (abs(self.upper_delay_s) <= MAX_UPPER_DELAY_S and abs(self.line_time_s) <= MAX_LINE_TIME_S):
+            raise CalibError(f"times of exposure: expected a delay of at most {MAX_UPPER_DELAY_S:g} s and a line time "
+                             f"of at most {MAX_LINE_TIME_S:g} s, found {self.upper_delay_s:g} and {self.line_time_s:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +56,7 @@ class Rig:
     T_base_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4)
     topics: tuple[str, str] = ("", "")  # of the lower and the upper camera's images; "" if unknown
     covariance: RigCovariance | None = None  # of the calibration
+    times: ShutterTimes = ShutterTimes()
 
     def __post_init__(self) -> None:
         for name, T in (("lower T_cam_rig", self.lower.T_cam_rig), ("upper T_cam_rig", self.upper.T_cam_rig),

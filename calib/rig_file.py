@@ -1,7 +1,8 @@
 """The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
-optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py.
+optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py. The optional table
+[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from calib.camera_table import camera_text, intrinsics_text, mask_text, number_t
 from calib.covariance_table import covariance_text, read_covariance
 from calib.errors import CalibError
 from calib.models.camera import Array
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.validation import ValidatedTable, read_bytes, require_schema, toml_table
 
 SCHEMA = 1
 SIDES = ("lower", "upper")
+TIME_KEYS = ("upper_delay_s", "line_time_s")
 # Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
 TRANSLATION_DECIMALS = 12
 
@@ -36,14 +38,24 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    table.allow_only(("schema", "T_base_rig", "covariance", *SIDES))
+    table.allow_only(("schema", "T_base_rig", "covariance", "times", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)
     topics = [side.text("topic") if side.has("topic") else "" for side in (lower, upper)]
     mounted = [_mounted(side, folder, f"T_rig_{side.path}") for side in (lower, upper)]
     cameras = (mounted[0].camera, mounted[1].camera)
     covariance = read_covariance(table.table("covariance"), cameras) if table.has("covariance") else None
-    return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]), covariance)
+    times = _times(table.table("times")) if table.has("times") else ShutterTimes()
+    return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]), covariance, times)
+
+
+def _times(table: ValidatedTable) -> ShutterTimes:
+    table.allow_only(TIME_KEYS)
+    delay_s, line_s = (table.number(key) if table.has(key) else 0.0 for key in TIME_KEYS)
+    try:
+        return ShutterTimes(delay_s, line_s)
+    except CalibError as error:
+        raise CalibError(f"{table.file}: {table.path}: {error}") from error
 
 
 def _mounted(table: ValidatedTable, folder: Path | None, transform: str) -> MountedCamera:
@@ -92,6 +104,10 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
         parts.append(intrinsics_text(side, mounted.camera))
         if mounted.mask is not None:
             parts.append(mask_text(side, mounted.mask, (images or {}).get(side, "")))
+    if rig.times != ShutterTimes():
+        values = (rig.times.upper_delay_s, rig.times.line_time_s)
+        parts.append("\n[times]\n")
+        parts += [f"{key} = {number_text(value)}\n" for key, value in zip(TIME_KEYS, values, strict=True)]
     if rig.covariance is not None:
         parts.append(covariance_text(rig.covariance))
     return "".join(parts)

@@ -85,11 +85,13 @@ class PairConfig:
 
 @dataclass(frozen=True, slots=True)
 class TimingConfig:
-    """Times of exposure of the cameras, beside the stamps."""
+    """Times of exposure of the cameras, beside the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
 
     line_time_us: float = knob(0.0, "rolling shutter: time from the exposure of an image row to that of the next, us; "
-                               "the stamp is that of the first row; 0: global shutter", low=0, high=1000)
-    upper_delay_ms: float = knob(0.0, "time by which the upper camera's exposure is later than the stamps say, ms",
+                               "the stamp is that of the first row; 0: as in the rig's file, or global", low=0,
+                               high=1000)
+    upper_delay_ms: float = knob(0.0, "time by which the upper camera's exposure is later than the stamps say, ms; "
+                                 "0: as in the rig's file",
                                  low=-1000, high=1000)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from calib import se3
 from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array
-from calib.rig import Rig
+from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 
 ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras: about a pixel
@@ -18,14 +18,7 @@ TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]  # the baseline's length stays
 # Times of exposure, and one step of each: some tenths of a pixel at walking speed.
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
 TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
-
-
-@dataclass(frozen=True, slots=True)
-class ShutterTimes:
-    """Times of exposure against the stamps: of the upper camera, and from one image row of a camera to the next."""
-
-    upper_delay_s: float = 0.0
-    line_time_s: float = 0.0
+S_PER_MS, S_PER_US = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +53,10 @@ class RigParameters:
     @property
     def values(self) -> Array:
         """Values (P,) at no step, in the parameters' own units; the transform's are zero, in radians."""
-        return np.concatenate([self.lower.start, self.upper.start, np.zeros(len(TRANSFORM_NAMES) + len(self.times))])
+        times = self.rig.times
+        of_rig = {UPPER_DELAY: times.upper_delay_s / S_PER_MS, LINE_TIME: times.line_time_s / S_PER_US}
+        return np.concatenate([self.lower.start, self.upper.start, np.zeros(len(TRANSFORM_NAMES)),
+                               [of_rig[name] for name in self.times]])
 
     @property
     def units(self) -> Array:
@@ -84,7 +80,7 @@ class RigParameters:
         lower = replace(rig.lower, camera=self.lower.camera_at(steps[:first]))
         upper = replace(rig.upper, camera=self.upper.camera_at(steps[first:second]),
                         T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
-        return replace(rig, lower=lower, upper=upper, covariance=None)
+        return replace(rig, lower=lower, upper=upper, covariance=None, times=self.times_at(steps))
 
     def transform_steps(self, rig: Rig) -> Array:
         """Return steps (P,) to the transform between another rig's cameras; cameras and times stay."""
@@ -98,7 +94,9 @@ class RigParameters:
         return steps
 
     def times_at(self, steps: Array) -> ShutterTimes:
-        """Return the times of exposure after steps (P,)."""
+        """Return the times of exposure after steps (P,); a time that is no parameter stays that of the rig."""
         values = dict(zip(self.times, steps[len(self.rig_names):].tolist(), strict=True))
-        return ShutterTimes(1e-3 * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
-                             1e-6 * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0))
+        start = self.rig.times
+        return ShutterTimes(
+            start.upper_delay_s + S_PER_MS * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
+            start.line_time_s + S_PER_US * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0))

@@ -16,7 +16,7 @@ from calib.fit.drive_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, 
 from calib.fit.drive_prior import baseline_by_prior, nominal_sigmas, prior_information
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
-from calib.rig import Rig
+from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
 from omnid.calibration.drive_observations import Drives, Topics, collect, observe_pairs
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
@@ -37,6 +37,8 @@ START_DISTORTION = ("p1", "p2")  # until the model is chosen
 MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
 MAX_CHANGE_SIGMAS = 4.0  # of a nominal rig's sigmas: intrinsics
 TIMES = (UPPER_DELAY, LINE_TIME)
+DIRECTION_NAMES = TRANSFORM_NAMES[3:]
+SYNCHRONOUS_S = 3e-3  # largest difference of stamps during which nothing moves that counts
 # Times below these are those of synchronous cameras with global shutters.
 MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
 
@@ -62,10 +64,9 @@ class DriveCalibration:
 
     @property
     def times(self) -> list[tuple[str, float]]:
-        """Keys of the configuration and values of the times of exposure that differ from none."""
-        times = self.adjustment.parameters.times_at(self.adjustment.state.steps)
-        values = {"camera.upper_delay_ms": 1e3 * times.upper_delay_s, "camera.line_time_us": 1e6 * times.line_time_s}
-        return [(key, value) for key, value in values.items() if value]
+        """Names and values of the rig's times of exposure that differ from none."""
+        values = {UPPER_DELAY: 1e3 * self.rig.times.upper_delay_s, LINE_TIME: 1e6 * self.rig.times.line_time_s}
+        return [(name, value) for name, value in values.items() if value]
 
     @property
     def distance_m(self) -> float:
@@ -93,7 +94,7 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
         report(str(score))
     times = significant_times(found)
     if (best_distortion(scores), times) != (distortion, TIMES):
-        parameters = RigParameters.about(before, best_distortion(scores), times)
+        parameters = RigParameters.about(_with_times(before, times), best_distortion(scores), times)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
     require_same_rig(parameters, found.state.steps)
     first_sigma = observation_sigma(before, found, drives.fixed)
@@ -104,11 +105,12 @@ def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics:
                report: Report) -> tuple[DriveAdjustment, Drives]:
     """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before."""
     parameters, steps = start
+    rig = parameters.at(steps)
     for number in range(1, MAX_ROUNDS + 1):
-        drives = collect(logs, parameters.at(steps), topics, config)
+        drives = collect(logs, rig, topics, config)
         found = _adjusted(parameters, steps, drives)
-        moved = scale_change(found, parameters.at(steps))
-        steps = found.state.steps
+        moved = scale_change(found, rig)
+        steps, rig = found.state.steps, _with_times(found.rig, significant_times(found))
         report(f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
                f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %")
         if number >= ROUNDS and abs(moved) < SETTLED:
@@ -154,9 +156,16 @@ def _calibration(before: Rig, found: DriveAdjustment, known: tuple[tuple[DriveMo
     return DriveCalibration(before, rig, found, scores, first_sigma, lengths, drive_structure(found), level, drives)
 
 
+def _with_times(rig: Rig, kept: tuple[str, ...]) -> Rig:
+    """Return the rig without the times of exposure that are not kept."""
+    times = ShutterTimes(rig.times.upper_delay_s if UPPER_DELAY in kept else 0.0,
+                         rig.times.line_time_s if LINE_TIME in kept else 0.0)
+    return replace(rig, times=times)
+
+
 def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
     """Return the names of the times of exposure that differ from none."""
-    names, values = found.parameters.names, found.state.steps * found.parameters.units
+    names, values = found.parameters.names, found.parameters.values + found.state.steps * found.parameters.units
     sigmas = found.sigmas * found.parameters.units
     return tuple(name for name, value, sigma in zip(names, values, sigmas, strict=True)
                  if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma))
@@ -215,9 +224,12 @@ def _straightened(log: Path, parameters: RigParameters, topics: Topics, config: 
     # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     prior = prior_information(parameters, rig)
+    apart_s = float(np.median([abs(pair.skew_s) for pair in pairs]))
     for _ in range(PAIR_ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
         steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)
+        if apart_s > SYNCHRONOUS_S:  # the motion between the exposures looks like a direction of the baseline
+            steps[[parameters.names.index(name) for name in DIRECTION_NAMES]] = 0.0
     finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
     report(finding.summary)
     return steps

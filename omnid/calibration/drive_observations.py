@@ -20,7 +20,7 @@ from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations,
 from omnid.core.rig.rig_check import match
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import FramePair, OdometryUpdate
+from omnid.messages import FramePair, OdometryUpdate, Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.odometry import OdometryStage
@@ -103,7 +103,7 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
     reader = open_log(log, topics, place.rig)
     try:
         landmarks = DriveLandmarks(place.model(NOISE_PX))
-        T_rig_odom, twists = list[Array](), list[Array]()
+        T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
         newest = np.eye(4)
         choice = _KeyframeChoice(_spacing(reader, most))
         for update, twist in _with_twists(_updates(reader, place, config, log)):
@@ -115,15 +115,21 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
             landmarks.add(View(seen.lower, seen.upper, seen.visible, update.depth.disparity, T_odom_rect))
             T_rig_odom.append(se3.inverse(update.T_odom_rig))
             twists.append(twist)
+            delays_s.append(_stamp_delay_s(seen, place.rig))
     finally:
         reader.close()
     found = landmarks.observations()
     pixels = image_pixels(found, place.rig, place.cylinder)
     observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
     observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-    motion = KeyframeMotion(np.array(twists), np.zeros(len(twists)))
+    motion = KeyframeMotion(np.array(twists), np.array(delays_s))
     state = DriveState(np.array(T_rig_odom), found.points[used], np.zeros(0), motion)
     return Drives(state, observations, (0,), T_rig_odom[-1] @ newest)
+
+
+def _stamp_delay_s(seen: Panoramas, rig: Rig) -> float:
+    """Return the upper minus the lower stamp of a pair; the rig's delay of the exposures is a parameter beside it."""
+    return seen.times.skew_s - rig.times.upper_delay_s if seen.times else -rig.times.upper_delay_s
 
 
 def _spacing(reader: LogReader, most: int) -> int:

@@ -85,11 +85,11 @@ def _decoded(pair: tuple[Frame, Frame]) -> tuple[Image, Image] | None:
         return None
 
 
-def paired(frames: Iterator[Frame]) -> Iterator[tuple[Frame, Frame]]:
+def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Iterator[tuple[Frame, Frame]]:
     """Yield pairs of lower and upper frames with nearly equal stamps, from frames in order of stamps, undecoded."""
     waiting: Frame | None = None
     for frame in frames:
-        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= TOLERANCE_NS:
+        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= tolerance_ns:
             yield (waiting, frame) if frame.camera == "upper" else (frame, waiting)
             waiting = None
         else:

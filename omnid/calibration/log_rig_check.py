@@ -14,7 +14,7 @@ from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
 from drivers.errors import DriverError
 from drivers.logs.mcap_reader import LogReader
-from omnid.calibration.image_pairs import SIDES, paired
+from omnid.calibration.image_pairs import SIDES, TOLERANCE_NS, paired
 from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_check import RigCheck, RigFinding
 from omnid.errors import OmnidError
@@ -51,15 +51,22 @@ def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) 
 
 
 def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
-    """Read at most PAIRS pairs, evenly spread over the log; raises OmnidError if none has the rig's size."""
-    stride = max(1, (sum(1 for _ in paired(reader.frames())) - 1) // PAIRS + 1)
+    """Read at most PAIRS pairs, evenly spread over the log; raises OmnidError if none has the rig's size.
+
+    Cameras that are not synchronised are paired as in a run: within half a period.
+    """
+    stamps = {camera: [frame.stamp_ns for frame in reader.frames() if frame.camera == camera] for camera in SIDES}
+    steps = [step for own in stamps.values() for step in np.diff(sorted(own)).tolist() if step > 0]
+    within_ns = max(TOLERANCE_NS, float(np.median(steps)) / 2 if steps else 0.0)
+    stride = max(1, (min(map(len, stamps.values())) - 1) // PAIRS + 1)
     decode, found = Decoder(rig), list[FramePair]()
-    for number, (lower, upper) in enumerate(paired(reader.frames())):
+    for number, (lower, upper) in enumerate(paired(reader.frames(), within_ns)):
         if number % stride:
             continue
         images = decode(lower), decode(upper)
+        skew_s = (upper.stamp_ns - lower.stamp_ns) * 1e-9
         if images[0] is not None and images[1] is not None:
-            found.append(FramePair(number, lower.stamp_ns, images[0], images[1]))
+            found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
     if not found:
         raise OmnidError("calibrate check: no pair of images in the log; "
                          f"{decode.fault or 'expected nearly equal stamps of both cameras'}")

@@ -106,7 +106,9 @@ def describe(found: DriveCalibration) -> list[str]:
         lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
     if not np.all(adjustment.seen):
         lines.append("parameters of which the drive tells nothing stay near their start")
-    lines += [f"set {key} = {value:.3g} in the configuration: the images were exposed so" for key, value in found.times]
+    if found.times:
+        times = ", ".join(f"{name} {value:.3g}" for name, value in found.times)
+        lines.append(f"times of exposure: {times}: in the table [times] of the file, where runs read them")
     if found.level_rad:
         lines.append(f"the rig frame was turned by {np.rad2deg(found.level_rad):.2f} deg, so that the drive lies in "
                      "the x-y plane of the base")

@@ -31,7 +31,8 @@ class Dewarp:
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
         timing = timing or TimingConfig()
-        self._upper_delay_s, line_s = timing.upper_delay_ms * 1e-3, timing.line_time_us * 1e-6
+        self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
+        line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
         tables = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper)]
         self._rows_s = tables if line_s else [None, None]
@@ -54,7 +55,7 @@ class Dewarp:
 
     def _times(self, skew_s: float) -> ExposureTimes | None:
         """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""
-        skew_s += self._upper_delay_s
+        skew_s += self.upper_delay_s
         lower_s, upper_s = self._rows_s
         return None if skew_s == 0 and lower_s is None else ExposureTimes(skew_s, lower_s, upper_s)
 

@@ -12,7 +12,7 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 
 
@@ -149,3 +149,16 @@ def test_damaged_text_is_a_calib_error_or_a_rig(ocam_rig: Rig) -> None:
     for deep in ("[" * 5000, "a = " + "[" * 5000, "x = " + "9" * 5000):
         with pytest.raises(CalibError):
             parse_rig(deep)
+
+
+def test_times_of_exposure_are_kept_and_bounded(omni_rig: Rig) -> None:
+    timed = replace(omni_rig, times=ShutterTimes(7.25e-3, -26e-6))
+    assert parse_rig(rig_toml(timed)).times == timed.times
+    assert "[times]" not in rig_toml(omni_rig) and parse_rig(rig_toml(omni_rig)).times == ShutterTimes()
+    text = rig_toml(timed)
+    for old, new, message in (("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
+                              ("upper_delay_s = 0.00725", "upper_delay_ms = 7.0", "unknown key"),
+                              ("line_time_s = -2.6e-05", "line_time_s = nan", "times.line_time_s: expected a finite")):
+        assert old in text
+        with pytest.raises(CalibError, match=message):
+            parse_rig(text.replace(old, new))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from calib.fit.drive_bundle import DriveAdjustment
 from calib.fit.drive_parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion
 from calib.models.camera import Array
-from calib.rig import Rig
+from calib.rig import Rig, ShutterTimes
 from omnid.calibration.drive import is_nominal, require_same_rig, significant_times
 from omnid.errors import OmnidError
 from tests.simulation.rigs import make_rig, nominal_rig, with_real_mirrors
@@ -68,6 +70,16 @@ def test_a_camera_aside_is_judged_after_tracking_only() -> None:
 def test_nominal_rigs_are_recognised() -> None:
     assert is_nominal(nominal_rig(with_real_mirrors(MEASURED, 1)))
     assert not is_nominal(MEASURED)
+
+
+def test_times_of_exposure_are_those_of_the_file_and_the_change() -> None:
+    parameters = RigParameters.about(replace(MEASURED, times=ShutterTimes(4e-3, 20e-6)), times=(UPPER_DELAY,))
+    steps = np.zeros(len(parameters.names))
+    steps[-1] = 2.0 / parameters.units[-1]
+    assert parameters.at(steps).times == parameters.times_at(steps)
+    assert parameters.times_at(steps).upper_delay_s == pytest.approx(6e-3)
+    assert parameters.times_at(steps).line_time_s == 20e-6
+    assert parameters.values[-1] == pytest.approx(4.0)
 
 
 def test_times_of_exposure_count_if_they_are_significant() -> None:

@@ -16,6 +16,8 @@ from omnid.calibration.log_rig_check import RigCheckResult, check_rig, open_log,
 from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
+from tests.simulation import build, write_log
+from tests.simulation.readout import Readout
 from tests.simulation.rigs import with_upper_rotated
 
 Turn = tuple[float, float, float]
@@ -29,6 +31,15 @@ def pairs(scene: Path) -> list[FramePair]:
 
 def check_rotated(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
     return check_rig(pairs, with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
+
+
+def test_images_that_are_not_synchronous_make_pairs(tmp_path: Path) -> None:
+    """Stamps 40 ms apart, with a period of 100 ms: nearer to no other image."""
+    run = build("turns", 3, 128, 4)
+    write_log(tmp_path, run.rig, run.poses, run.scene, readout=Readout(skew_ms=(40.0, 40.0)), supersample=1)
+    rig = read_rig(tmp_path / "rig.toml")
+    found = read_rig_pairs(open_log(tmp_path / "log.mcap", (None, None), rig), rig)
+    assert [pair.skew_s for pair in found] == pytest.approx([0.04] * 4)
 
 
 def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
