@@ -1,0 +1,175 @@
+"""Pose graph on SE(3): sparse Gauss-Newton in which wrong loops lose their weight (graduated non-convexity).
+
+Nodes are poses, edges are measured relative poses. Edges of the odometry are believed; each loop has a weight from 0 to
+1 by the truncated least squares of Yang, Antonante, Tzoumas, Carlone 2020, "Graduated Non-Convexity for Robust Spatial
+Perception" (GNC-TLS): the cost begins nearly convex, and a factor mu makes it steeper until every loop either counts in
+full or not at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import bsr_matrix, coo_matrix, csc_matrix, diags
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from calib import se3
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+LARGEST_SQUARED: Final = 16.8  # squared Mahalanobis distance of a right loop: 99 % of chi-squared, 6 degrees of freedom
+STEEPER: Final = 2.0  # factor of mu from step to step
+MAX_STEPS: Final = 60  # of Gauss-Newton
+CONVERGED: Final = 1e-5  # m and rad: a smaller step is the last one, once all weights are 0 or 1
+UNDECIDED: Final = 1e-3  # distance of a weight from 0 and 1
+ACCEPTED: Final = 0.5  # weight from which a loop counts as accepted
+DAMPING: Final = 1e-6  # added to the diagonal, 1/m^2 and 1/rad^2, so that nodes which no edge holds stay where they are
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEdges:
+    """Measured poses of nodes b in nodes a, with the covariance [t; r] of small motions of b in its own axes."""
+
+    pairs: Indices  # (M, 2) a, b
+    T_a_b: Array  # (M, 4, 4)
+    covariance: Array  # (M, 6, 6) positive definite
+    is_loop: Flags  # (M,) True: may be wrong
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    @staticmethod
+    def empty() -> PoseEdges:
+        """Return no edges."""
+        return PoseEdges(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0, bool))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphResult:
+    """Poses after the optimisation, and the edges that agree with them."""
+
+    poses: Array  # (N, 4, 4)
+    weights: Array  # (M,) 1 for odometry, 0 to 1 for loops
+    squared: Array  # (M,) squared Mahalanobis distances of the edges from the result
+    connected: Flags  # (N,) nodes that odometry and accepted loops join to a fixed node
+    covariance: Array  # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite: not connected
+    steps: int  # of Gauss-Newton
+    converged: bool
+
+    @property
+    def accepted(self) -> Flags:
+        """Flags (M,) of the edges that count."""
+        return self.weights > ACCEPTED
+
+
+def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> PoseGraphResult:
+    """Return the poses (N, 4, 4) that best explain all edges, from a start.
+
+    fixed: flags (N,) of the nodes that stay where they are, such as those of a saved map; None: the first node. Parts
+    that no edge joins to a fixed node stay where they are.
+    """
+    if fixed is None:
+        fixed = np.arange(len(poses)) == 0
+    graph, loop, weights = _Graph(edges, fixed), edges.is_loop, np.ones(len(edges))
+    residual, J = graph.linearised(poses)
+    mu, steps, converged = _first_mu((residual[loop] ** 2).sum(axis=1)), 0, False
+    while not converged and steps < MAX_STEPS:
+        # 1. The weights of the loops at this mu; 2. one step of Gauss-Newton; 3. a steeper cost.
+        weights[loop] = _weights((residual[loop] ** 2).sum(axis=1), mu)
+        change = graph.solve(residual, J, weights)
+        poses = poses @ se3.exp(change)
+        residual, J = graph.linearised(poses)
+        decided = bool((np.minimum(weights, 1 - weights) < UNDECIDED).all())
+        converged = decided and float(np.abs(change).max()) < CONVERGED
+        mu, steps = STEEPER * mu, steps + 1
+    connected = _connected(edges.pairs[weights > ACCEPTED], fixed)
+    covariance = graph.last_covariance(J, weights) if connected[-1] else np.full((6, 6), np.inf)
+    return PoseGraphResult(poses, weights, (residual**2).sum(axis=1), connected, covariance, steps, converged)
+
+
+class _Graph:
+    """The linear system of the edges; fixed nodes do not move."""
+
+    def __init__(self, edges: PoseEdges, fixed: Flags) -> None:
+        self.edges = edges
+        self._W = np.linalg.inv(np.linalg.cholesky(edges.covariance))  # W S W^T = I
+        self._moves = ~fixed
+        self._fixed = diags(np.repeat(np.where(fixed, 1.0, DAMPING), 6))
+
+    def linearised(self, T: Array) -> tuple[Array, Array]:
+        """Return residuals (M, 6) and derivatives (M, 2, 6, 6), those by fixed nodes 0."""
+        residual, J = linearised(T, self.edges, self._W)
+        return residual, J * self._moves[self.edges.pairs][..., None, None]
+
+    def solve(self, residual: Array, J: Array, weight: Array) -> Array:
+        """Return the small motions (N, 6) of Gauss-Newton."""
+        root = np.sqrt(weight)
+        stacked = self._stacked(J, root)
+        gradient = stacked.T @ (root[:, None] * residual).ravel()
+        return np.asarray(-self._factorised(stacked).solve(gradient)).reshape(-1, 6)
+
+    def last_covariance(self, J: Array, weight: Array) -> Array:
+        """Return the covariance (6, 6) of the last node: a block of the inverse of the normal equations."""
+        if not self._moves[-1]:
+            return np.zeros((6, 6))
+        columns = np.zeros((6 * len(self._moves), 6))
+        columns[-6:] = np.eye(6)
+        found = self._factorised(self._stacked(J, np.sqrt(weight))).solve(columns)[-6:]
+        return np.asarray((found + found.T) / 2)
+
+    def _stacked(self, J: Array, root: Array) -> Any:
+        """Return the derivatives as a sparse matrix (6 M, 6 N), scaled by the roots (M,) of the weights."""
+        count = len(self.edges)
+        blocks = (root[:, None, None, None] * J).reshape(-1, 6, 6)
+        shape = (6 * count, 6 * len(self._moves))
+        return bsr_matrix((blocks, self.edges.pairs.ravel(), 2 * np.arange(count + 1)), shape=shape)
+
+    def _factorised(self, stacked: Any) -> Any:
+        """Return the factorised normal equations."""
+        H = csc_matrix(stacked.T @ stacked + self._fixed)
+        return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=6, panel_size=6,  # blocks of 6 x 6
+                    options={"SymmetricMode": True})
+
+
+def linearised(T: Array, edges: PoseEdges, W: Array) -> tuple[Array, Array]:
+    """Return whitened residuals (M, 6), and their derivatives (M, 2, 6, 6) by small motions of the nodes a and b.
+
+    The residual of an edge is W log(T_a_b^-1 T_a^-1 T_b), and a node moves by T exp(x).
+    """
+    T_b_a = se3.inverse(T[edges.pairs[:, 1]]) @ T[edges.pairs[:, 0]]
+    residual = se3.log(se3.inverse(T_b_a @ edges.T_a_b))
+    by_b = W @ _inverse_right_jacobian(residual)
+    return (W @ residual[..., None])[..., 0], np.stack([-by_b @ se3.adjoint(T_b_a), by_b], axis=1)
+
+
+def _inverse_right_jacobian(xi: Array) -> Array:
+    """Return the derivative (M, 6, 6) of log(exp(xi) exp(x)) by x at 0: its series up to the second order."""
+    ad = np.zeros((len(xi), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(xi[:, 3:])
+    ad[:, :3, 3:] = se3.hat(xi[:, :3])
+    return np.asarray(np.eye(6) + ad / 2 + ad @ ad / 12)
+
+
+def _first_mu(squared: Array) -> float:
+    """Return the factor with which the cost is convex for the largest of the squared residuals."""
+    largest = float(squared.max(initial=0.0))
+    return LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED)
+
+
+def _weights(squared: Array, mu: float) -> Array:
+    """Return weights 0..1 of loops with squared residuals (L,)."""
+    ratio = np.sqrt(LARGEST_SQUARED / np.maximum(squared, 1e-12))
+    return np.asarray(np.clip(ratio * np.sqrt(mu * (mu + 1)) - mu, 0.0, 1.0))
+
+
+def _connected(pairs: Indices, fixed: Flags) -> Flags:
+    """Return flags (N,) of the nodes that pairs (K, 2) of nodes join to a fixed node."""
+    joins = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(fixed), len(fixed)))
+    _, label = connected_components(joins, directed=False)
+    return np.isin(label, label[fixed])
