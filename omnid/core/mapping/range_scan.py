@@ -1,0 +1,64 @@
+"""Range scan of a keyframe: the nearest obstacle in each direction, as a planar laser scanner would see it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SECTORS: Final = 360
+NEAREST_SHARE: Final = 0.2  # of the points of a sector that are nearer than its obstacle, as some matches are false
+MIN_POINTS: Final = 3  # of a sector; fewer may be false matches
+MAX_RANGE_M: Final = 12.0
+FILLED_SECTORS: Final = 4  # longest gap that is filled between two sectors of one surface
+SURFACE_RATIO: Final = 1.15  # of the ranges on both sides of such a gap, at most
+
+RangeScan = NDArray[np.float32]  # (SECTORS,) m, from azimuth -pi on; NaN: nothing was seen there
+
+
+def azimuths() -> Array:
+    """Return the azimuths (SECTORS,) [rad] of the sectors' middles."""
+    return np.asarray((np.arange(SECTORS) + 0.5) * (2 * math.pi / SECTORS) - math.pi)
+
+
+def range_scan(points: Array, heights_m: tuple[float, float]) -> RangeScan:
+    """Return the ranges of the nearest obstacles among points (N, 3) [m] of a frame with z up, between two heights."""
+    x, y, z = points.T
+    ranges = np.hypot(x, y)
+    usable = (z >= heights_m[0]) & (z <= heights_m[1]) & (ranges < MAX_RANGE_M) & (ranges > 0)
+    ranges = ranges[usable]
+    turned = (np.arctan2(y[usable], x[usable]) + math.pi) * (SECTORS / (2 * math.pi))
+    sector = np.floor(turned).astype(np.intp) % SECTORS
+    order = np.lexsort((ranges, sector))
+    count = np.bincount(sector, minlength=SECTORS)
+    first = np.cumsum(count) - count
+    known = count >= MIN_POINTS
+    chosen = first[known] + np.floor(NEAREST_SHARE * count[known]).astype(np.intp)
+    scan = np.full(SECTORS, np.nan, np.float32)
+    scan[known] = ranges[order[chosen]]
+    return _filled(scan)
+
+
+def _filled(scan: RangeScan) -> RangeScan:
+    """Return the scan with short gaps filled, if the ranges on both sides are those of one surface.
+
+    Stereo sees edges: a wall between two of them is no gap.
+    """
+    known = np.flatnonzero(np.isfinite(scan))
+    if len(known) < 2:
+        return scan
+    following = np.roll(known, -1)
+    gap = (following - known) % SECTORS - 1
+    a, b = scan[known], scan[following]
+    is_surface = (gap >= 1) & (gap <= FILLED_SECTORS) & (np.maximum(a, b) <= SURFACE_RATIO * np.minimum(a, b))
+    filled = scan.copy()
+    for step in range(1, FILLED_SECTORS + 1):
+        chosen = is_surface & (gap >= step)
+        share = step / (gap[chosen] + 1)
+        # A flat wall is linear in 1 / range, as long as the sectors are narrow.
+        filled[(known[chosen] + step) % SECTORS] = 1 / ((1 - share) / a[chosen] + share / b[chosen])
+    return filled

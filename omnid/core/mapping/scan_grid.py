@@ -1,0 +1,105 @@
+"""Occupancy grid of range scans at poses: obstacles, and the space between the robot and them (ray casting).
+
+The scans are those of keyframes, so the grid is drawn again where keyframes move: a loop that closes moves the map.
+Log odds with limits: Elfes 1989, "Using occupancy grids for mobile robot perception and navigation"; the limits, by
+which later views clear what has gone: Hornung et al. 2013, "OctoMap", section 3.4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
+from omnid.core.mapping.range_scan import SURFACE_RATIO, RangeScan, azimuths
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int8]
+
+MAX_CELLS: Final = 8_000_000  # of the grid, 2 bytes each
+HIT: Final = 9  # tenths of log odds that a scan adds to a cell with an obstacle
+MISS: Final = 4  # and takes from one that it sees through
+LIMITS: Final = (-20, 35)  # tenths of log odds: nine free views clear a wall that was seen often
+OCCUPIED_FROM: Final = 14  # tenths of log odds: two hits more than misses
+FREE_UNTIL: Final = -4  # tenths of log odds: one miss
+SHORTER: Final = 0.02  # 1/m: the free space of a range r ends r^2 times it before the obstacle, as the noise of stereo
+SHIFT: Final = 4  # fractional bits of the corners that are drawn
+
+
+class ScanGrid:
+    """Log odds of cells, drawn scan by scan; the oldest first, because later ones count more."""
+
+    def __init__(self, low: Array, high: Array, cell_m: float) -> None:
+        """low, high: corners (2,) [m] of the area; cells double in size until there are at most MAX_CELLS."""
+        while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > MAX_CELLS:
+            cell_m *= 2
+        self._cell_m = cell_m
+        self._first = np.floor(low / cell_m)
+        width, height = (np.floor(high / cell_m) - self._first + 1).astype(int)
+        self._odds = np.zeros((height, width), np.int8)
+        self._seen = np.zeros((height, width), bool)
+
+    def add(self, scan: RangeScan, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Add a scan at a pose of its frame."""
+        known = np.isfinite(scan)
+        angle = azimuths() + yaw_rad
+        direction = np.column_stack([np.cos(angle), np.sin(angle)]) / self._cell_m
+        centre = np.array([x_m, y_m]) / self._cell_m - self._first
+        ends = centre + np.where(known, scan, 0.0)[:, None] * direction
+        window = self._window(ends, centre)
+        if window is None:
+            return
+        left, top, right, bottom = window
+        odds, seen = self._odds[top:bottom, left:right], self._seen[top:bottom, left:right]
+        free, hit = np.zeros(odds.shape, np.uint8), np.zeros(odds.shape, np.uint8)
+        # A cell's middle is an integer for OpenCV. Sectors without range are a corner at the robot: not seen.
+        seen_through = np.where(known, np.maximum(scan - self._cell_m - SHORTER * scan**2, 0.0), 0.0)
+        corners = np.rint((centre + seen_through[:, None] * direction - [left, top] - 0.5) * 2**SHIFT).astype(np.int32)
+        cv2.fillPoly(free, [corners], 1, shift=SHIFT)
+        _draw_hits(hit, scan, ends - [left, top])
+        change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
+        np.clip(odds + change, *LIMITS, out=odds)
+        seen |= (hit | free) > 0
+
+    def grid(self) -> Grid:
+        """Return occupied, free and unknown cells."""
+        cells = np.full(self._odds.shape, UNKNOWN, np.int8)
+        cells[self._seen & (self._odds <= FREE_UNTIL)] = FREE
+        cells[self._seen & (self._odds >= OCCUPIED_FROM)] = OCCUPIED
+        x, y = (self._first * self._cell_m).tolist()
+        return Grid(cells, self._cell_m, (x, y))
+
+    def _window(self, ends: Array, centre: Array) -> tuple[int, int, int, int] | None:
+        """Return left, top, right and bottom of the cells around ends (SECTORS, 2), None where none lies inside."""
+        corners = np.vstack([ends, centre])
+        low = np.clip(np.floor(corners.min(axis=0)) - 1, 0, None).astype(int)
+        high = np.minimum(np.ceil(corners.max(axis=0)) + 2, self._odds.shape[::-1]).astype(int)
+        return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (low < high).all() else None
+
+
+def scan_grid(scans: Sequence[RangeScan], poses: Array, cell_m: float) -> Grid:
+    """Return the grid of scans whose frames have the poses (K, 4, 4) in the map, the oldest first."""
+    farthest = [float(np.max(scan, where=np.isfinite(scan), initial=0.0)) + cell_m for scan in scans]
+    reach, xy = np.array(farthest)[:, None], poses[:, :2, 3]
+    low, high = (xy - reach, xy + reach) if len(scans) else (np.zeros((1, 2)), np.zeros((1, 2)))
+    drawn = ScanGrid(low.min(axis=0), high.max(axis=0), cell_m)
+    for scan, pose in zip(scans, poses, strict=True):
+        drawn.add(scan, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0]))
+    return drawn.grid()
+
+
+def _draw_hits(hit: NDArray[np.uint8], scan: RangeScan, ends: Array) -> None:
+    """Draw the obstacles of a scan: its ends (SECTORS, 2) [cells], and the lines between those of one surface."""
+    following = np.roll(scan, -1)
+    with np.errstate(invalid="ignore"):
+        is_surface = np.maximum(scan, following) <= SURFACE_RATIO * np.minimum(scan, following)  # False for NaN
+    cells = np.floor(ends).astype(np.int32)
+    lines = np.stack([cells, np.roll(cells, -1, axis=0)], axis=1)[is_surface]
+    cv2.polylines(hit, list(lines), False, 1)
+    inside = np.isfinite(scan) & ((cells >= 0) & (cells < hit.shape[::-1])).all(axis=1)
+    hit[cells[inside, 1], cells[inside, 0]] = 1

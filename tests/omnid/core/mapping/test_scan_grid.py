@@ -1,0 +1,66 @@
+"""Grid of range scans: walls, free space, what has gone is cleared, and the map moves with its keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
+from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.mapping.scan_grid import MAX_CELLS, scan_grid
+from tests.omnid.core.mapping.rooms import box, pose, scan_of
+
+ROOM = box((-3.0, -2.0), (4.0, 2.5))
+PATH = np.array([pose(x, 0.2 * x, 0.3 * x) for x in np.arange(-1.5, 1.5, 0.3)])
+
+
+def at(grid: Grid, x: float, y: float) -> int:
+    column, row = (int(np.floor(value / grid.cell_m)) - round(corner / grid.cell_m)
+                   for value, corner in zip((x, y), grid.corner, strict=True))
+    return int(grid.cells[row, column])
+
+
+def near(grid: Grid, x: float, y: float) -> set[int]:
+    """Return the values of a cell and its eight neighbours."""
+    return {at(grid, x + dx, y + dy) for dx in (-0.05, 0, 0.05) for dy in (-0.05, 0, 0.05)}
+
+
+def test_walls_are_occupied_the_room_is_free_the_rest_unknown() -> None:
+    grid = scan_grid([scan_of(ROOM, T, 0.01, n) for n, T in enumerate(PATH)], PATH, 0.05)
+    for y in np.arange(-1.9, 2.4, 0.1):
+        assert OCCUPIED in near(grid, -3.0, y) and OCCUPIED in near(grid, 4.0, y)
+        assert {at(grid, x, y) for x in np.arange(-2.7, 3.7, 0.1)} == {FREE} or abs(y - 0.25) > 1.9
+        assert at(grid, -3.3, y) == at(grid, 4.3, y) == UNKNOWN
+
+
+def test_an_obstacle_that_has_gone_is_cleared_and_a_new_one_appears() -> None:
+    T = np.tile(pose(0, 0, 0), (30, 1, 1))
+    before, after = np.concatenate([ROOM, box((1, 1), (1.3, 1.3))]), np.concatenate([ROOM, box((1, -1), (1.3, -0.7))])
+    scans = [scan_of(before, T[0])] * 18 + [scan_of(after, T[0])] * 12
+    grid = scan_grid(scans[:18], T[:18], 0.05)
+    assert OCCUPIED in near(grid, 1.0, 1.0) and at(grid, 1.0, -0.7) == FREE
+    grid = scan_grid(scans, T, 0.05)
+    assert near(grid, 1.0, 1.0) == {FREE} and OCCUPIED in near(grid, 1.0, -0.7)
+
+
+def test_the_map_moves_with_its_keyframes() -> None:
+    scans = [scan_of(ROOM, T) for T in PATH]
+    moved = pose(1.0, 2.0, np.pi / 2)
+    grid = scan_grid(scans, moved @ PATH, 0.05)
+    for y in np.arange(-1.9, 2.4, 0.1):
+        x_m, y_m = (moved @ [4.0, y, 0, 1])[:2]
+        assert OCCUPIED in near(grid, x_m, y_m)
+    assert at(grid, 1.0, 2.0) == FREE
+
+
+def test_directions_without_a_range_stay_unknown() -> None:
+    scan = scan_of(ROOM, pose(0, 0, 0))
+    scan[: SECTORS // 2] = np.nan  # azimuths below 0
+    grid = scan_grid([scan] * 3, np.tile(np.eye(4), (3, 1, 1)), 0.05)
+    assert at(grid, 0.5, -0.5) == UNKNOWN and at(grid, 0.5, 0.5) == FREE
+
+
+def test_no_scan_is_no_map_and_a_large_area_gets_larger_cells() -> None:
+    assert set(scan_grid([], np.zeros((0, 4, 4)), 0.05).cells.ravel()) == {UNKNOWN}
+    far = np.array([pose(0, 0, 0), pose(900, 300, 0)])
+    grid = scan_grid([scan_of(ROOM, far[0])] * 2, far, 0.05)
+    assert grid.cells.size <= MAX_CELLS and grid.cell_m == 0.2
