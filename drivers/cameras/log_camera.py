@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 
 MAX_LOG_BYTES: Final = 1 << 30
 MIN_PACE, MAX_PACE = 0.001, 1000.0

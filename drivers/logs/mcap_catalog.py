@@ -9,7 +9,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from drivers.logs.mcap_records import PARSE_ERRORS, RecordError, parser
+from drivers.logs.ros_image import IMAGE_TYPES
 
+CDR, ROS1 = "cdr", "ros1"  # message encodings
 _MAX_CHANNELS = 4096
 _MAX_DEFINITION_BYTES = 2**20
 _MAX_NAME = 256  # characters
@@ -17,10 +19,11 @@ _MAX_ENCODING = 16  # characters
 
 
 class LogTopic(NamedTuple):
-    """Name and type of a topic; type is a ROS name such as sensor_msgs/msg/Image, '' where it is not CDR."""
+    """Name and type of a topic; type is a ROS name such as sensor_msgs/msg/Image, '' where it cannot be decoded."""
 
     name: str
     type: str
+    aligned: bool = True  # True: CDR; False: the serialisation of ROS 1
 
 
 class Catalog:
@@ -38,7 +41,7 @@ class Catalog:
         try:
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(parser(body))
-                self._types[schema.id] = _ros_name(schema.name[:_MAX_NAME])
+                self._types[schema.id] = ros_name(schema.name[:_MAX_NAME])
             else:
                 channel = Channel.read(parser(body))
                 self._channels[channel.id] = _truncated(channel)
@@ -50,12 +53,14 @@ class Catalog:
         channel = self._channels.get(channel_id)
         if channel is None:
             return None
-        known = channel.message_encoding == "cdr"
-        return LogTopic(channel.topic, self._types.get(channel.schema_id, "") if known else "")
+        kind, encoding = self._types.get(channel.schema_id, ""), channel.message_encoding
+        # Of ROS 1, images are all that is read.
+        known = encoding == CDR or (encoding == ROS1 and kind in IMAGE_TYPES)
+        return LogTopic(channel.topic, kind if known else "", encoding != ROS1)
 
     def topics(self) -> dict[str, str]:
         """Return topic name -> type."""
-        return dict(filter(None, map(self.topic, self._channels)))
+        return {topic.name: topic.type for topic in map(self.topic, self._channels) if topic is not None}
 
     def ids(self, topic: str) -> list[int]:
         """Return the channels of a topic: two recordings merged into one file have one each."""
@@ -68,7 +73,7 @@ def _truncated(channel: Channel) -> Channel:
     return Channel(channel.id, channel.topic[:_MAX_NAME], encoding, {}, channel.schema_id)
 
 
-def _ros_name(schema_name: str) -> str:
+def ros_name(schema_name: str) -> str:
     """Return package/msg/Type for this, for DDS (sensor_msgs::msg::dds_::Image_) and for ROS 1 (sensor_msgs/Image)."""
     parts = [part for part in re.split(r"/|::", schema_name) if part not in ("msg", "dds_")]
     return f"{parts[0]}/msg/{parts[1].rstrip('_')}" if len(parts) == 2 else schema_name

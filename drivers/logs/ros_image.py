@@ -1,8 +1,8 @@
-"""Decodes sensor_msgs/msg/Image and CompressedImage from CDR bytes, without copying the image.
+"""Decodes sensor_msgs/msg/Image and CompressedImage from the bytes of ROS 2 (CDR) or ROS 1, without copying the image.
 
 A decoder of its own, not a general one, since these two messages are nearly all of a log and invalid bytes must be
 detected. The layout is the OMG's CDR (RTPS 2.2, 10.2): a 4-byte header, then each number aligned to its own size,
-counted from the end of the header.
+counted from the end of the header. ROS 1 has the same members without header and alignment, little endian.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from drivers.errors import FrameDecodeError
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
 
 # cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
 _SYNONYMS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16",
@@ -37,57 +38,64 @@ class RosImage:
     bigendian: bool = False
 
 
-def parse_image(schema_name: str, message: memoryview) -> RosImage:
-    """Return the image in a CDR message of type IMAGE or COMPRESSED_IMAGE; raise FrameDecodeError where it is invalid.
+def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) -> RosImage:
+    """Return the image in a message of type IMAGE or COMPRESSED_IMAGE; raise FrameDecodeError where it is invalid.
+
+    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
     """
     try:
-        cdr = _CdrReader(message)
-        stamp_ns = _header(cdr)
-        return _raw(cdr, stamp_ns) if schema_name == IMAGE else _compressed(cdr, stamp_ns)
+        members = _CdrReader(message) if aligned else _Ros1Reader(message)
+        stamp_ns = _header(members)
+        return _raw(members, stamp_ns) if schema_name == IMAGE else _compressed(members, stamp_ns)
     except struct.error as error:
         raise FrameDecodeError(f"a {schema_name} of {len(message)} bytes is truncated") from error
 
 
-def _header(cdr: _CdrReader) -> int:
+def _header(members: _MemberReader) -> int:
     """Return the stamp of a std_msgs/Header [ns]."""
-    seconds, nanoseconds = cdr.number("i"), cdr.number("I")
+    members.sequence_number()
+    seconds, nanoseconds = members.number("i"), members.number("I")
     if seconds < 0 or nanoseconds >= 10**9:
         raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
-    cdr.string()  # frame_id, which is not used: the topic identifies the camera
+    members.string()  # frame_id, which is not used: the topic identifies the camera
     return seconds * 10**9 + nanoseconds
 
 
-def _raw(cdr: _CdrReader, stamp_ns: int) -> RosImage:
-    height, width, encoding = cdr.number("I"), cdr.number("I"), cdr.string()
-    bigendian, step = bool(cdr.number("B")), cdr.number("I")
-    return RosImage(stamp_ns, _SYNONYMS.get(encoding, encoding), cdr.octets(), width, height, step, bigendian)
+def _raw(members: _MemberReader, stamp_ns: int) -> RosImage:
+    height, width, encoding = members.number("I"), members.number("I"), members.string()
+    bigendian, step = bool(members.number("B")), members.number("I")
+    return RosImage(stamp_ns, _SYNONYMS.get(encoding, encoding), members.octets(), width, height, step, bigendian)
 
 
-def _compressed(cdr: _CdrReader, stamp_ns: int) -> RosImage:
+def _compressed(members: _MemberReader, stamp_ns: int) -> RosImage:
     """Return a compressed image; its first bytes decide the encoding, else the format field, which is free text."""
-    encoding, data = cdr.string(), cdr.octets()
+    encoding, data = members.string(), members.octets()
     if "jp" in encoding.lower():  # such as 'bgr8; jpeg compressed bgr8'
         encoding = "jpeg"
     elif "png" in encoding.lower():
         encoding = "png"
-    return RosImage(stamp_ns, _MAGIC.get(bytes(data[:_MAGIC_BYTES]), encoding), data)
+    return RosImage(stamp_ns, image_encoding(data, encoding), data)
 
 
-class _CdrReader:
-    """Reads the members of a CDR message in order; raises struct.error at the end of the bytes."""
+def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
+    """Return jpeg or png by the first bytes of an image file, `otherwise` where it is neither."""
+    return _MAGIC.get(bytes(data[:_MAGIC_BYTES]), otherwise)
 
-    def __init__(self, message: memoryview) -> None:
-        if len(message) < _CDR_HEADER_BYTES or message[0] != 0 or message[1] not in (0, 1):
-            start = bytes(message[:_CDR_HEADER_BYTES]).hex()
-            raise FrameDecodeError(f"a message starts with {start}, not with a CDR header")
-        self._order = "<" if message[1] else ">"  # CDR_LE or CDR_BE
-        self._body = message[_CDR_HEADER_BYTES:]
-        self._offset = 0
+
+class _MemberReader:
+    """Reads the members of a message in order; raises struct.error at the end of the bytes."""
+
+    def __init__(self, body: memoryview, order: str) -> None:
+        """order: "<" little endian, ">" big endian."""
+        self._order, self._body, self._offset = order, body, 0
+
+    def sequence_number(self) -> None:
+        """Skip the number that a header begins with in ROS 1."""
 
     def number(self, code: str) -> int:
         """Return a number; code: its format in struct."""
         size = struct.calcsize("=" + code)
-        self._offset += -self._offset % size  # alignment
+        self._offset += self._padding(size)
         value: int = struct.unpack_from(self._order + code, self._body, self._offset)[0]
         self._offset += size
         return value
@@ -104,3 +112,34 @@ class _CdrReader:
     def string(self) -> str:
         """Return a string, truncated to 256 bytes."""
         return bytes(self.octets()[:_MAX_STRING]).rstrip(b"\0").decode("utf-8", "replace")
+
+    def _padding(self, size: int) -> int:
+        """Return the bytes that are left out before a number of this size."""
+        raise NotImplementedError
+
+
+class _CdrReader(_MemberReader):
+    """Members in CDR."""
+
+    def __init__(self, message: memoryview) -> None:
+        if len(message) < _CDR_HEADER_BYTES or message[0] != 0 or message[1] not in (0, 1):
+            start = bytes(message[:_CDR_HEADER_BYTES]).hex()
+            raise FrameDecodeError(f"a message starts with {start}, not with a CDR header")
+        super().__init__(message[_CDR_HEADER_BYTES:], "<" if message[1] else ">")  # CDR_LE or CDR_BE
+
+    def _padding(self, size: int) -> int:
+        return -self._offset % size
+
+
+class _Ros1Reader(_MemberReader):
+    """Members as ROS 1 serialises them."""
+
+    def __init__(self, message: memoryview) -> None:
+        super().__init__(message, "<")
+
+    def sequence_number(self) -> None:
+        """Skip the number."""
+        self.number("I")
+
+    def _padding(self, size: int) -> int:
+        return 0

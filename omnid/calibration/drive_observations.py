@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion
 from calib.rig import Rig
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.calibration.log_rig_check import open_log
 from omnid.config import Config
 from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels

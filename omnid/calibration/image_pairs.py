@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
 from omnid.errors import OmnidError
 

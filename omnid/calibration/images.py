@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DriverError, FrameDecodeError
+from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray
-from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
-from drivers.logs.mcap_records import LogFile
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, parse_image
+from drivers.logs.image_log import ImageLog, LoggedImage
+from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
+from drivers.logs.mcap_records import RecordError
+from drivers.logs.ros_image import IMAGE_TYPES
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
@@ -25,14 +26,12 @@ SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".
 MAX_IMAGES = 400
 # Number of frames of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_FRAMES = 120
-# The part of a log that is scanned for its topics.
-SCAN_BYTES, SCAN_MESSAGES = 64 * 2**20, 2000
 
 
 def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
     """Read grey images of files, folders and patterns, or of a log's topic; raises OmnidError unless all are readable
     and of one size."""
-    logs = [source for source in sources if Path(source).suffix == ".mcap"]
+    logs = [source for source in sources if Path(source).suffix in LOG_SUFFIXES]
     if logs and len(sources) > 1:
         raise OmnidError(f"{logs[0]}: expected images, or one log alone; found {len(sources)} names")
     if topic and not logs:
@@ -94,19 +93,15 @@ def one_size(images: Images) -> None:
 
 
 def _of_log(path: Path, topic: str | None) -> Images:
-    file = LogFile(path)
-    try:
-        catalog = scan_channels(file, SCAN_BYTES, SCAN_MESSAGES)
-        chosen = _topic(path, catalog, topic)
-        stride = max(1, sum(1 for _ in _messages(file, catalog, chosen)) // LOG_FRAMES)
-        return dict(_frames(file, catalog, chosen, stride))
-    finally:
-        file.close()
+    with closing(open_image_log(path)) as log:
+        chosen = _topic(path, log, topic)
+        stride = max(1, sum(1 for _ in _images(log, chosen)) // LOG_FRAMES)
+        return dict(_frames(log, chosen, stride))
 
 
-def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
+def _topic(path: Path, log: ImageLog, topic: str | None) -> str:
     """Return the requested topic, or the only one with images."""
-    images = sorted(name for name, kind in catalog.topics().items() if kind in (IMAGE, COMPRESSED_IMAGE))
+    images = sorted(name for name, kind in log.topics().items() if kind in IMAGE_TYPES)
     if topic in images:
         return str(topic)
     if topic is None and len(images) == 1:
@@ -115,24 +110,18 @@ def _topic(path: Path, catalog: Catalog, topic: str | None) -> str:
     raise OmnidError(f"{path}: expected {wanted}, found image topics {', '.join(images) or '(none)'}")
 
 
-def _messages(file: LogFile, catalog: Catalog, topic: str) -> Iterator[LogMessage]:
-    for message in DataSection(file, catalog).messages():
-        found = catalog.topic(message.channel_id)
-        if found is not None and found.name == topic:
-            yield message
+def _images(log: ImageLog, topic: str) -> Iterator[LoggedImage]:
+    return (image for image in log.images() if image.topic == topic)
 
 
-def _frames(file: LogFile, catalog: Catalog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
+def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
     """Yield every stride-th image, named by its number, without those that cannot be decoded."""
-    for number, message in enumerate(_messages(file, catalog, topic)):
-        kind = catalog.topic(message.channel_id)
-        if number % stride or kind is None:
+    for number, logged in enumerate(_images(log, topic)):
+        if number % stride:
             continue
         try:
-            image = parse_image(kind.type, message.data())
+            image = logged.read()
             yield f"frame{number:06d}", gray(Frame(number, image.stamp_ns, "lower", image.encoding, image.data,
                                                    image.width, image.height, image.step, image.bigendian))
-        except (FrameDecodeError, DriverError):
+        except (FrameDecodeError, RecordError):
             continue
-
-

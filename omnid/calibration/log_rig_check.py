@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
 from drivers.errors import DriverError
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.calibration.image_pairs import SIDES, TOLERANCE_NS, paired
 from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_check import RigCheck, RigFinding

@@ -1,4 +1,4 @@
-"""`omnid log`: show the content of a recording, and recover one that is cut or corrupt."""
+"""`omnid log`: show the content of logs, and recover an MCAP file that is cut or corrupt."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ MAX_COLUMN = 60  # characters of a topic or a type
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `log` to the command line."""
-    parser = subparsers.add_parser("log", help="show the content of MCAP logs, and recover broken ones")
+    parser = subparsers.add_parser("log", help="show the content of logs, and recover broken ones")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
     info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
-    info.add_argument("logs", type=Path, nargs="+", metavar="FILE", help=".mcap or .mcap.part")
+    info.add_argument("logs", type=Path, nargs="+", metavar="LOG",
+                      help=".mcap, .mcap.part, .db3, .bag, or a folder of these or of images")
     add_json(info)
     info.set_defaults(run=run_info)
     recover = actions.add_parser("recover", help="write all readable messages of a cut or corrupt log to a new one")
@@ -35,12 +36,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run_info(args: argparse.Namespace) -> int:
     """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
     from drivers.errors import DriverError
-    from drivers.logs.mcap_info import LogState, read_log_info
+    from drivers.logs.log_formats import log_info
+    from drivers.logs.mcap_info import LogState
 
     code, logs = 0, []
     for number, path in enumerate(args.logs):
         try:
-            found = read_log_info(path)
+            found = log_info(path)
         except DriverError as error:
             print(f"omnid: {_shown(str(error))}", file=sys.stderr)
             code = 2
@@ -103,6 +105,8 @@ def _state(found: LogInfo) -> str:
     from drivers.logs.mcap_info import LogState
 
     advice = f"`omnid log recover {_shown(str(found.path))}`"
+    if found.state is LogState.BROKEN and found.path.suffix not in (".mcap", ".part"):
+        return f"cut or corrupt, with {found.broken} corrupt records: what can be read is used"
     if found.state is LogState.BROKEN:
         corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
         position = f"byte {found.readable_bytes} of {found.size_bytes}"

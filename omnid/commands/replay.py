@@ -19,7 +19,8 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `replay` to the command line."""
     parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
-    parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap file, or the folder of ros2 bag record -s mcap")
+    parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap, .db3 or .bag file, a folder with "
+                        "one or with its parts, or a folder with a folder of stamped images for each camera")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
     parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")

@@ -85,7 +85,7 @@ def _recorded(args: argparse.Namespace) -> OpenCamera:
 
 
 def _rig_of(log: Path) -> Rig:
-    from drivers.logs.mcap_reader import LogReader
+    from drivers.logs.log_reader import LogReader
     from omnid.runs.log_rig import attached_rig
 
     with closing(LogReader(log)) as reader:

@@ -13,12 +13,12 @@ from functools import partial
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.mcap_catalog import Catalog
+from drivers.logs.mcap_catalog import Catalog, LogTopic
 from drivers.logs.mcap_index import read_attachments, read_summary
 from drivers.logs.mcap_info import LogInfo
 from drivers.logs.mcap_messages import DataSection, LogMessage
 from drivers.logs.mcap_records import LogFile, RecordError
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, RosImage, parse_image
+from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
     DIAGNOSTICS_SCHEMA,
@@ -88,7 +88,7 @@ class RecordingReader:
             for message in section.messages():
                 topic = section.catalog.topic(message.channel_id)
                 name = None if topic is None else wanted.get(topic.name)
-                decoder = None if topic is None or name is None else _decoder(name, topic.type)
+                decoder = None if topic is None or name is None else _decoder(name, topic)
                 if topic is not None and name is not None and decoder is not None:
                     content = self._decoded(topic.name, message, decoder)
                     if content is not None:
@@ -105,12 +105,12 @@ class RecordingReader:
             return None
 
 
-def _decoder(name: str, schema: str) -> Decoder | None:
+def _decoder(name: str, topic: LogTopic) -> Decoder | None:
     """Return the decoder of messages of a topic; None where they are of another type than expected."""
-    if name in IMAGES and schema in (IMAGE, COMPRESSED_IMAGE):
-        return partial(parse_image, schema)
+    if name in IMAGES and topic.type in IMAGE_TYPES:
+        return partial(parse_image, topic.type, aligned=topic.aligned)
     expected, decoder = _DECODERS.get(name, ("", None))
-    return decoder if schema == expected else None
+    return decoder if topic.type == expected else None
 
 
 def _finite_twist(data: memoryview) -> TwistRecord:

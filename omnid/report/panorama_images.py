@@ -16,7 +16,7 @@ from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.errors import OmnidError
 from omnid.report.page import Image
 from omnid.stages.decoder import Decoder

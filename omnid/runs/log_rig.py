@@ -6,7 +6,7 @@ from pathlib import Path
 
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.errors import OmnidError
 
 

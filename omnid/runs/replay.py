@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot

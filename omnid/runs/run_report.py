@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.diagnostics.input_warnings import input_warnings
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.status import stage_status, summary_status

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
 from omnid.engine.graph import Graph
 from omnid.messages import OdometryUpdate

@@ -12,7 +12,7 @@ import pytest
 from calib.kalibr import import_kalibr
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.run_summary import run_summary

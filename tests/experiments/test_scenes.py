@@ -11,7 +11,7 @@ import pytest
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.frame import gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from tests.experiments.building import building
 from tests.experiments.povray import INSTALL, PovrayError, available, shoot, view_text, write_world
 from tests.experiments.rendering import cast_log, render_log

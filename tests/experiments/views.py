@@ -12,7 +12,7 @@ import numpy as np
 from calib import se3
 from calib.models.camera import Array
 from calib.rig_file import read_rig
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.dewarp import Dewarp

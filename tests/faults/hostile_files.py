@@ -25,7 +25,7 @@ from calib.ocam_file import parse_ocam
 from calib.rig_file import parse_rig, read_rig
 from drivers.errors import DriverError
 from drivers.frame import gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_recovery import recover
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
@@ -35,6 +35,8 @@ from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import decode_diagnostics, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment
+from tests.drivers.logs.bags import write_bag, write_db3
+from tests.drivers.logs.mcap_logs import pairs
 from tests.faults.mutation import mutated
 from tests.simulation import build, write_log
 
@@ -59,6 +61,12 @@ class TooLongError(Exception):
 
 def read_log(path: Path) -> None:
     """Read a log as a replay does, and recover it."""
+    read_frames(path)
+    recover(path, path.with_name("recovered.mcap"))
+
+
+def read_frames(path: Path) -> None:
+    """Read a log of any format as a replay does."""
     reader = LogReader(path)
     try:
         reader.attachments()
@@ -69,7 +77,6 @@ def read_log(path: Path) -> None:
                 continue
     finally:
         reader.close()
-    recover(path, path.with_name("recovered.mcap"))
 
 
 def messages() -> Mapping[str, bytes]:
@@ -94,6 +101,8 @@ FORMATS: Final = {
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
     "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),
     "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_log),
+    "log.db3": Format(lambda folder: write_db3(folder / "bag", pairs(4)).read_bytes(), read_frames),
+    "log.bag": Format(lambda folder: write_bag(folder / "log.bag", pairs(4), "LZ4").read_bytes(), read_frames),
     "odom.cdr": Format(lambda _: messages()["odom"], lambda path: decode_pose(path.read_bytes(), b"")),
     "status.cdr": Format(lambda _: messages()["status"], lambda path: decode_diagnostics(path.read_bytes())),
     "attachment.json": Format(lambda _: PoseAttachment(7, "tracking", 0, 50, 60, 10**18).to_bytes(),

@@ -21,7 +21,7 @@ import pytest
 from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import LONGEST_ABSENCE_S
 from omnid.runs.log_rig import attached_rig

@@ -18,7 +18,7 @@ import pytest
 import omnid
 from calib.rig_file import read_rig, write_rig
 from drivers.frame import gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.ply import read_ply

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 
 PERIOD_NS = 100_000_000

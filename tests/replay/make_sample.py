@@ -19,7 +19,7 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import rig_toml
 from drivers.frame import Frame, gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter
 
 SIDE_PX = 512

@@ -13,7 +13,7 @@ import pytest
 
 from calib.rig_file import parse_rig
 from drivers.frame import Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph

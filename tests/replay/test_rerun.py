@@ -11,7 +11,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib.rig_file import parse_rig, rig_toml
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.recordings.run_series import read_run_series
 from omnid.transport.status_names import ODOMETRY, WHEELS, camera_name, stage_name
 from tests.replay.command import Command

@@ -12,7 +12,7 @@ import pytest
 from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from tests.conftest import PAIRS
 from tests.replay.edited import Image, images, save
 

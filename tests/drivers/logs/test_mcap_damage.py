@@ -19,8 +19,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.logs.mcap_reader import LogReader
-from drivers.logs.mcap_records import MAGIC
+from drivers.logs.log_reader import LogReader
+from drivers.logs.mcap_records import MAGIC, LogFile
 from drivers.logs.ros_image import parse_image
 from tests.drivers.logs.mcap_logs import (
     BARE,
@@ -162,8 +162,8 @@ def test_ignores_a_corrupt_summary(tmp_path: Path) -> None:
         (b"", "it is empty"),
         (MAGIC[:5], "starts with"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), r"starts with b'\\x89PNG"),
-        (b"SQLite format 3\0" + bytes(50), "rosbags-convert --src ITS_FOLDER"),
-        (b"#ROSBAG V2.0\n" + bytes(50), "ROS 1 bag"),
+        (b"SQLite format 3\0" + bytes(50), "file is not a database"),
+        (b"#ROSBAG V2.0\n" + bytes(50), "no topics at all"),
         (zstandard.compress(bytes(50)), "zstd -d"),
         (MAGIC, "no topics at all"),
     ],
@@ -174,6 +174,17 @@ def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: s
     with pytest.raises(DriverError, match=message) as caught:
         LogReader(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [(b"SQLite format 3\0", "rosbags-convert --src ITS_FOLDER"), (b"#ROSBAG V2.0\n", "rosbags-convert --src FILE")],
+)
+def test_tools_for_mcap_files_refuse_other_bags(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(data)
+    with pytest.raises(DriverError, match=message):
+        LogFile(path)
 
 
 def test_the_advice_for_other_bags_works(tmp_path: Path) -> None:
@@ -192,8 +203,10 @@ def test_refuses_unreadable_paths(tmp_path: Path) -> None:
     with pytest.raises(DriverError, match="none"):
         LogReader(tmp_path)
     (tmp_path / "bag_0.db3").touch()
-    with pytest.raises(DriverError, match=f"rosbags-convert --src {tmp_path} --dst"):
+    with pytest.raises(DriverError, match="it is empty"):
         LogReader(tmp_path)
+    with pytest.raises(DriverError, match=f"rosbags-convert --src {tmp_path} --dst"):
+        LogFile(tmp_path)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(DriverError, match="no regular file"):
         LogReader(tmp_path / "pipe")

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_records import MAGIC
 from drivers.logs.mcap_recovery import Recovery, recover
 from drivers.logs.mcap_writer import LogWriter

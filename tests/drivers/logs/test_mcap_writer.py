@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter, schema_text
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, UPPER, Entry, pairs, text
 

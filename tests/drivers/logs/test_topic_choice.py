@@ -7,7 +7,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.topic_choice import choose_topics
 from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
 

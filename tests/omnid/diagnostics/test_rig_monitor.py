@@ -11,7 +11,7 @@ import pytest
 
 from calib.rig import Rig
 from calib.rig_file import read_rig
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config, PairConfig, PanoramaConfig
 from omnid.core.rig.rig_check import POINTS
 from omnid.diagnostics.rig_monitor import MIN_PLACES, VIEWS, RigMonitor, start_status

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from calib import se3
 from calib.rig import Rig
 from calib.rig_file import rig_toml
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum, tum_row

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from drivers.frame import Camera, Frame, gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.voxel_map import MapPoints

@@ -15,7 +15,7 @@ from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import gray
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid import Odometry
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN, Motion, MotionSettings

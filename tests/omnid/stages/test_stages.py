@@ -14,7 +14,7 @@ from calib import se3
 from calib.panorama import remap_tables
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config, MappingConfig, PairConfig
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.logs import mcap_index
-from drivers.logs.mcap_reader import LogReader
+from drivers.logs.log_reader import LogReader
 from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import RosImage
 from tests.drivers.logs.mcap_logs import (
@@ -150,8 +150,8 @@ def test_other_spellings_of_the_type(tmp_path: Path, name: str) -> None:
 def test_accepts_a_folder_with_one_log(tmp_path: Path) -> None:
     write_log(tmp_path / "bag_0.mcap", pairs(2))
     assert places(read(tmp_path)[0]) == in_order(2)
-    write_log(tmp_path / "bag_1.mcap", pairs(2))
-    with pytest.raises(DriverError, match=r"bag_0\.mcap, bag_1\.mcap"):
+    write_log(tmp_path / "other_1.mcap", pairs(2))
+    with pytest.raises(DriverError, match=r"bag_0\.mcap, other_1\.mcap"):
         LogReader(tmp_path)
 
 

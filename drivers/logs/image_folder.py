@@ -1,0 +1,173 @@
+"""Folders of images with stamps, one folder for each camera.
+
+The stamp of an image is its name without suffix (1403636579763555584.png, 1305031102.175304.jpg), or the line of its
+number in timestamps.txt or times.txt beside the images or in the folder above. A stamp is in nanoseconds where it is a
+whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from drivers.errors import DriverError
+from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
+from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
+
+SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+STAMP_FILES: Final = ("timestamps.txt", "times.txt")
+ATTACHMENT: Final = "rig.toml"  # beside the folders of the cameras
+MAX_IMAGES: Final = 1_000_000
+_MAX_DEPTH: Final = 4  # of a folder of images below the given one
+_MAX_FOLDERS: Final = 64
+_MAX_VISITED: Final = 10_000
+_MAX_STAMP_BYTES: Final = 64 * 2**20
+_MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
+_MAX_STAMP_NS: Final = 2**63
+_NS_DIGITS: Final = 16
+_SECONDS: Final = re.compile(r"\d{1,12}(?:\.(\d{1,12}))?")
+
+
+class _StampedFile(NamedTuple):
+    stamp_ns: int
+    topic: str
+    path: Path
+
+
+def image_folders(path: Path) -> list[Path]:
+    """Return the folders with images below a folder, at most 64, of the first 10,000 folders that are visited."""
+    found: list[Path] = []
+    for visited, (folder, inner, files) in enumerate(os.walk(path)):
+        here = Path(folder)
+        inner[:] = sorted(inner) if len(here.relative_to(path).parts) < _MAX_DEPTH else []
+        if here != path and any(Path(name).suffix.lower() in SUFFIXES for name in files):
+            found.append(here)
+        if visited >= _MAX_VISITED or len(found) >= _MAX_FOLDERS:
+            break
+    return found
+
+
+class ImageFolder:
+    """An ImageLog of folders of images; the topic of each is its path below the given folder.
+
+    Raises DriverError where an image has no stamp.
+    """
+
+    def __init__(self, path: Path, folders: Sequence[Path]) -> None:
+        self.name = str(path)
+        self._path, self._closed = path, False
+        self._files = {folder.relative_to(path).as_posix(): list(_stamped(path, folder)) for folder in folders}
+        if sum(map(len, self._files.values())) > MAX_IMAGES:
+            raise DriverError(f"{self.name!r} contains more than {MAX_IMAGES} images; give a part of them")
+
+    def topics(self) -> Mapping[str, str]:
+        """Return folder -> sensor_msgs/msg/CompressedImage."""
+        return dict.fromkeys(self._files, COMPRESSED_IMAGE)
+
+    def counts(self) -> Mapping[str, int] | None:
+        """Return the number of images in each folder."""
+        return {topic: len(files) for topic, files in self._files.items()}
+
+    def images(self) -> Iterator[LoggedImage]:
+        """Yield the images of all folders in the order of their stamps."""
+        for file in sorted(file for files in self._files.values() for file in files):
+            if self._closed:
+                return
+            yield LoggedImage(file.topic, file.stamp_ns, partial(_read, file))
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return the rig.toml beside the folders, if there is one of at most 16 MiB."""
+        try:
+            with (self._path / ATTACHMENT).open("rb") as file:
+                data = file.read(_MAX_ATTACHMENT_BYTES + 1)
+        except OSError:
+            return {}
+        return {ATTACHMENT: data} if len(data) <= _MAX_ATTACHMENT_BYTES else {}
+
+    def damage(self) -> LogDamage:
+        """Return none: a file that is no image is counted when it is read."""
+        return LogDamage()
+
+    def close(self) -> None:
+        """End images()."""
+        self._closed = True
+
+
+def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
+    """Yield the images of a folder with their stamps; raise DriverError where one has none."""
+    topic = folder.relative_to(top).as_posix()
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    lines = _stamp_lines(folder)
+    if lines is not None and len(lines) != len(paths):
+        raise DriverError(f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
+                          "they must be as many")
+    for index, path in enumerate(paths):
+        text = path.stem if lines is None else lines[index]
+        stamp_ns = parse_stamp(text)
+        if stamp_ns is None:
+            where = "is named" if lines is None else "has the stamp"
+            raise DriverError(f"{str(path)!r} {where} {text[:40]!r}; expected a stamp: nanoseconds of 16 digits or "
+                              f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}")
+        yield _StampedFile(stamp_ns, topic, path)
+
+
+def _stamp_lines(folder: Path) -> list[str] | None:
+    """Return the lines of the list of stamps beside the images or above; None without one."""
+    for path in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
+        try:
+            if path.is_file() and path.stat().st_size <= _MAX_STAMP_BYTES:
+                lines = path.read_text("utf-8", "replace").splitlines()
+                return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+        except OSError as error:
+            raise DriverError(f"cannot read the stamps {str(path)!r}: {error.strerror}") from error
+    return None
+
+
+def parse_stamp(text: str) -> int | None:
+    """Return a stamp [ns], None where the text is none; exact, because a float holds no nanoseconds since 1970."""
+    if text.isascii() and text.isdigit() and len(text) >= _NS_DIGITS:
+        stamp_ns = int(text) if len(text) <= len(str(_MAX_STAMP_NS)) else _MAX_STAMP_NS
+    elif match := _SECONDS.fullmatch(text):
+        stamp_ns = int(text.partition(".")[0]) * 10**9 + int((match[1] or "")[:9].ljust(9, "0"))
+    elif (seconds := _float(text)) is not None:
+        stamp_ns = round(seconds * 1e9)
+    else:
+        return _parse_date(text)
+    return stamp_ns if stamp_ns < _MAX_STAMP_NS else None
+
+
+def _float(text: str) -> float | None:
+    """Return seconds such as 1.036336e-01, None where the text is no such number."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        return None
+    return seconds if math.isfinite(seconds) and 0 <= seconds < _MAX_STAMP_NS * 1e-9 else None
+
+
+def _parse_date(text: str) -> int | None:
+    """Return the stamp of a date and time such as 2011-09-26 13:02:25.951199337 (UTC)."""
+    whole, _, fraction = text.partition(".")
+    try:
+        seconds = int(datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp())
+    except ValueError:
+        return None
+    if fraction and not (fraction.isascii() and fraction.isdigit()):
+        return None
+    return seconds * 10**9 + int(fraction[:9].ljust(9, "0")) if seconds >= 0 else None
+
+
+def _read(file: _StampedFile) -> RosImage:
+    try:
+        with file.path.open("rb") as opened:
+            data = opened.read(MAX_RECORD_BYTES)
+    except OSError as error:
+        raise RecordError(f"{str(file.path)!r} cannot be read: {error.strerror}") from error
+    return RosImage(file.stamp_ns, image_encoding(data), memoryview(data))

@@ -1,0 +1,47 @@
+"""A log of images in any format: the messages that a reader of frames needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple, Protocol
+
+from drivers.logs.ros_image import RosImage
+
+
+class LoggedImage(NamedTuple):
+    """An image message that is not yet decoded."""
+
+    topic: str
+    log_time_ns: int
+    read: Callable[[], RosImage]  # raises FrameDecodeError or RecordError where there is no valid image
+
+
+class LogDamage(NamedTuple):
+    """Faults that were found while a log was read."""
+
+    broken: int = 0  # chunks and records that were skipped
+    cut: str = ""  # one line that says where a log ends too early; empty for a complete log
+
+
+class ImageLog(Protocol):
+    """The image messages of a log, streamed in its order; it may be damaged or malicious."""
+
+    name: str  # for error messages
+
+    def topics(self) -> Mapping[str, str]:
+        """Return name -> ROS type of all topics, such as sensor_msgs/msg/Image; '' where it cannot be decoded."""
+
+    def counts(self) -> Mapping[str, int] | None:
+        """Return the number of messages of each topic; None where the log does not state it."""
+
+    def images(self) -> Iterator[LoggedImage]:
+        """Yield the images of all topics; ends early after close."""
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
+
+    def damage(self) -> LogDamage:
+        """Return the faults found by the last call of images(), once that has ended."""
+
+    def close(self) -> None:
+        """Close the files; may be called twice."""

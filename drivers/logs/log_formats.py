@@ -1,0 +1,118 @@
+"""Choice of the reader for a log, by its first bytes or by what its folder contains."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Final
+
+from drivers.errors import DriverError
+from drivers.logs import ros1_bag, sqlite_bag
+from drivers.logs.image_folder import ImageFolder, image_folders
+from drivers.logs.image_log import ImageLog
+from drivers.logs.mcap_image_log import McapImageLog
+from drivers.logs.mcap_info import LogInfo, LogState, read_log_info
+from drivers.logs.ros1_bag import Ros1Bag
+from drivers.logs.split_log import SplitLog
+from drivers.logs.sqlite_bag import SqliteBag
+
+MAX_PARTS: Final = 1000
+_MAX_LISTED: Final = 8
+LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
+# A part of a split log: name, time of its first message (of omnid's recordings and of ROS 1), number.
+_PART: Final = re.compile(r"(.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?_(\d{1,9})(\.\w+)")
+
+
+def open_image_log(path: str | os.PathLike[str]) -> ImageLog:
+    """Open a log of images; raise DriverError, which says what is supported, where there is none.
+
+    path: an MCAP file, an SQLite bag of ROS 2 (.db3), a bag of ROS 1 (.bag), a folder with one of these or with the
+    parts of one, or a folder with a folder of images for each camera (see `ImageFolder`).
+    """
+    given = Path(path)
+    return _open_folder(given) if given.is_dir() else _open_file(given)
+
+
+def log_info(path: str | os.PathLike[str]) -> LogInfo:
+    """Return the contents of a log of any format; all but MCAP are read to the end. Raise DriverError without a log.
+
+    The time of the others is that of their images.
+    """
+    log = open_image_log(path)
+    try:
+        if isinstance(log, McapImageLog):
+            return read_log_info(path)
+        times_ns = [(image.topic, image.log_time_ns) for image in log.images()]
+        counts = log.counts() or Counter(topic for topic, _ in times_ns)
+        topics = {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())}
+        damage, size_bytes = log.damage(), _size_bytes(Path(path))
+        state = LogState.BROKEN if damage.cut or damage.broken else LogState.WHOLE
+        span_ns = (min(t for _, t in times_ns), max(t for _, t in times_ns)) if times_ns else None
+        attachments = {name: len(data) for name, data in log.attachments().items()}
+        return LogInfo(Path(path), size_bytes, state, size_bytes, damage.broken, topics, span_ns, attachments)
+    finally:
+        log.close()
+
+
+def _size_bytes(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _open_file(path: Path) -> ImageLog:
+    try:
+        if path.is_file():
+            with path.open("rb") as file:
+                start = file.read(max(len(sqlite_bag.MAGIC), len(ros1_bag.MAGIC)))
+            if start.startswith(sqlite_bag.MAGIC):
+                return SqliteBag(path)
+            if start.startswith(ros1_bag.MAGIC):
+                return Ros1Bag(path)
+    except OSError as error:
+        raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
+    return McapImageLog(path)
+
+
+def _open_folder(path: Path) -> ImageLog:
+    try:
+        logs = sorted(file for file in path.iterdir() if file.suffix in LOG_SUFFIXES and file.is_file())
+    except OSError as error:
+        raise DriverError(f"cannot read the folder {str(path)!r}: {error.strerror}") from error
+    if len(logs) == 1:
+        return _open_file(logs[0])
+    if parts := parts_in_order(logs):
+        return _open_parts(path, parts)
+    if not logs and (folders := image_folders(path)):
+        return ImageFolder(path, folders)
+    names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
+    raise DriverError(f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
+                      f"folder of images for each camera; found: {names}; give one file")
+
+
+def parts_in_order(logs: list[Path]) -> list[Path]:
+    """Return the parts of a split log in the order of their numbers; empty where the files are not such parts.
+
+    They have one name and numbers without a gap: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them.
+    """
+    found = [(_PART.fullmatch(log.name), log) for log in logs]
+    numbered = sorted((int(match[2]), log) for match, log in found if match)
+    names = {(match[1], match[3]) for match, _ in found if match}
+    first = numbered[0][0] if numbered else 0
+    follows = [number for number, _ in numbered] == list(range(first, first + len(logs)))
+    return [log for _, log in numbered] if len(names) == 1 and follows else []
+
+
+def _open_parts(path: Path, parts: list[Path]) -> ImageLog:
+    if len(parts) > MAX_PARTS:
+        raise DriverError(f"{str(path)!r} contains {len(parts)} parts of a log; at most {MAX_PARTS} can be read as one")
+    opened: list[ImageLog] = []
+    try:
+        for part in parts:
+            opened.append(_open_file(part))
+    except DriverError:
+        for log in opened:
+            log.close()
+        raise
+    return SplitLog(str(path), opened)

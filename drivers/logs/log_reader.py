@@ -1,0 +1,113 @@
+"""Reads the frames of two cameras from a log: MCAP, a bag of ROS 2 or ROS 1, or folders of images."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+from drivers.errors import DriverError, FrameDecodeError
+from drivers.frame import Camera, Frame
+from drivers.logs.image_log import LoggedImage
+from drivers.logs.log_formats import open_image_log
+from drivers.logs.mcap_records import RecordError
+from drivers.logs.reorder_buffer import ReorderBuffer
+from drivers.logs.ros_image import RosImage
+from drivers.logs.topic_choice import choose_topics
+
+_WARNINGS = {
+    "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
+    "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
+    "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
+    "unstamped": "{} frames have no stamp in their header: used the time of logging",
+    "broken_records": "skipped {} corrupt chunks or records of the file",
+}
+_COUNTERS = ("lower", "upper", *_WARNINGS)
+
+
+class LogReader:
+    """A FrameSource that streams a log once per call of frames().
+
+    path: as for `open_image_log`. lower, upper: topics, where their names do not identify the cameras. window: number
+    of frames that are held back to sort them by stamp. Raises DriverError where the path is no such log, or the topics
+    of the two cameras are ambiguous.
+
+    During and after frames(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate', 'unstamped'
+    (log time used), 'broken' (messages without a valid image) and 'broken_records' (chunks or records of the file).
+    After its end `truncated` is True for an incomplete log, and `warnings` has one line per kind of fault.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32
+    ) -> None:
+        self._window, self._closed = window, False
+        self._log = open_image_log(path)
+        self._reset()
+        try:
+            wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
+            self._cameras = choose_topics(repr(self._log.name), self._log.topics(), wanted)
+        except DriverError:
+            self.close()
+            raise
+
+    @property
+    def topics(self) -> dict[Camera, str]:
+        """The topic of each camera."""
+        return {camera: topic for topic, camera in self._cameras.items()}
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames of both cameras in the order of their stamps; seq counts each camera's from 0."""
+        self._reset()
+        buffer = ReorderBuffer(self._window, self.counts)
+        for logged in self._log.images():
+            camera = self._cameras.get(logged.topic)
+            image = None if camera is None else self._image(logged)
+            if camera is not None and image is not None:
+                yield from buffer.push(camera, image)
+        if not self._closed:
+            yield from buffer.drain()
+            self._report()
+
+    def close(self) -> None:
+        """End frames() and close the log."""
+        self._closed = True
+        self._log.close()
+
+    def pair_estimate(self) -> int | None:
+        """Return the largest possible number of pairs, for a progress bar; None where the log does not state it."""
+        counts = self._log.counts()
+        return None if counts is None else min(counts.get(topic, 0) for topic in self._cameras)
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
+        return self._log.attachments()
+
+    def _reset(self) -> None:
+        self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
+        self.warnings: list[str] = []
+        self.truncated = False
+        self._fault = ""  # of the first message without a valid image
+
+    def _image(self, logged: LoggedImage) -> RosImage | None:
+        """Return an image, None of a broken one.
+
+        The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
+        """
+        try:
+            image = logged.read()
+        except (FrameDecodeError, RecordError) as error:
+            self.counts["broken"] += 1
+            self._fault = self._fault or str(error)
+            return None
+        self.counts["unstamped"] += not image.stamp_ns and logged.log_time_ns != 0
+        return replace(image, stamp_ns=image.stamp_ns or logged.log_time_ns, data=memoryview(bytes(image.data)))
+
+    def _report(self) -> None:
+        damage = self._log.damage()
+        self.counts["broken_records"] = damage.broken
+        self.truncated = bool(damage.cut)
+        if damage.cut:
+            self.warnings.append(damage.cut)
+        found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
+        self.warnings += [text.format(self.counts[name], fault=self._fault) for name, text in found.items()]

@@ -1,0 +1,135 @@
+"""The images of a bag of ROS 2 in SQLite (.db3), as `ros2 bag record -s sqlite3` writes it.
+
+Layout: rosbag2_storage_sqlite3, versions 1 to 4: table topics (id, name, type, serialization_format, ...) and table
+messages (id, topic_id, timestamp [ns], data). A message may be compressed by zstd.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+import zstandard
+
+from drivers.errors import DriverError
+from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
+from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+
+MAGIC: Final = b"SQLite format 3\0"
+_MAX_TOPICS: Final = 4096
+_MAX_REASON: Final = 120  # characters
+_ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame, RFC 8878
+_TABLES: Final = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') " \
+    "AND sql LIKE 'CREATE TABLE%'"
+_TOPICS: Final = f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics " \
+    f"LIMIT {_MAX_TOPICS}"
+# In the order of writing, which needs no index: that of the time is by the stamps of the images.
+_IMAGES: Final = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({}) ORDER BY id"
+_COUNTS: Final = "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
+
+
+class SqliteBag:
+    """An ImageLog of one .db3 file; raises DriverError where it is no bag."""
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._damage = LogDamage()
+        self._closed = False
+        try:
+            self._bag = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, check_same_thread=False)
+            self._bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD_BYTES)
+            self._bag.execute("PRAGMA trusted_schema = OFF")
+            self._bag.text_factory = _text
+            tables = self._bag.execute(_TABLES).fetchone()[0]
+            self._topics = {} if tables != 2 else {
+                _integer(key): (str(name), str(kind) if encoding == "cdr" else "")
+                for key, name, kind, encoding in self._bag.execute(_TOPICS)}
+        except (sqlite3.Error, OverflowError, ValueError) as error:
+            raise DriverError(f"cannot read the bag {self.name!r}: {_line(error)}; if the recording was cut, try "
+                              "`sqlite3 FILE .recover`") from error
+        if tables != 2:
+            self.close()
+            raise DriverError(f"{self.name!r} is an SQLite file, but no bag of ROS 2: it has no tables topics and "
+                              "messages; give the .db3 file that `ros2 bag record` wrote")
+
+    def topics(self) -> Mapping[str, str]:
+        """Return name -> type of all topics."""
+        return dict(self._topics.values())
+
+    def counts(self) -> Mapping[str, int] | None:
+        """Return the number of messages of each topic; None where the file is damaged."""
+        try:
+            found = dict(self._bag.execute(_COUNTS))
+        except sqlite3.Error:
+            return None
+        return {name: int(found.get(key, 0)) for key, (name, _) in self._topics.items()}
+
+    def images(self) -> Iterator[LoggedImage]:
+        """Yield the images in the order in which they were written."""
+        wanted = {key: topic for key, topic in self._topics.items() if topic[1] in IMAGE_TYPES}
+        broken, count = 0, 0
+        try:
+            with closing(self._bag.execute(_IMAGES.format(", ".join(map(str, wanted))))) as rows:
+                for key, time_ns, data in rows:
+                    count += 1
+                    if isinstance(data, bytes) and isinstance(time_ns, int):
+                        name, kind = wanted[key]
+                        yield LoggedImage(name, time_ns, partial(_read, kind, data))
+                    else:
+                        broken += 1
+                    if self._closed:
+                        return
+            self._damage = LogDamage(broken)
+        except sqlite3.Error as error:
+            if not self._closed:
+                self._damage = LogDamage(broken, f"the bag {self.name!r} is cut or corrupt after {count} images "
+                                                 f"({_line(error)}): used those before")
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return none: a bag has no attachments."""
+        return {}
+
+    def damage(self) -> LogDamage:
+        """Return the faults found by the last call of images()."""
+        return self._damage
+
+    def close(self) -> None:
+        """Close the file."""
+        self._closed = True
+        self._bag.close()
+
+
+def _read(kind: str, data: bytes) -> RosImage:
+    return parse_image(kind, memoryview(_unpacked(data)))
+
+
+def _unpacked(data: bytes) -> bytes:
+    """Return a message that may be compressed; raise RecordError where it does not unpack."""
+    if not data.startswith(_ZSTD):
+        return data
+    try:
+        unpacked: bytes = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES)
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise RecordError(f"a compressed message does not unpack: {error}") from error
+    return unpacked
+
+
+def _line(error: Exception) -> str:
+    """Return an error in one line: SQLite quotes the file, which may contain anything."""
+    return " ".join(str(error).split())[:_MAX_REASON]
+
+
+def _text(value: bytes) -> str:
+    return value.decode("utf-8", "replace")
+
+
+def _integer(value: object) -> int:
+    if not isinstance(value, int):
+        raise ValueError(f"a topic has the id {value!r}")
+    return value
