@@ -82,7 +82,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.mapping": "omnid.errors",
     "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
-    "omnid.core.places": "calib.se3 omnid.core.odometry omnid.core.stereo",
+    "omnid.core.places": "calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo",
     "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":

@@ -1,0 +1,41 @@
+"""Poses on the floor: x, y, yaw [m, m, rad], in arrays (3,) or (N, 3)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+
+Array = NDArray[np.float64]
+
+
+def wrapped(angle: Array) -> Array:
+    """Return angles in [-pi, pi)."""
+    return np.asarray((angle + math.pi) % (2 * math.pi) - math.pi)
+
+
+def planar(T: Array) -> Array:
+    """Return x, y, yaw (3,) of a transform (4, 4)."""
+    return np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
+
+
+def transform(pose: Array) -> Array:
+    """Return the transform (4, 4) of x, y, yaw (3,)."""
+    return se3.transform(se3.rotation_exp([0.0, 0.0, pose[2]]), [pose[0], pose[1], 0.0])
+
+
+def composed(poses: Array, step: Array) -> Array:
+    """Return poses (N, 3) after a motion (3,) or motions (N, 3) in their own axes."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy, turn = step.T
+    return np.column_stack([poses[:, 0] + c * dx - s * dy, poses[:, 1] + s * dx + c * dy, poses[:, 2] + turn])
+
+
+def relative(a: Array, b: Array) -> Array:
+    """Return the pose (3,) of b in the axes of a."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    dx, dy = b[:2] - a[:2]
+    return np.array([c * dx + s * dy, c * dy - s * dx, b[2] - a[2]])
