@@ -171,12 +171,13 @@ class LiveRun:
                   ) -> CommandReceiver:
         settings = self._config.controller
         commands = CommandReceiver(controller, settings.deadlines.command_s, sources=settings.sources.names,
-                                   synchronised=self._config.bus.command_clock == "synchronised")
+                                   synchronised=self._config.bus.command_clock == "synchronised",
+                                   report=partial(self._report, logging.WARNING))
         topics = command_topics(settings.sources.names)
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns, topics)
 
-        def receive(key: str, payload: bytes, sender: str) -> None:
-            commands.receive(key, payload, sender)  # before it is recorded: a stop must not wait
+        def receive(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
+            commands.receive(key, payload, sender, sent_ns)  # before it is recorded: a stop must not wait
             record(key, payload)
 
         bus.subscribe_commands(receive, topics)

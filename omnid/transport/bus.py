@@ -25,7 +25,8 @@ __all__ = ["Bus", "BusConfig"]
 
 ALIVE: Final = "alive"  # liveliness token below the robot's name; exists as long as the daemon runs
 _ALIVE_TIMEOUT_S: Final = 1.0  # of the search for a robot of the same name
-CommandCallback = Callable[[str, bytes, str], None]  # key from `cmd` on, payload, identity of the sender
+# Key from `cmd` on, payload, identity of the sender, time of sending [ns of Unix time].
+CommandCallback = Callable[[str, bytes, str, int], None]
 
 
 class Bus:
@@ -100,9 +101,10 @@ class Bus:
             self._declare_queryable(self._session, name)
 
     def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str]) -> None:
-        """Call callback(key, payload, sender) for each message on `<robot>/cmd/...`, in a zenoh thread.
+        """Call callback(key, payload, sender, sent_ns) for each message on `<robot>/cmd/...`, in a zenoh thread.
 
-        key: from `cmd` on. sender: empty where the message does not name it. topics: with their types, for ROS 2.
+        key: from `cmd` on. sender: empty where the message does not name it. sent_ns: 0 where it does not
+        say it. topics: with their types, for ROS 2.
         """
         self._on_command, self._command_topics = callback, topics
         if self._session is not None:
@@ -212,7 +214,7 @@ def _sample_callback(
     def on_sample(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)[prefix_length:]
         topic = key.rsplit("/", suffix_parts)[0] if suffix_parts else key
-        callback(topic, sample.payload.to_bytes(), _sender(sample))
+        callback(topic, sample.payload.to_bytes(), _sender(sample), _sent_ns(sample))
 
     return on_sample
 
@@ -226,6 +228,11 @@ def _sender(sample: zenoh.Sample) -> str:
     if sample.source_info is not None:
         return str(sample.source_info.source_id.zid)
     return "" if sample.attachment is None else ros2.gid_in(sample.attachment.to_bytes())
+
+
+def _sent_ns(sample: zenoh.Sample) -> int:
+    """Return the time of sending that rmw_zenoh attaches to a sample, 0 without."""
+    return 0 if sample.attachment is None else ros2.sent_ns_in(sample.attachment.to_bytes())
 
 
 class _RosGraph:

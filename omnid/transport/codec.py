@@ -27,9 +27,11 @@ TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
+PLAIN_TWIST_SCHEMA = "geometry_msgs/msg/Twist"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
+_PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
 SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA, TWIST_SCHEMA,
            VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
 
@@ -263,6 +265,18 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
     return TwistRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
                  message.twist.angular.z)
+
+
+def is_plain_twist(payload: bytes) -> bool:
+    """True if a payload has the length of a geometry_msgs/msg/Twist, which no TwistStamped has."""
+    return len(payload) == _PLAIN_TWIST_BYTES
+
+
+def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
+    """Decode a Twist, which has no stamp (0) and no frame. Raise OmnidError for any other bytes."""
+    twist = message_from_cdr(payload, PLAIN_TWIST_SCHEMA)
+    assert isinstance(twist, ros.geometry_msgs__msg__Twist)
+    return TwistRecord(0, "", twist.linear.x, twist.angular.z)
 
 
 def heading_from_cdr(payload: bytes) -> HeadingRecord:

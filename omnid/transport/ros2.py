@@ -49,6 +49,11 @@ def gid_in(attached: bytes) -> str:
     return attached[size:].hex() if len(attached) == size + GID_BYTES and attached[size - 1] == GID_BYTES else ""
 
 
+def sent_ns_in(attached: bytes) -> int:
+    """Return the time of sending in an attachment of rmw_zenoh [ns of Unix time]; 0 for any other attachment."""
+    return int(struct.unpack_from("<q", attached, 8)[0]) if gid_in(attached) else 0
+
+
 def gid_of(token: str) -> bytes:
     """Return the unique id (16 bytes) of the publisher with this token."""
     return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()

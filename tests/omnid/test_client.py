@@ -134,7 +134,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
     state = {"x": 0.0, "y": 0.0}
     stops: list[str] = []
 
-    def execute(key: str, payload: bytes, _: str) -> None:
+    def execute(key: str, payload: bytes, *_: object) -> None:
         if key == "cmd/heading":
             _, _, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
@@ -158,7 +158,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
 
 
 def test_sends_commands() -> None:
-    received: list[tuple[str, bytes, str]] = []
+    received: list[tuple[str, bytes, str, int]] = []
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         driver = connection.driver()
         assert not driver.connected
@@ -173,11 +173,11 @@ def test_sends_commands() -> None:
         with Robot(connect=(endpoint,)) as other:
             other.driver().stop()
             wait_until(lambda: len(received) == 6)
-    (twist, a, _), (heading, b, _), (stop, _, _), (arm, c, _), (planned, d, _), _ = received
+    (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, *_), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
     assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
     assert codec.stamp_from_cdr(c) == stamp_ns
-    senders = [sender for *_, sender in received]
+    senders = [sender for *_, sender, _ in received]
     assert len(set(senders[:5])) == 1 and senders[5] != senders[0] and len(senders[0]) >= 16
     assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
     assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)

@@ -22,6 +22,14 @@ TOPICS = command_topics(("operator", "planner"))
 NOW_NS = 1_700_000_000 * 10**9
 
 
+def test_a_plain_twist_is_recorded_as_what_the_topic_holds() -> None:
+    plain = codec.twist_stamped_cdr(NOW_NS, "", 0.4, 0.5)[-48:]  # the six numbers
+    message = logged_command("cmd/twist", b"\0\1\0\0" + plain, TOPICS)
+    assert message is not None
+    assert codec.twist_from_cdr(message.payload) == codec.TwistRecord(0, "", 0.4, 0.5)
+    assert logged_command("cmd/twist", b"\7\7\0\0" + plain, TOPICS) is None
+
+
 def test_commands_are_recorded_unchanged(tmp_path: Path) -> None:
     config = Config()
     config = replace(config, record=replace(config.record, folder=str(tmp_path / "log"), free_mb=0, file_mb=1))

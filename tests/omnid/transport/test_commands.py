@@ -6,9 +6,11 @@ import math
 import random
 import struct
 import time
+from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
@@ -17,6 +19,7 @@ from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
 
 STALE_S = 0.5
+STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
 
 
 class AcceptedCommands:
@@ -118,7 +121,45 @@ def test_refuses_invalid_stamps(accepted: AcceptedCommands) -> None:
         payload = bytearray(twist())
         payload[4:12] = stamp
         accepted.receiver.receive("cmd/twist", bytes(payload))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 3}
+    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 2, "no stamp": 1}
+
+
+def plain_twist(velocity_mps: float = 0.3, rate_radps: float = -0.2) -> bytes:
+    types = STORE.types
+    vectors = [types["geometry_msgs/msg/Vector3"](*v) for v in ((velocity_mps, 0.0, 0.0), (0.0, 0.0, rate_radps))]
+    return bytes(STORE.serialize_cdr(types["geometry_msgs/msg/Twist"](*vectors), "geometry_msgs/msg/Twist"))
+
+
+def test_a_plain_twist_has_the_stamp_of_its_sending(accepted: AcceptedCommands) -> None:
+    accepted.receiver.receive("cmd/twist", plain_twist(), sent_ns=now_ns())
+    assert accepted.setpoints == [Setpoint(0.3, None, -0.2)]
+    accepted.receiver.receive("cmd/twist", plain_twist(), sent_ns=now_ns(-1.0))
+    accepted.receiver.receive("cmd/twist", plain_twist())
+    accepted.receiver.receive("cmd/twist", plain_twist(math.nan), sent_ns=now_ns())
+    assert len(accepted.setpoints) == 1
+    assert accepted.receiver.refused == {"too old": 1, "no stamp": 1, "not finite": 1}
+
+
+def test_a_plain_twist_without_stamp_counts_where_the_clocks_differ() -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    for _ in range(3):
+        accepted.receiver.receive("cmd/twist", plain_twist())
+    assert accepted.setpoints == [Setpoint(0.3, None, -0.2)] * 3
+    for sent_ns in (20, 10):
+        accepted.receiver.receive("cmd/twist", plain_twist(), sent_ns=sent_ns)
+    assert accepted.receiver.refused == {"stamp does not rise": 1}
+
+
+def test_refusals_are_reported_with_what_to_do() -> None:
+    lines: list[str] = []
+    receiver = CommandReceiver(AcceptedCommands(), STALE_S, report=lines.append)
+    receiver.receive("cmd/twist", plain_twist())
+    receiver.receive("cmd/twist", b"{}")
+    receiver.receive("cmd/" + "\n\x1b[2J" * 50, twist())
+    assert lines[0].startswith("a command on cmd/twist is refused: no stamp; fill in the stamp")
+    assert 'bus.command_clock = "arrival"' in lines[0]
+    assert lines[1].startswith("a command on cmd/twist is refused: malformed; twist takes TwistStamped or Twist")
+    assert all(line.isprintable() and len(line) < 200 for line in lines) and len(lines) == 3
 
 
 def stream(start_ns: int, count: int = 5) -> list[bytes]:

@@ -130,7 +130,7 @@ def test_receives_a_twist_from_ros() -> None:
             message, gid = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1), bytes(range(16))
             attachment = ros2.attachment(1, 5, gid)
             wait_until(lambda: session.put(key, message, attachment=attachment) is None and bool(received))
-    assert received[0] == ("cmd/twist", message, gid.hex())
+    assert received[0] == ("cmd/twist", message, gid.hex(), 5)
 
 
 def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
