@@ -14,8 +14,8 @@ from typing import NoReturn
 from omnid.commands.examples import add_examples
 from omnid.version import __version__
 
-COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "drive", "listen", "view", "record",
-            "report", "log", "diff", "doctor", "config", "install-service")
+COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "drive", "listen", "view", "web",
+            "record", "report", "log", "diff", "doctor", "config", "install-service")
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
 WRONG_INPUT = 2
 

@@ -147,17 +147,26 @@ class Robot:
         decoder = cast("Callable[[bytes, bytes], T]", decode)
         return Subscription(self._session, f"{self.name}/{key}", decoder, on_close)
 
-    def on_message(self, callback: Callable[[str, bytes, bytes], None]) -> None:
+    def on_message(self, callback: Callable[[str, bytes, bytes], None], topic: str = "*") -> Callable[[], None]:
         """Call callback(topic, payload, attachment) for each message of the robot from now on, in a zenoh thread.
 
         The payload is CDR; `odom` and `panorama` have an attachment. The callback must be quick and never raise.
+        topic: the only one to receive; default: all. Return a function that ends the subscription.
         """
         prefix_length = len(self.name) + 1
 
         def on_sample(sample: zenoh.Sample) -> None:
             callback(str(sample.key_expr)[prefix_length:], sample.payload.to_bytes(), _attachment(sample))
 
-        self._declared.append(self._session.declare_subscriber(f"{self.name}/*", on_sample))
+        subscriber = self._session.declare_subscriber(f"{self.name}/{topic}", on_sample)
+        self._declared.append(subscriber)
+
+        def end() -> None:
+            self._declared.remove(subscriber)
+            with suppress(zenoh.ZError):
+                subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
+
+        return end
 
     def driver(self, source: str = "") -> Driver:
         """Return a sender of commands to the wheels.

@@ -70,7 +70,7 @@ ARROWS: Mapping[str, str] = {
         "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
         "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
-        "omnid.viewer",
+        "omnid.viewer omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
         "omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration omnid.transport",
@@ -134,6 +134,9 @@ ARROWS: Mapping[str, str] = {
         "calib.se3 drivers.errors drivers.frame drivers.logs omnid.client omnid.config omnid.core.odometry "
         "omnid.engine omnid.errors omnid.messages omnid.monitor omnid.recordings omnid.runs omnid.sinks "
         "omnid.stages omnid.tracking_state omnid.transport",
+    "omnid.web":
+        "drivers.errors drivers.logs omnid.client omnid.engine omnid.errors omnid.monitor omnid.tracking_state "
+        "omnid.transport",
 }
 
 

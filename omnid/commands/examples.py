@@ -26,6 +26,8 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "drive": ("drive", "drive --robot rover --connect tcp/robot:7447"),
     "listen": ("listen", "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap"),
     "view": ("view out.mcap", "view out.mcap -o out.rrd"),
+    "web": ("web", "web --connect tcp/robot:7447",
+            "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml"),
     "record": ("record recordings/ --rig rig.toml",),
     "report": ("report out.mcap -o report.html",),
     "log info": ("log info recordings/*.mcap",),

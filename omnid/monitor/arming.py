@@ -27,7 +27,7 @@ def arm(bus: BusConfig, answer_s: float = ANSWER_S) -> str:
         deadline_s = time.monotonic() + answer_s
         while time.monotonic() < deadline_s:
             report = statuses.wait(deadline_s - time.monotonic())
-            if report is not None and _answered_ns(report) >= stamp_ns:
+            if report is not None and answered_ns(report.value(WHEELS, Key.ARM_STAMP_NS)) >= stamp_ns:
                 return report.value(WHEELS, Key.ARM_REFUSAL)
     raise OmnidError(f"{bus.robot} has not answered within {answer_s:g} s: either this program must not command it "
                      "(bus.command_users, bus.command_names), or the clocks differ by more than "
@@ -59,8 +59,8 @@ def driver_of(robot: Robot) -> Driver:
     return driver
 
 
-def _answered_ns(report: Diagnostics) -> int:
-    text = report.value(WHEELS, Key.ARM_STAMP_NS)
+def answered_ns(text: str) -> int:
+    """Return the stamp of the answered request in a status, ns; 0 for a text that is none."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
 
 

@@ -1,0 +1,30 @@
+"""Remedies: advice for each status that is not good."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from omnid.transport import status_names
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import PREFIX, Key
+
+_OF_PART: Final = {
+    status_names.ODOMETRY: "stop, then drive back slowly to a place that it has seen; check light and mirrors",
+    status_names.PAIRING: "on the robot: omnid doctor",
+    status_names.WHEELS: "remove the cause, then arm; on the robot: omnid doctor",
+    status_names.BUS: "see bus.robot and bus.connect in the robot's configuration",
+    status_names.RECORDING: "make room on the disk, or change record.folder",
+    status_names.LOAD: "close other programs on the robot, or start it with --profile small",
+    status_names.RIG: "omnid calibrate check on a recording",
+    status_names.RIG_AT_START: "name the right rig.toml, or calibrate again",
+}
+_CAMERA: Final = "check its cable and its power; on the robot: omnid doctor"
+
+
+def remedy_of(status: DiagnosticStatus) -> str:
+    """Return what to do: the robot's own words, else the usual advice for that part; empty where there is none."""
+    if status.values.get(Key.REMEDY):
+        return status.values[Key.REMEDY]
+    if status.name.startswith(PREFIX) and status.name.endswith(" camera"):
+        return _CAMERA
+    return _OF_PART.get(status.name, "")

@@ -1,0 +1,121 @@
+"""The state of the robot as messages for browsers. Text from the network is shortened, without control characters."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from omnid.engine.telemetry import Histogram
+from omnid.monitor.robot_state import RobotState, plain
+from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.decode import Map, Pose
+from omnid.transport.status_names import STAGE_PREFIX, WHEELS, Key, short_name
+from omnid.web.channels import compact, with_header
+from omnid.web.remedies import remedy_of
+
+MOST_WARNINGS: Final = 20
+MOST_VALUES: Final = 60  # of a part
+LONGEST_VALUE: Final = 100  # characters
+LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
+MOST_CELLS: Final = 1 << 26
+_ROBOT_GONE: Final = "start the daemon on the robot: omnid run, or systemctl start omnid"
+
+
+def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> str:
+    """Return the message `state`: tracking, pose, rates, wheels, warnings.
+
+    link: why there is no connection to the robot; empty with one. extra: further entries.
+    """
+    return compact({
+        "type": "state", "robot": plain(robot), "link": plain(link), "alive": state.alive, "state": state.state,
+        "fresh": state.rate_hz > 0, "rate_hz": _number(state.rate_hz), "missed": state.missed, "broken": state.broken,
+        "pose": None if state.pose is None else _pose(state.pose), "age_ms": _quantiles_ms(state.age),
+        "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "warnings": _warnings(state, link),
+        **extra,
+    })
+
+
+def parts_message(state: RobotState) -> str:
+    """Return the message `parts`: all status entries, the worst first, stages last."""
+    parts = sorted(state.statuses.values(), key=_importance)
+    return compact({"type": "parts", "parts": [
+        {"name": plain(short_name(part.name)), "level": part.level % 4, "message": plain(part.message),
+         "values": [[plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
+                    for key, value in list(part.values.items())[:MOST_VALUES]]}
+        for part in parts]})
+
+
+def map_message(grid: Map) -> bytes:
+    """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated."""
+    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size:
+        return with_header({"type": "map", "width": 0, "height": 0}, b"")
+    step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
+    cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
+    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "cell_m": step * grid.cell_m,
+              "x_m": grid.corner[0], "y_m": grid.corner[1]}
+    return with_header(header, zlib.compress(cells.tobytes(), 1))
+
+
+def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """Return the highest value in each square of step x step cells."""
+    if step == 1:
+        return cells
+    height, width = (-(-edge // step) for edge in cells.shape)
+    padded = np.zeros((height * step, width * step), np.uint8)
+    padded[:cells.shape[0], :cells.shape[1]] = cells
+    reduced: np.ndarray[Any, np.dtype[np.uint8]] = padded.reshape(height, step, width, step).max(axis=(1, 3))
+    return reduced
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
+    found = pose.attachment
+    return {
+        "x_m": _number(pose.x_m), "y_m": _number(pose.y_m), "z_m": _number(pose.z_m), "yaw_rad": _number(pose.yaw_rad),
+        "speed_mps": _number(float(pose.velocity[0])), "sigma_mm": _number(1e3 * float(sigma[:3].max())),
+        "sigma_deg": _number(math.degrees(sigma[3:].max())), "inliers": found.inliers, "tracked": found.tracked,
+        "resets": found.resets, "sent_ms": found.sent_ns * 1e-6 if 0 < found.sent_ns < 2**63 else None,
+    }
+
+
+def _wheels(state: RobotState) -> dict[str, Any] | None:
+    """Return the wheels' entry; None where the robot has reported none, or its daemon has ended."""
+    status = state.statuses.get(WHEELS)
+    if status is None or state.alive is False:
+        return None
+    return {"armed": status.values.get(Key.ARMED) == "1", "message": plain(status.message), "level": status.level % 4,
+            "source": plain(status.values.get(Key.SOURCE, ""))}
+
+
+def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
+    """Return what is wrong, the worst first, each with its remedy."""
+    found = []
+    if link:
+        found.append(_warning(2, "connection", link, "is the robot on, and on this network? check --connect"))
+    elif state.alive is False:
+        found.append(_warning(2, "robot", "its daemon has ended or cannot be reached", _ROBOT_GONE))
+    parts = sorted((part for part in state.statuses.values() if part.level % 4 != OK), key=_importance)
+    found += [_warning(part.level % 4, short_name(part.name), part.message, remedy_of(part)) for part in parts]
+    return found[:MOST_WARNINGS]
+
+
+def _warning(level: int, name: str, message: str, remedy: str) -> dict[str, Any]:
+    return {"level": level, "name": plain(name), "message": plain(message), "remedy": plain(remedy)}
+
+
+def _importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
+    return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name
+
+
+def _quantiles_ms(histogram: Histogram) -> list[float | None]:
+    """Return median and 99th percentile."""
+    return [_number(1e3 * histogram.p(q)) for q in (0.5, 0.99)]
+
+
+def _number(value: float) -> float | None:
+    """Return the number in 6 digits; None for one that JSON does not have."""
+    return float(f"{value:.6g}") if math.isfinite(value) else None

@@ -1,0 +1,87 @@
+// The STOP and Arm buttons. A stop is sent again until the server has taken it; the server repeats it until the robot
+// confirms it.
+import { byId } from "./elements.js";
+
+const RETRY_MS = 300;
+const GIVE_UP_MS = 10000;
+const SURE_MS = 4000;
+const EMERGENCY = "STOP IS NOT SENT: use the emergency stop on the robot";
+
+export function wireCommands() {
+  const stopButton = byId("stop");
+  const armButton = byId("arm");
+  let sureUntil = 0;
+  let newest = 0;
+
+  async function stop() {
+    newest += 1;
+    const number = newest;
+    sureUntil = 0;
+    showStop("sending STOP ...", "");
+    stopButton.classList.add("sent");
+    const answer = await post("/stop", GIVE_UP_MS, () => showStop(EMERGENCY, "bad"));
+    if (number !== newest) return; // a newer press shows its own answer
+    stopButton.classList.remove("sent");
+    showStop(answer.text, answer.done ? "good" : "bad");
+  }
+
+  function showStop(text, className) {
+    byId("stop-answer").textContent = text;
+    byId("stop-answer").className = className;
+  }
+
+  async function arm() {
+    if (performance.now() > sureUntil) {
+      sureUntil = performance.now() + SURE_MS;
+      armButton.textContent = "The wheels may turn: press again to arm";
+      armButton.classList.add("sure");
+      setTimeout(unsure, SURE_MS);
+      return;
+    }
+    unsure();
+    byId("answer").textContent = "asking the robot ...";
+    showStop("", "");
+    const answer = await post("/arm", 0, () => {});
+    byId("answer").textContent = answer.text;
+  }
+
+  function unsure() {
+    sureUntil = 0;
+    armButton.textContent = "Arm";
+    armButton.classList.remove("sure");
+  }
+
+  // On pointerdown, not on click: a finger that slides off the button has pressed it all the same.
+  stopButton.addEventListener("pointerdown", stop);
+  stopButton.addEventListener("click", (event) => event.detail === 0 && stop()); // by keyboard or by a screen reader
+  armButton.addEventListener("click", arm);
+  document.addEventListener("keydown", (event) => {
+    if (event.code !== "Space" || event.repeat) return;
+    event.preventDefault(); // else the focused button would be pressed
+    stop();
+  }, { capture: true });
+  document.addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), { capture: true });
+
+  return {
+    setArmed(armed) {
+      armButton.hidden = armed;
+      if (armed && sureUntil) unsure();
+    },
+  };
+}
+
+// Sends a command; again and again for so many ms where the server cannot be reached. Returns {done, text}.
+async function post(address, patience, onFailure) {
+  const end = performance.now() + patience;
+  for (;;) {
+    try {
+      const response = await fetch(address, { method: "POST" });
+      if (response.headers.get("content-type")?.startsWith("application/json")) return await response.json();
+      return { done: false, text: `${EMERGENCY}: ${await response.text()}` };
+    } catch (error) {
+      onFailure();
+      if (performance.now() > end) return { done: false, text: `no connection: ${error.message}. ${EMERGENCY}` };
+    }
+    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+  }
+}

@@ -1,0 +1,17 @@
+// Elements of the page.
+
+export function byId(id) {
+  return document.getElementById(id);
+}
+
+// An element with properties and children; strings become text nodes.
+export function element(name, properties, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+// A number with so many decimals; a dash where there is none.
+export function fixed(value, decimals) {
+  return typeof value === "number" ? value.toFixed(decimals) : "–";
+}

@@ -1,0 +1,117 @@
+// Connects the elements of the page with the messages of the server. Text is only ever set as text, never as HTML.
+import { Connection } from "./connection.js";
+import { Plan } from "./plan.js";
+import { wireCommands } from "./commands.js";
+import { wireRecordings } from "./recordings.js";
+import { byId, element, fixed } from "./elements.js";
+
+const LEVELS = ["good", "warn", "bad", "warn"];
+const LEVEL_NAMES = ["good", "warning", "error", "no news"];
+const STATES = { tracking: "good", degraded: "warn", lost: "bad" };
+
+const plan = new Plan(byId("plan"));
+const connection = new Connection(onMessage, onConnection);
+const commands = wireCommands();
+let imageUrl = "";
+
+function onMessage(message, body) {
+  switch (message.type) {
+    case "state": return showState(message);
+    case "path": return plan.addPath(message.from, message.points);
+    case "map": return plan.setMap(message, body);
+    case "parts": return showParts(message.parts);
+    case "panorama": return showPanorama(body);
+  }
+  return undefined;
+}
+
+function onConnection(text) {
+  byId("lost").hidden = !text;
+  byId("lost").textContent = text;
+  if (text) {
+    setBadge("state", "no connection", "bad");
+    setBadge("armed", "", "warn");
+  }
+}
+
+function showState(state) {
+  document.title = `${state.robot}: ${state.state}`;
+  byId("robot").textContent = state.robot;
+  setBadge("state", state.state, state.fresh ? STATES[state.state] ?? "warn" : "bad");
+  byId("rate").textContent = state.fresh ? `${fixed(state.rate_hz, 1)} poses/s` : "";
+  showWheels(state.wheels);
+  showWarnings(state.warnings);
+  showPose(state);
+  byId("no-pose").hidden = state.pose !== null;
+  byId("panorama-note").hidden = state.panoramas > 0;
+  plan.setPose(state.pose, state.fresh);
+  document.dispatchEvent(new CustomEvent("omnid-state", { detail: state }));
+}
+
+function showWheels(wheels) {
+  const armed = wheels !== null && wheels.armed;
+  setBadge("armed", wheels === null ? "" : armed ? "armed" : "not armed", armed ? "warn" : "good");
+  const source = wheels !== null && wheels.source ? `, commanded by ${wheels.source}` : "";
+  byId("wheels").textContent = wheels === null ? "not reported: the robot has no motor, or is not there"
+    : `${wheels.message}${source}`;
+  commands.setArmed(armed);
+}
+
+function showWarnings(warnings) {
+  const text = JSON.stringify(warnings);
+  const box = byId("warnings");
+  if (box.dataset.shown === text) return;
+  box.dataset.shown = text;
+  box.replaceChildren(...warnings.map((warning) => element("div", { className: `warning ${LEVELS[warning.level]}` },
+    element("strong", {}, `${warning.name}: ${warning.message}`),
+    element("p", {}, warning.remedy ? `Do: ${warning.remedy}` : ""))));
+}
+
+function showPose(state) {
+  const pose = state.pose;
+  const degrees = (radians) => radians === null ? null : radians * 180 / Math.PI;
+  const rows = pose === null ? [] : [
+    ["x, y, z", `${fixed(pose.x_m, 3)}, ${fixed(pose.y_m, 3)}, ${fixed(pose.z_m, 3)} m`],
+    ["heading", `${fixed(degrees(pose.yaw_rad), 1)}°`],
+    ["speed", `${fixed(pose.speed_mps, 2)} m/s`],
+    ["uncertainty, 1 sigma", `${fixed(pose.sigma_mm, 1)} mm, ${fixed(pose.sigma_deg, 2)}°`],
+    ["landmarks", `${pose.inliers} of ${pose.tracked}`],
+    ["resets", `${pose.resets}`],
+    ["image to here, p50 / p99", `${fixed(state.age_ms[0], 0)} / ${fixed(state.age_ms[1], 0)} ms`],
+    ["missed poses", `${state.missed}`],
+  ];
+  byId("pose").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("td", {}, name),
+    element("td", {}, value))));
+}
+
+function showParts(parts) {
+  byId("parts").replaceChildren(...parts.flatMap((part) => [
+    element("h3", { className: LEVELS[part.level] }, `${part.name}: ${part.message || LEVEL_NAMES[part.level]}`),
+    element("table", {}, ...part.values.map(([key, value]) => element("tr", {}, element("td", {}, key),
+      element("td", {}, value)))),
+  ]));
+}
+
+function showPanorama(body) {
+  const image = byId("panorama");
+  const before = imageUrl;
+  imageUrl = URL.createObjectURL(new Blob([body], { type: "image/jpeg" }));
+  image.src = imageUrl;
+  image.hidden = false;
+  if (before) URL.revokeObjectURL(before);
+}
+
+function setBadge(id, text, className) {
+  const badge = byId(id);
+  if (badge.textContent !== text) badge.textContent = text;
+  badge.className = `badge ${className}`;
+}
+
+byId("panorama-box").addEventListener("toggle", (event) => connection.request("panorama", event.target.open));
+byId("panorama-note").textContent = "None comes yet. The robot publishes it with bus.panorama_hz = 5, off by default.";
+byId("closer").addEventListener("click", () => plan.zoom(1.5));
+byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
+byId("fit").addEventListener("click", () => plan.fit());
+plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
+wireRecordings();
+connection.open();

@@ -1,0 +1,243 @@
+// The plan: map, path and robot in odom, x to the right and y up; dragged, zoomed, or fitted to all that is known.
+
+const MARGIN_PX = 40;
+const SMALLEST_M = 4; // width of the plan at least, when fitted
+const ROBOT_PX = 11;
+const NEAREST_PX = 2000; // per metre
+const WIDEST_PX = 0.05;
+const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
+
+export class Plan {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+    this.points = [];
+    this.pose = null;
+    this.fresh = false;
+    this.map = null;
+    this.fits = true;
+    this.onFit = () => {};
+    this.view = { x: 0, y: 0, scale: 50 }; // the centre in m, px per m
+    this.pointers = new Map();
+    this.drawing = false;
+    new ResizeObserver(() => this.draw()).observe(canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.recolour());
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.move(event));
+    for (const name of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+    }
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-event.deltaY / 400));
+    }, { passive: false });
+  }
+
+  // Points from a position of the list on; null is a gap.
+  addPath(from, points) {
+    if (from > this.points.length) return;
+    this.points.length = from;
+    for (const point of points) this.points.push(point);
+    this.draw();
+  }
+
+  setPose(pose, fresh) {
+    const usable = pose !== null && [pose.x_m, pose.y_m, pose.yaw_rad].every(Number.isFinite);
+    this.pose = usable ? pose : null;
+    this.fresh = fresh;
+    this.draw();
+  }
+
+  // Cells of 0 unknown, 1 free, 2 occupied, deflated, row by row from low to high y.
+  async setMap(header, body) {
+    const { width, height } = header;
+    if (!width || !height) {
+      this.map = null;
+    } else {
+      const stream = new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"));
+      const cells = new Uint8Array(await new Response(stream).arrayBuffer());
+      this.map = { ...header, cells, image: null };
+      this.recolour();
+    }
+    this.draw();
+  }
+
+  recolour() {
+    if (this.map !== null) {
+      const { width, height, cells } = this.map;
+      const colours = [[0, 0, 0, 0], this.rgba("--free"), this.rgba("--wall")];
+      const image = new ImageData(width, height);
+      for (let row = 0; row < height; row += 1) {
+        for (let column = 0; column < width; column += 1) {
+          // An image begins at the top: the row of the highest y.
+          const colour = colours[cells[(height - 1 - row) * width + column]] ?? colours[0];
+          image.data.set(colour, 4 * (row * width + column));
+        }
+      }
+      this.map.image = new OffscreenCanvas(width, height);
+      this.map.image.getContext("2d").putImageData(image, 0, 0);
+    }
+    this.draw();
+  }
+
+  zoom(factor) {
+    this.setFit(false);
+    this.view.scale = Math.min(NEAREST_PX, Math.max(WIDEST_PX, this.view.scale * factor));
+    this.draw();
+  }
+
+  fit() {
+    this.setFit(true);
+    this.draw();
+  }
+
+  setFit(fits) {
+    this.fits = fits;
+    this.onFit(fits);
+  }
+
+  press(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  }
+
+  // One pointer drags; two zoom by the ratio of their distances.
+  move(event) {
+    const before = this.pointers.get(event.pointerId);
+    if (before === undefined) return;
+    const now = [event.clientX, event.clientY];
+    const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
+    if (other !== undefined) {
+      const [old, spread] = [before, now].map((at) => Math.hypot(at[0] - other[0], at[1] - other[1]));
+      if (old > 0 && spread > 0) this.zoom(spread / old);
+    } else {
+      this.setFit(false);
+      this.view.x -= (now[0] - before[0]) / this.view.scale;
+      this.view.y += (now[1] - before[1]) / this.view.scale;
+    }
+    this.pointers.set(event.pointerId, now);
+    this.draw();
+  }
+
+  // Draws at the next frame of the screen; several changes are drawn at once.
+  draw() {
+    if (this.drawing) return;
+    this.drawing = true;
+    requestAnimationFrame(() => {
+      this.drawing = false;
+      this.paint();
+    });
+  }
+
+  paint() {
+    const { canvas, context } = this;
+    const ratio = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    if (this.fits) this.fitView(width, height);
+    const toScreen = (x, y) => [width / 2 + (x - this.view.x) * this.view.scale,
+      height / 2 - (y - this.view.y) * this.view.scale];
+    this.paintMap(toScreen);
+    this.paintPath(toScreen);
+    if (this.pose !== null) this.paintRobot(toScreen);
+    this.paintScale(width, height);
+  }
+
+  fitView(width, height) {
+    let [left, right, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
+    const add = (x, y) => {
+      left = Math.min(left, x); right = Math.max(right, x);
+      low = Math.min(low, y); high = Math.max(high, y);
+    };
+    for (const point of this.points) if (point !== null) add(point[0], point[1]);
+    if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
+    if (this.map !== null) {
+      add(this.map.x_m, this.map.y_m);
+      add(this.map.x_m + this.map.width * this.map.cell_m, this.map.y_m + this.map.height * this.map.cell_m);
+    }
+    if (left > right) return;
+    this.view.x = (left + right) / 2;
+    this.view.y = (low + high) / 2;
+    this.view.scale = Math.min((width - 2 * MARGIN_PX) / Math.max(SMALLEST_M, right - left),
+      (height - 2 * MARGIN_PX) / Math.max(SMALLEST_M, high - low));
+    this.view.scale = Math.min(NEAREST_PX, Math.max(WIDEST_PX, this.view.scale));
+  }
+
+  paintMap(toScreen) {
+    if (this.map === null || this.map.image === null) return;
+    const [left, top] = toScreen(this.map.x_m, this.map.y_m + this.map.height * this.map.cell_m);
+    const scale = this.map.cell_m * this.view.scale;
+    this.context.imageSmoothingEnabled = false;
+    this.context.drawImage(this.map.image, left, top, this.map.width * scale, this.map.height * scale);
+  }
+
+  paintPath(toScreen) {
+    const { context } = this;
+    context.strokeStyle = this.colour("--accent");
+    context.lineWidth = 2.5;
+    context.lineJoin = "round";
+    context.beginPath();
+    let begins = true;
+    for (const point of this.points) {
+      if (point === null) {
+        begins = true;
+      } else {
+        const [x, y] = toScreen(point[0], point[1]);
+        if (begins) context.moveTo(x, y);
+        else context.lineTo(x, y);
+        begins = false;
+      }
+    }
+    if (this.pose !== null && !begins) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
+    context.stroke();
+  }
+
+  paintRobot(toScreen) {
+    const { context } = this;
+    const [x, y] = toScreen(this.pose.x_m, this.pose.y_m);
+    context.save();
+    context.translate(x, y);
+    context.rotate(-this.pose.yaw_rad);
+    context.beginPath();
+    context.moveTo(1.5 * ROBOT_PX, 0);
+    context.lineTo(-ROBOT_PX, ROBOT_PX);
+    context.lineTo(-0.5 * ROBOT_PX, 0);
+    context.lineTo(-ROBOT_PX, -ROBOT_PX);
+    context.closePath();
+    context.fillStyle = this.colour(this.fresh ? "--accent" : "--bad");
+    context.strokeStyle = this.colour("--back");
+    context.lineWidth = 2;
+    context.fill();
+    context.stroke();
+    context.restore();
+  }
+
+  paintScale(width, height) {
+    const { context } = this;
+    const length = SCALES_M.find((metres) => metres * this.view.scale >= 60) ?? SCALES_M.at(-1);
+    const [left, bottom] = [14, height - 14];
+    context.fillStyle = context.strokeStyle = this.colour("--quiet");
+    context.lineWidth = 2;
+    context.beginPath();
+    context.moveTo(left, bottom - 6);
+    context.lineTo(left, bottom);
+    context.lineTo(left + length * this.view.scale, bottom);
+    context.lineTo(left + length * this.view.scale, bottom - 6);
+    context.stroke();
+    context.font = "13px system-ui, sans-serif";
+    context.fillText(`${length} m`, left + 6, bottom - 8);
+  }
+
+  colour(name) {
+    return getComputedStyle(this.canvas).getPropertyValue(name).trim();
+  }
+
+  // A colour #rrggbb of the style as 4 bytes.
+  rgba(name) {
+    const text = this.colour(name);
+    return [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16)).concat(255);
+  }
+}

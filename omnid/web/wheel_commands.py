@@ -1,0 +1,146 @@
+"""Stop and arm from the page: the same commands with the same answers as `omnid stop` and `omnid arm`."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Final, NamedTuple, TypeVar
+
+from omnid.client import Driver
+from omnid.monitor.arming import ANSWER_S, CONNECT_S, answered_ns
+from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
+from omnid.web.feed import RobotFeed
+
+T = TypeVar("T")
+REPEAT_S: Final = 0.2  # between two stops
+_POLL_S: Final = 0.02
+
+
+class Answer(NamedTuple):
+    """The answer to a command."""
+
+    done: bool
+    text: str
+
+
+class WheelCommands:
+    """Sends commands. A stop goes on until the robot's status confirms it; any number of browsers may ask for one.
+
+    Sending may block while the robot does not read: stops and requests to arm have a thread each.
+    """
+
+    def __init__(self, feed: RobotFeed) -> None:
+        self._feed = feed
+        self._stop_thread, self._arm_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._driver: Driver | None = None
+        self._stopping: asyncio.Task[Answer] | None = None
+        self._again = False  # a stop was asked for since the newest one was sent
+        self._arming = False
+        self.stops = self.arms = 0  # that were asked for
+
+    @property
+    def is_stopping(self) -> bool:
+        """True while a stop is sent and not confirmed."""
+        return self._stopping is not None and not self._stopping.done()
+
+    async def stop(self) -> Answer:
+        """Stop the wheels, and wait until the robot confirms it.
+
+        For at most 10 s after the newest request; 2 s where no robot receives commands.
+        """
+        self.stops += 1
+        self._again = True
+        if not self.is_stopping:
+            self._stopping = asyncio.create_task(self._stop())
+        assert self._stopping is not None
+        return await asyncio.shield(self._stopping)  # a browser that goes does not end it
+
+    async def arm(self) -> Answer:
+        """Ask the robot to arm, and wait for its answer."""
+        if self.is_stopping:
+            return Answer(False, "a stop is not confirmed yet: arm after it")
+        if self._arming:
+            return Answer(False, "another request to arm has no answer yet")
+        self.arms += 1
+        self._arming = True
+        try:
+            return await self._arm()
+        finally:
+            self._arming = False
+
+    async def _stop(self) -> Answer:
+        begin_s = time.monotonic()
+        while time.monotonic() < begin_s + (ANSWER_S if self._is_received else CONNECT_S):
+            if self._again:
+                self._again, begin_s = False, time.monotonic()
+            driver, reports = self._ready_driver(), self._feed.wheel_reports
+            if driver is not None:
+                await _within(self._stop_thread, driver.stop)
+                reported = await self._wait_for(partial(self._reported_since, reports), REPEAT_S)
+                if reported and not self._again and self._is_stopped():
+                    return Answer(True, "the robot stops: its wheels stand until it is armed")
+            else:
+                await asyncio.sleep(_POLL_S)
+        return Answer(False, f"the stop is NOT confirmed: use the emergency stop. {self._reason()}")
+
+    async def _arm(self) -> Answer:
+        driver = self._ready_driver()
+        if driver is None:
+            return Answer(False, self._reason())
+        stamp_ns = await _within(self._arm_thread, driver.arm)
+        answered = stamp_ns is not None and await self._wait_for(lambda: self._answered_ns() >= stamp_ns, ANSWER_S)
+        if not answered:
+            return Answer(False, f"the robot has not answered. {self._reason()}")
+        refusal = self._value(Key.ARM_REFUSAL)
+        return Answer(not refusal, f"refused: {refusal}" if refusal else "the robot is armed: it obeys commands")
+
+    def _ready_driver(self) -> Driver | None:
+        """Return the sender; None without a connection to the robot."""
+        if self._driver is None and self._feed.robot is not None:
+            self._driver = self._feed.robot.driver()
+        return self._driver
+
+    @property
+    def _is_received(self) -> bool:
+        """True if a robot receives commands."""
+        return self._driver is not None and self._driver.connected
+
+    async def _wait_for(self, happens: Callable[[], bool], timeout_s: float) -> bool:
+        deadline_s = time.monotonic() + timeout_s
+        while not happens():
+            if time.monotonic() > deadline_s:
+                return False
+            await asyncio.sleep(_POLL_S)
+        return True
+
+    def _reported_since(self, reports: int) -> bool:
+        return self._feed.wheel_reports > reports
+
+    def _is_stopped(self) -> bool:
+        return self._value(Key.DISARMED_BY) == DISARMED_BY_STOP
+
+    def _answered_ns(self) -> int:
+        return answered_ns(self._value(Key.ARM_STAMP_NS))
+
+    def _value(self, key: Key) -> str:
+        status = self._feed.state.statuses.get(WHEELS)
+        return "" if status is None else status.values.get(key, "")
+
+    def _reason(self) -> str:
+        """Return why there may be no answer."""
+        if self._feed.link:
+            return f"There is no connection: {self._feed.link}"
+        if not self._is_received:
+            return "No robot of that name receives commands there: does its daemon run, with a motor?"
+        return ("Either this program must not command it (bus.command_users, bus.command_names), or the clocks differ; "
+                "see `refused` in the entry of the wheels")
+
+
+async def _within(thread: ThreadPoolExecutor, send: Callable[[], T]) -> T | None:
+    """Call a function in a thread; return None if it has not returned in time, because the robot does not read."""
+    call = asyncio.get_running_loop().run_in_executor(thread, send)
+    done, _ = await asyncio.wait([call], timeout=ANSWER_S / 2)
+    return call.result() if done else None

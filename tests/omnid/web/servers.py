@@ -1,0 +1,122 @@
+"""`omnid web` in a process of its own, and a client that sends what browsers send, and what they never would."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.sync.client import ClientConnection, connect
+
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 30.0
+
+
+class HttpAnswer(NamedTuple):
+    """Answer to a request."""
+
+    status: int
+    headers: Mapping[str, str]
+    text: str
+
+
+class WebServer:
+    """A running `omnid web`."""
+
+    def __init__(self, process: subprocess.Popen[str], url: str) -> None:
+        self.process, self.url = process, url
+        parts = urlsplit(url)
+        self.port = int(parts.port or 0)
+        self.host = f"127.0.0.1:{self.port}"
+        self.token = parse_qs(parts.query)["token"][0]
+
+    @property
+    def bearer(self) -> dict[str, str]:
+        """The header of a program that knows the token."""
+        return {"Authorization": f"Bearer {self.token}"}
+
+    def request(self, path: str, method: str = "GET", headers: Mapping[str, str] | None = None,
+                body: str | None = None) -> HttpAnswer:
+        """Send one request over a connection of its own."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        try:
+            connection.request(method, path, body, dict(headers or {}))
+            answer = connection.getresponse()
+            return HttpAnswer(answer.status, {name.lower(): value for name, value in answer.getheaders()},
+                              answer.read().decode("utf-8", "replace"))
+        finally:
+            connection.close()
+
+    def post(self, path: str) -> dict[str, Any]:
+        """Send a command as a program; return the answer."""
+        found: dict[str, Any] = json.loads(self.request(path, "POST", self.bearer).text)
+        return found
+
+    def cookie(self) -> dict[str, str]:
+        """Return the header of a browser that has opened the printed address."""
+        answer = self.request(f"/?token={self.token}")
+        assert answer.status == 303 and answer.headers["location"] == "/"
+        return {"Cookie": answer.headers["set-cookie"].split(";")[0]}
+
+    def live(self, headers: Mapping[str, str] | None = None, origin: str | None = None) -> ClientConnection:
+        """Open the websocket."""
+        return connect(f"ws://{self.host}/live", additional_headers=headers, origin=origin,  # type: ignore[arg-type]
+                       compression=None, open_timeout=PATIENCE_S)
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Send a signal; return the exit code and stderr."""
+        self.process.send_signal(number)
+        _, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, err
+
+
+@contextmanager
+def served(*words: object) -> Iterator[WebServer]:
+    """Yield a server on a free port; it is killed at the end of the block."""
+    command = [sys.executable, "-m", "omnid", "web", "--listen", "127.0.0.1:0", *map(str, words)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line, process.communicate()[1]
+            yield WebServer(process, line.strip())
+        finally:
+            process.kill()
+
+
+class Shown:
+    """What a page would show: the newest message of each kind. Each message is answered as the page does."""
+
+    def __init__(self, live: ClientConnection) -> None:
+        self._live = live
+        self.newest: dict[str, dict[str, Any]] = {}
+
+    def read(self) -> dict[str, Any]:
+        """Take the next message."""
+        data = self._live.recv(PATIENCE_S)
+        if isinstance(data, str):
+            message: dict[str, Any] = json.loads(data)
+        else:
+            length = int.from_bytes(data[:4], "big")
+            message = {**json.loads(data[4:4 + length]), "body": data[4 + length:]}
+        self.newest[message["type"]] = message
+        self._live.send("ok")
+        return message
+
+    def until(self, kind: str, action: Callable[[], object] = lambda: None,
+              holds: Callable[[dict[str, Any]], object] = lambda _: True) -> dict[str, Any]:
+        """Repeat an action and take messages until one of a kind is there for which a condition holds; return it."""
+        end_s = time.monotonic() + PATIENCE_S
+        while kind not in self.newest or not holds(self.newest[kind]):
+            assert time.monotonic() < end_s, f"no such message {kind!r} within {PATIENCE_S:g} s: {self.newest}"
+            action()
+            self.read()
+        return self.newest[kind]

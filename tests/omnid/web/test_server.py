@@ -1,0 +1,264 @@
+"""The server as a process: who is let in, what browsers get, and what hostile ones cannot do."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import time
+import zlib
+from contextlib import ExitStack
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from drivers.frame import Frame
+from omnid.transport import codec
+from omnid.transport.bus import Bus
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.image_codec import image_cdr
+from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.status_names import BUS, WHEELS
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served
+from tests.replay.command import Command
+
+HOSTILE = "<img src=x onerror=alert(1)>\x1b[2J\u202e\x00\n"
+
+
+def publish(bus: Bus, seq: int, state: str = "tracking") -> None:
+    bus.publish("odom", odometry(seq), PoseAttachment(seq, state, 0, 50, 60, time.time_ns()).to_bytes())
+
+
+def state_of(server: WebServer) -> dict[str, Any]:
+    with server.live(server.bearer) as live:
+        return Shown(live).until("state")
+
+
+def metric(server: WebServer, name: str) -> float:
+    lines = server.request("/metrics", headers=server.bearer).text.splitlines()
+    return next((float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith(f"{name} ")), 0.0)
+
+
+def test_the_printed_address_lets_a_browser_in(server: WebServer) -> None:
+    first = server.request("/")
+    assert first.status == 401 and "token" in first.text and "page.js" not in first.text
+    assert server.request("/?token=wrong").status == 401
+    page = server.request("/", headers=server.cookie())
+    assert page.status == 200 and "page.js" in page.text
+    cookie = server.request(f"/?token={server.token}").headers["set-cookie"].lower()
+    assert "httponly" in cookie and "samesite=lax" in cookie and server.token not in cookie
+    own = {"Origin": f"http://{server.host}", "Content-Type": "application/x-www-form-urlencoded"}
+    assert server.request("/login", "POST", own, f"token={server.token}").status == 303
+    assert server.request("/login", "POST", own, "token=wrong").status == 401
+    assert server.request("/login", "POST", own, "x" * 5000).status == 413
+    assert server.request("/login", "POST", {}, f"token={server.token}").status == 403
+
+
+@pytest.mark.parametrize("path", ["/", "/login", "/static/page.js", "/metrics", "/recordings", "/nothing"])
+def test_every_answer_has_the_headers_that_protect_the_page(server: WebServer, path: str) -> None:
+    for headers in ({}, server.bearer):
+        answer = server.request(path, headers=headers)
+        assert "script-src 'self'" in answer.headers["content-security-policy"]
+        assert "unsafe" not in answer.headers["content-security-policy"]
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["referrer-policy"] == "same-origin"
+        assert server.token not in answer.text
+
+
+@pytest.mark.parametrize(("method", "path"), [
+    ("POST", "/stop"), ("POST", "/arm"), ("GET", "/metrics"), ("GET", "/recordings"),
+    ("GET", "/recordings/0/report"), ("POST", "/recordings/0/report"), ("GET", "/static/page.js"),
+])
+def test_nothing_is_answered_without_token_or_for_another_site(server: WebServer, method: str, path: str) -> None:
+    origin = {"Origin": f"http://{server.host}"}
+    assert server.request(path, method, origin).status == 401
+    assert server.request(path, method, {"Authorization": "Bearer wrong"}).status == 401
+    assert server.request(path, method, {**server.cookie(), "Origin": "http://evil.example"}).status == 403
+    assert server.request(path, method, {**server.bearer, "Host": "evil.example"}).status == 403
+
+
+def test_commands_are_posts(server: WebServer) -> None:
+    assert [server.request(path, headers=server.bearer).status for path in ("/stop", "/arm", "/login")] == [405] * 3
+
+
+@pytest.mark.parametrize("path", [
+    "/static/../access.py", "/static/%2e%2e/access.py", "/static/..%2faccess.py", "/static//etc/passwd", "/static/",
+    "/recordings/..%2f..%2fetc%2fpasswd/report", "/recordings/%00/report", "/%ff%fe",
+])
+def test_no_other_file_can_be_read(server: WebServer, path: str) -> None:
+    answer = server.request(path, headers=server.bearer)
+    assert answer.status in (404, 409) and "import" not in answer.text and "root:" not in answer.text
+
+
+def test_websockets_need_token_and_origin(server: WebServer) -> None:
+    cookie, origin = server.cookie(), f"http://{server.host}"
+    with server.live(cookie, origin) as live:
+        assert Shown(live).until("state")["robot"] == "rover"
+    for headers, other in ((None, origin), (cookie, "http://evil.example"), (cookie, "null"), (cookie, None),
+                           ({"Cookie": "omnid=1"}, origin)):
+        with pytest.raises(InvalidStatus) as refused:
+            server.live(headers, other)
+        assert refused.value.response.status_code == 403
+
+
+@pytest.mark.parametrize("message", ["arm", "ok ok", "show state", "show", "\x00", b"ok", "{}", "x" * 300])
+def test_a_websocket_that_sends_anything_else_is_closed(server: WebServer, message: str | bytes) -> None:
+    with server.live(server.bearer) as live:
+        Shown(live).until("state")
+        live.send(message)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                live.recv(PATIENCE_S)
+        assert live.close_code in (1008, 1009)
+    assert state_of(server)["robot"] == "rover"
+
+
+def test_an_answer_without_a_message_closes_the_websocket(server: WebServer) -> None:
+    with server.live(server.bearer) as live:
+        Shown(live).until("state")
+        for _ in range(3):
+            live.send("ok")
+        with pytest.raises(ConnectionClosed):
+            while True:
+                live.recv(PATIENCE_S)
+
+
+def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
+    seq = count(1)
+    grid = np.full((40, 30), -1, np.int8)
+    grid[:, 0], grid[0, :] = 100, 0
+    wheels = DiagnosticStatus(WHEELS, 1, "not armed: a stop was asked for", {"remedy": "omnid arm", "armed": "0"})
+
+    def run() -> None:
+        publish(bus, next(seq))
+        bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(BUS, 0, "open", {"lost": "0"}), wheels]))
+        bus.publish("map", codec.grid_cdr(10**18, "odom", grid, 0.1, (-1.0, -2.0)))
+
+    with server.live(server.bearer) as live:
+        shown = Shown(live)
+        state = shown.until("state", run, lambda found: found["pose"] and found["wheels"] and found["alive"])
+        assert state["state"] == "tracking" and state["pose"]["inliers"] == 50 and not state["wheels"]["armed"]
+        assert state["warnings"] == [{"level": 1, "name": "wheels", "message": "not armed: a stop was asked for",
+                                      "remedy": "omnid arm"}]
+        parts = shown.until("parts", run, lambda found: found["parts"])
+        assert [part["name"] for part in parts["parts"]] == ["wheels", "bus"]
+        assert shown.until("path", run, lambda found: found["points"])["points"][-1][0] == pytest.approx(
+            state["pose"]["x_m"], abs=5.0)
+        received = shown.until("map", run, lambda found: found["width"])
+        cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
+        assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
+        assert (received["cell_m"], received["x_m"], received["y_m"]) == (pytest.approx(0.1), -1.0, -2.0)
+
+
+def test_a_panorama_is_sent_to_a_browser_that_asks(server: WebServer, bus: Bus) -> None:
+    jpeg = np.frombuffer(b"\xff\xd8\xff\xe0 some bytes", np.uint8)
+
+    def run() -> None:
+        publish(bus, 1)
+        bus.publish("panorama", image_cdr(Frame(1, 10**9, "lower", "jpeg", jpeg), 10**9)[1])
+
+    with server.live(server.bearer) as live, server.live(server.bearer) as other:
+        live.send("show panorama")
+        assert Shown(live).until("panorama", run)["body"] == jpeg.tobytes()
+        quiet = Shown(other)
+        quiet.until("state", holds=lambda found: found["panoramas"])
+        for _ in range(8):  # of each kind at least one
+            run()
+            assert quiet.read()["type"] != "panorama"
+
+
+def test_hostile_messages_of_the_robot_are_shown_as_text(server: WebServer, bus: Bus) -> None:
+    values = {HOSTILE: HOSTILE, **{f"key {number}": "9" * 500 for number in range(200)}}
+    entries = [DiagnosticStatus(f"{HOSTILE}{number}", 2, HOSTILE * 100, values) for number in range(5)]
+    huge = json.dumps({"seq": 10**300, "sent_ns": 10**400, "state": HOSTILE, "inliers": -(10**200)}).encode()
+
+    def run() -> None:
+        bus.publish("status", codec.diagnostics_cdr(10**18, entries))
+        bus.publish("odom", odometry(5), huge)
+        bus.publish("odom", b"nonsense")
+        bus.publish("map", b"\0" * 1000)
+        bus.publish("panorama", b"\0" * 1000)
+
+    with server.live(server.bearer) as live:
+        shown = Shown(live)
+        broken = shown.until("state")["broken"]
+        state = shown.until("state", run, lambda found: len(found["warnings"]) >= 5 and found["broken"] > broken + 1)
+        parts = shown.until("parts", run, lambda found: len(found["parts"]) >= 5)
+        for text in (json.dumps(state), json.dumps(parts)):
+            assert "onerror" in text and len(text) < 400_000
+            assert not any(code in text for code in ("\\u001b", "\\u202e", "\\u0000"))
+    metrics = server.request("/metrics", headers=server.bearer).text
+    assert "\x1b" not in metrics and all(line.startswith(("omnid_", "# ")) for line in metrics.splitlines())
+
+
+def test_a_browser_that_does_not_answer_skips_and_delays_no_other(server: WebServer, bus: Bus) -> None:
+    skipped = metric(server, 'omnid_web_skipped_total{channel="state"}')
+    with server.live(server.bearer) as slow, server.live(server.bearer) as quick:
+        data, quicker, seq = slow.recv(PATIENCE_S), Shown(quick), count(1000)
+        assert data
+        for _ in range(30):
+            publish(bus, next(seq))
+            quicker.read()
+            time.sleep(0.02)
+        last_m = quicker.until("state", holds=lambda found: found["pose"]["x_m"] > 250)["pose"]["x_m"]
+        slow.send("ok")
+        later = Shown(slow)
+        assert later.until("state")["pose"]["x_m"] >= last_m
+    assert metric(server, 'omnid_web_skipped_total{channel="state"}') > skipped + 10
+
+
+def test_only_so_many_browsers(server: WebServer) -> None:
+    with ExitStack() as pages:
+        for _ in range(32):
+            pages.enter_context(server.live(server.bearer))
+        with server.live(server.bearer) as one_more, pytest.raises(ConnectionClosed):
+            one_more.recv(PATIENCE_S)
+        assert one_more.close_code == 1013
+    wait_until(lambda: metric(server, "omnid_web_browsers") == 0)
+
+
+@pytest.mark.slow
+def test_connections_that_send_nothing_do_not_keep_browsers_out(server: WebServer) -> None:
+    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(140)]
+    try:
+        wait_until(lambda: server.request("/").status == 401)
+    finally:
+        for connection in silent:
+            connection.close()
+
+
+def test_refused_requests_are_counted(server: WebServer) -> None:
+    before = metric(server, 'omnid_web_refused_total{reason="cross-site"}')
+    server.request("/stop", "POST", {**server.cookie(), "Origin": "http://evil.example"})
+    assert metric(server, 'omnid_web_refused_total{reason="cross-site"}') == before + 1
+
+
+def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_signals: None) -> None:
+    with served("--connect", free_endpoint()) as server:
+        with server.live(server.bearer) as live:
+            state = Shown(live).until("state", holds=lambda found: "cannot reach" in found["link"])
+        assert state["warnings"][0]["name"] == "connection"
+        assert server.post("/arm")["text"].startswith("There is no connection")
+        assert server.post("/stop")["text"].startswith("the stop is NOT confirmed: use the emergency stop")
+        assert server.end(signal.SIGINT) == (0, "")
+
+
+@pytest.mark.parametrize(("words", "expected"), [
+    (("--listen", "nonsense"), "HOST:PORT"), (("--listen", "127.0.0.1:99999"), "HOST:PORT"),
+    (("--listen", "192.0.2.1:0"), "another address"), (("--host", "http://x"), "--host"),
+    (("--robot", "a b"), "bus.robot"), (("--connect", "nonsense"), "bus.connect"),
+    (("--tls-key", "key.pem"), "--tls-certificate"), (("--token-file", "/nowhere/token"), "--token-file"),
+    (("--tls-key", "/nowhere", "--tls-certificate", "/nowhere"), "--tls-certificate"),
+])
+def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    listen = () if "--listen" in words else ("--listen", "127.0.0.1:0")
+    assert expected in Command(capsys).refused("web", *listen, *words)
+
+
+def test_a_taken_port_is_told(server: WebServer, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "stop the other program" in Command(capsys).refused("web", "--listen", server.host)

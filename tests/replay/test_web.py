@@ -1,0 +1,60 @@
+"""The page's commands against a real daemon and a simulated base: arm, drive, stop, a restart of the daemon."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from omnid.core.control.safety_rules import ASKED, FAILED
+from tests.replay.live import command_line, robot, started, wait_until
+from tests.replay.test_arming import MANUAL
+
+pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
+pytest.importorskip("websockets", reason="needs the packages of omnid[web]")
+from tests.omnid.web.servers import Shown, WebServer, served
+
+RECORDED = ("--set", "record.enabled=true", "--set")
+
+
+def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    """Return the state on a page that is opened now, as soon as a condition holds."""
+    with server.live(server.bearer) as live:
+        return Shown(live).until("state", holds=holds)
+
+
+def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, scene: Path) -> None:
+    folder = tmp_path / "recordings"
+    with robot(scene, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base), \
+            served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", folder) as server:
+        operator.drive(0.3)
+        assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
+        assert not base.line.moved_since(0.0)
+        assert server.post("/arm") == {"done": True, "text": "the robot is armed: it obeys commands"}
+        wait_until(lambda: base.drives, "motion")
+        answer = server.post("/stop")
+        assert answer["done"] and "stand until" in answer["text"]
+        wait_until(lambda: not base.drives, "the stop")
+        since_s = time.monotonic()
+        stopped = state(server, lambda found: not found["wheels"]["armed"])
+        assert stopped["wheels"]["message"] == ASKED
+        time.sleep(0.5)
+        assert not base.line.moved_since(since_s), "the operator, who sends at 20 Hz, moves nothing"
+        assert server.post("/arm")["done"]
+        base.unplug()
+        wait_until(lambda: operator.message("wheels") == FAILED, "the fault")
+        assert server.post("/arm") == {"done": False, "text": f"refused: {FAILED}"}
+        base.plug_in()
+        assert daemon.end()[0] == 0
+        gone = state(server, lambda found: found["alive"] is False and len(found["warnings"]) == 1)
+        assert gone["wheels"] is None and gone["warnings"][0]["name"] == "robot"
+        assert '"state":"whole"' in server.request("/recordings", headers=server.bearer).text
+        with started(command_line(scene, daemon.port, base.port, *MANUAL), daemon.port):
+            again = state(server, lambda found: found["alive"] and found["fresh"] and found["wheels"])
+            assert not again["wheels"]["armed"]
+            with server.live(server.bearer) as live:
+                assert len(Shown(live).until("path")["points"]) < 200, "the path of the new start only"
+        assert server.end() == (0, "")
