@@ -9,7 +9,6 @@ import time
 import zlib
 from contextlib import ExitStack
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -260,5 +259,5 @@ def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys
     assert expected in Command(capsys).refused("web", *listen, *words)
 
 
-def test_a_taken_port_is_told(server: WebServer, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_taken_port_is_refused(server: WebServer, capsys: pytest.CaptureFixture[str]) -> None:
     assert "stop the other program" in Command(capsys).refused("web", "--listen", server.host)
