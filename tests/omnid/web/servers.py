@@ -93,7 +93,7 @@ def served(*words: object) -> Iterator[WebServer]:
 
 
 class Shown:
-    """What a page would show: the newest message of each kind. Each message is answered as the page does."""
+    """Content of a page: the newest message of each kind. Each message is answered as the page does."""
 
     def __init__(self, live: ClientConnection) -> None:
         self._live = live
