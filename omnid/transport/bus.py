@@ -18,7 +18,7 @@ from omnid.errors import OmnidError
 from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
-from omnid.transport.session import open_session, reason
+from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.topics import PUBLISHED, Topic, ros_name
 
 __all__ = ["Bus", "BusConfig"]
@@ -54,7 +54,7 @@ class Bus:
         self._closed = False
         self.lost = 0
         if not self.needs_router:
-            self._open()
+            self._open_peer()
 
     @property
     def needs_router(self) -> bool:
@@ -121,6 +121,19 @@ class Bus:
     def _same_name(self) -> str:
         return (f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands; "
                 "change bus.robot of one of them")
+
+    def _open_peer(self) -> None:
+        """Open the session of a peer; where ROS 2's router (rmw_zenohd) holds the endpoints, that of its client."""
+        try:
+            self._open()
+        except EndpointTaken:
+            client = router_in_place(self._config) if self._config.ros2 == "rmw_zenoh" else None
+            if client is None:
+                raise
+            self._warn(f"the zenoh router at {', '.join(client.connect)} is joined as a client: who "
+                       "may connect is decided there")
+            self._config = client
+            self._open()
 
     def _open(self) -> None:
         session = open_session(self._config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 import zenoh
@@ -33,12 +34,16 @@ _TLS: Final = {
 }
 
 
+class EndpointTaken(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
+    """An endpoint cannot be listened on."""
+
+
 class Unreachable(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
     """No endpoint answers a client, or the answer refuses it."""
 
 
 def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
-    """Open a session. Raise OmnidError where an endpoint cannot be listened on, Unreachable for a client.
+    """Open a session. Raise EndpointTaken where an endpoint cannot be listened on, Unreachable for a client.
 
     guarded: other programs may write commands only, and cannot send messages above 1 MiB. Clients are not guarded: the
     messages of a robot may be larger.
@@ -56,7 +61,21 @@ def _failure(config: BusConfig, cause: str) -> OmnidError:
         return Unreachable(f"bus cannot reach {endpoints}: {cause}; start the robot or router there, or change "
                            "bus.connect")
     endpoints = ", ".join(config.listen)
-    return OmnidError(f"bus cannot listen on {endpoints}: {cause}; stop the other program there or change bus.listen")
+    return EndpointTaken(f"bus cannot listen on {endpoints}: {cause}; stop the other program there or change "
+                         "bus.listen")
+
+
+def router_in_place(config: BusConfig) -> BusConfig | None:
+    """Return the configuration of a client of the router that holds the endpoints of a peer; None without a router."""
+    client = replace(config, mode="client", listen=(), connect=config.listen)
+    try:
+        session = open_session(client, guarded=False)
+    except OmnidError:
+        return None
+    try:
+        return client if session.info.routers_zid() else None
+    finally:
+        session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
 
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:

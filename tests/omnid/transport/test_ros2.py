@@ -10,6 +10,7 @@ import struct
 import subprocess
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,9 +46,9 @@ COMMANDS = command_topics(("planner",))
 
 
 @contextlib.contextmanager
-def client(endpoint: str) -> Iterator[zenoh.Session]:
+def client(endpoint: str, mode: str = "client") -> Iterator[zenoh.Session]:
     config = zenoh.Config()
-    for key, value in (("mode", "client"), ("connect/endpoints", [endpoint]), ("scouting/multicast/enabled", False)):
+    for key, value in (("mode", mode), ("connect/endpoints", [endpoint]), ("scouting/multicast/enabled", False)):
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
         yield session
@@ -131,6 +132,34 @@ def test_receives_a_twist_from_ros() -> None:
             attachment = ros2.attachment(1, 5, gid)
             wait_until(lambda: session.put(key, message, attachment=attachment) is None and bool(received))
     assert received[0] == ("cmd/twist", message, gid.hex(), 5)
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])  # a node of ROS 2 is a peer
+def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> None:
+    endpoint, lines, received, poses = free_endpoint(), list[str](), list[tuple[str, bytes, str, int]](), list[bytes]()
+    config = BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3)
+    with (script(ROUTER, endpoint), contextlib.closing(Bus(config, lines.append)) as bus,
+          client(endpoint, mode) as session):
+        assert lines == [f"the zenoh router at {endpoint} is joined as a client: who may connect is decided there"]
+        assert bus.status().values["mode"] == "client" and bus.needs_router
+        bus.subscribe_commands(lambda *message: received.append(message), COMMANDS)
+        key, twist = ros2.data_key(3, "/omnid/cmd/twist", "geometry_msgs/msg/Twist"), bytes(52)
+        attachment = ros2.attachment(1, 5, bytes(16))
+        odom = session.declare_subscriber(ros2.data_key(3, "/omnid/odom", codec.ODOMETRY_SCHEMA),
+                                          lambda sample: poses.append(sample.payload.to_bytes()))
+        wait_until(lambda: session.put(key, twist, attachment=attachment) is None
+                   and bus.publish("odom", odometry(1)) is None and bool(received) and bool(poses))
+        odom.undeclare()
+    assert received[0][:2] == ("cmd/twist", twist) and poses[0] == odometry(1)
+
+
+def test_joins_nothing_but_a_router() -> None:
+    endpoint = free_endpoint()
+    config = BusConfig(listen=(endpoint,), ros2="rmw_zenoh")
+    with contextlib.closing(Bus(config)), pytest.raises(OmnidError, match="stop the other program"):
+        Bus(replace(config, robot="other"))
+    with script(ROUTER, endpoint), pytest.raises(OmnidError, match="stop the other program"):
+        Bus(replace(config, ros2="off"))
 
 
 def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
