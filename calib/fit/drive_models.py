@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +26,10 @@ class DriveModelScore:
 
     distortion: tuple[str, ...]
     held_out_px: float
+    waves: bool = False  # with wavefronts: rays that do not meet in one point
 
     def __str__(self) -> str:
-        name = " ".join(self.distortion) or "the file's terms"
+        name = (" ".join(self.distortion) or "the file's terms") + (" and wavefronts" if self.waves else "")
         return f"model with {name}: {self.held_out_px:.4f} px at landmarks held out"
 
 
@@ -37,13 +39,13 @@ def candidate_distortions(rig: Rig) -> tuple[tuple[str, ...], ...]:
     return DISTORTIONS if all(isinstance(camera, UnifiedCamera) for camera in cameras) else ((),)
 
 
-def best_distortion(scores: tuple[DriveModelScore, ...]) -> tuple[str, ...]:
-    """Return the fewest terms that no model with more of them improves significantly."""
+def best_model(scores: Sequence[DriveModelScore]) -> DriveModelScore:
+    """Return the model with the fewest terms that none with more of them improves significantly."""
     best = scores[0]
     for score in scores[1:]:
         if score.held_out_px < (1 - MIN_GAIN) * best.held_out_px:
             best = score
-    return best.distortion
+    return best
 
 
 def drive_structure(found: DriveAdjustment) -> tuple[ResidualStructure, ResidualStructure]:

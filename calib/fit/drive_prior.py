@@ -6,6 +6,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.fit.drive_parameters import TIME_UNITS, TRANSFORM_NAMES, RigParameters
+from calib.fit.parameterisation import WAVEFRONT_NAMES
 from calib.models.camera import Array
 from calib.rig import Rig
 
@@ -13,6 +14,7 @@ from calib.rig import Rig
 XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, DISTORTION_SIGMA_PX, TANGENTIAL_SIGMA_PX = 0.02, 0.02, 3.0, 1.0, 3.0
 TURN_SIGMA_RAD, DIRECTION_SIGMA_RAD = np.deg2rad(1.5), np.deg2rad(2.0)
 RULER_SIGMA_M = 0.5e-3
+WAVEFRONT_SIGMA_M = 1e-3  # a ray of a mirror camera passes the viewpoint within about a millimetre
 DELAY_SIGMA_MS, LINE_TIME_SIGMA_US = 15.0, 30.0
 # Smallest part of a nominal sigma to which a board's covariance is trusted: mirrors are knocked and metal grows.
 MIN_PART = 1e-3
@@ -45,6 +47,8 @@ def _nominal_sigma(name: str, value: float, unit: float) -> float:
     if name in TIME_UNITS:
         return (DELAY_SIGMA_MS if name.endswith("[ms]") else LINE_TIME_SIGMA_US) / unit
     own = name.split()[-1]
+    if own in WAVEFRONT_NAMES:
+        return WAVEFRONT_SIGMA_M / unit
     if own in ("pu", "pv", "center_row", "center_column"):
         return CENTRE_SIGMA_PX / unit
     if own == "xi":

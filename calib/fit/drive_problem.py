@@ -14,7 +14,9 @@ from scipy import sparse
 
 from calib import se3
 from calib.fit.drive_parameters import RigParameters
-from calib.models.camera import Array
+from calib.models import wavefront as wavefronts
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import DISTANCE_M, OcamCamera
 from calib.rig import Rig
 
 Indices = NDArray[np.intp]
@@ -66,14 +68,27 @@ class DriveState:
     motion: KeyframeMotion
 
 
-def project(rig: Rig, camera: Indices, points: Array) -> Array:
-    """Return pixels (M, 2) of points (M, 3) in the rig frame, each in its camera; NaN where there is no image."""
+def project(rig: Rig, camera: Indices, points: Array, waves: Array | None = None) -> Array:
+    """Return pixels (M, 2) of points (M, 3) in the rig frame, each in its camera; NaN where there is no image.
+
+    waves: wavefronts (2, 5) [m] of both cameras, None: central cameras. The cameras themselves are exact at DISTANCE_M.
+    """
     pixels = np.full((len(points), 2), np.nan)
     for side, mounted in enumerate((rig.lower, rig.upper)):
         at = np.flatnonzero(camera == side)
         if len(at):
-            pixels[at] = mounted.camera.project(se3.apply(mounted.T_cam_rig, points[at]))
+            seen = se3.apply(mounted.T_cam_rig, points[at])
+            if waves is not None and np.any(waves[side]):
+                seen = _at_distance(mounted.camera, seen, tuple(waves[side].tolist()))
+            pixels[at] = mounted.camera.project(seen)
     return pixels
+
+
+def _at_distance(camera: OmniCamera, points: Array, wavefront: tuple[float, ...]) -> Array:
+    """Return the places (N, 3), at the distance for which a camera is exact, of the rays to points (N, 3) [m]."""
+    axis = float(np.sign(camera.lift(np.array([camera.center]))[0, 2]))
+    distance_m = camera.distance_m if isinstance(camera, OcamCamera) else DISTANCE_M
+    return wavefronts.points_at(distance_m, wavefronts.directions_to(points, wavefront, axis), wavefront, axis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +104,12 @@ class DriveProblem:
     def residuals(self, state: DriveState) -> Array:
         """Return measured minus modelled pixels (M, 2); LOST_PX where the model has no image."""
         seen = self.observations
-        cast = project(self.parameters.at(state.steps), seen.camera, self.in_rig(state, state.steps))
+        cast = self.cast(state.steps, seen.camera, self.in_rig(state, state.steps))
         return np.where(np.isfinite(cast), seen.pixels - cast, LOST_PX)
+
+    def cast(self, steps: Array, camera: Indices, points: Array) -> Array:
+        """Return pixels (M, 2) of points (M, 3) in the rig frame after steps (P,) of the parameters."""
+        return project(self.parameters.at(steps), camera, points, self.parameters.wavefronts_at(steps))
 
     def in_rig(self, state: DriveState, steps: Array) -> Array:
         """Return the landmark (M, 3) of each observation in the rig frame at the time of its exposure."""
@@ -171,7 +190,7 @@ def linearise(problem: DriveProblem, state: DriveState, sigma_px: float) -> Norm
     squared = (residual**2).sum(axis=1) / sigma_px**2
     root = np.sqrt(1 / (1 + squared / KERNEL**2))[:, None] / sigma_px
     in_rig = problem.in_rig(state, state.steps)
-    by_rig_point = _by_point(problem.parameters.at(state.steps), seen.camera, in_rig) * root[:, :, None]
+    by_rig_point = _by_point(problem, state.steps, in_rig) * root[:, :, None]
     by_point = by_rig_point @ state.T_rig_odom[seen.keyframe][:, :3, :3]
     by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)
     by_steps = (_by_steps(problem, state) * root[:, :, None]).reshape(-1, len(problem.prior))
@@ -200,11 +219,11 @@ def _scattered(J: Array, index: Indices, count: int) -> sparse.csr_matrix:
     return sparse.csr_matrix((J.ravel(), (rows.ravel(), columns.ravel())), (2 * M, count * D))
 
 
-def _by_point(rig: Rig, camera: Indices, points: Array) -> Array:
+def _by_point(problem: DriveProblem, steps: Array, points: Array) -> Array:
     """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
-    reach = STEP * np.linalg.norm(points, axis=1, keepdims=True)
-    columns = [(project(rig, camera, points + reach * axis) - project(rig, camera, points - reach * axis)) / (2 * reach)
-               for axis in np.eye(3)]
+    camera, reach = problem.observations.camera, STEP * np.linalg.norm(points, axis=1, keepdims=True)
+    columns = [(problem.cast(steps, camera, points + reach * axis) - problem.cast(steps, camera, points - reach * axis))
+               / (2 * reach) for axis in np.eye(3)]
     return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
 
 
@@ -217,9 +236,8 @@ def _by_steps(problem: DriveProblem, state: DriveState) -> Array:
     in_rig = problem.in_rig(state, state.steps)
     for k, step in enumerate(STEP * np.eye(len(state.steps))):
         moved = [side for side in (0, 1) if parameters.moves_camera(side)[k]]
-        at, is_time = np.flatnonzero(np.isin(camera, moved)), k >= len(parameters.rig_names)
-        ahead, behind = (project(parameters.at(steps), camera[at],
-                                 problem.in_rig(state, steps)[at] if is_time else in_rig[at])
+        at, is_time = np.flatnonzero(np.isin(camera, moved)), parameters.names[k] in parameters.times
+        ahead, behind = (problem.cast(steps, camera[at], problem.in_rig(state, steps)[at] if is_time else in_rig[at])
                          for steps in (state.steps + step, state.steps - step))
         J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
     return J

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, adjust_pairs, held_out_error, observation_sigma
-from calib.fit.drive_models import DriveModelScore, best_distortion, candidate_distortions, drive_structure
+from calib.fit.drive_models import DriveModelScore, best_model, candidate_distortions, drive_structure
 from calib.fit.drive_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
 from calib.fit.drive_prior import baseline_by_prior, nominal_sigmas, prior_information
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
+from calib.fit.rig_fit import has_wavefront
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
 from omnid.calibration.drive_observations import Drives, Topics, collect, observe_pairs
@@ -85,20 +86,24 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     config = Config()
     before = _with_masks(logs[0], rig, topics)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
-    parameters = RigParameters.about(before, distortion, TIMES)
+    # Boards have shown whether the rays of the cameras meet in one point; else it is tried at the end.
+    known = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
+    parameters = RigParameters.about(before, distortion, TIMES, waves=known)
     steps = _straightened(logs[0], parameters, topics, config, report)
     require_same_rig(parameters, steps, tracked=False)
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
-    scores = tuple(_score(found, drives, terms) for terms in candidate_distortions(before))
+    scores = [_score(found, drives, terms, known) for terms in candidate_distortions(before)]
+    if not known:
+        scores.append(_score(found, drives, best_model(scores).distortion, True))
     for score in scores if len(scores) > 1 else ():
         report(str(score))
-    times = significant_times(found)
-    if (best_distortion(scores), times) != (distortion, TIMES):
-        parameters = RigParameters.about(_with_times(before, times), best_distortion(scores), times)
+    best, times = best_model(scores), significant_times(found)
+    if (best.distortion, best.waves, times) != (distortion, known, TIMES):
+        parameters = RigParameters.about(_with_times(before, times), best.distortion, times, waves=best.waves)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
     require_same_rig(parameters, found.state.steps)
     first_sigma = observation_sigma(before, found, drives.fixed)
-    return _calibration(before, found, (scores, first_sigma), drives)
+    return _calibration(before, found, (tuple(scores), first_sigma), drives)
 
 
 def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics: Topics, config: Config,
@@ -129,10 +134,10 @@ def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
     return np.array([steps.get(name, 0.0) for name in parameters.names])
 
 
-def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...]) -> DriveModelScore:
-    parameters = RigParameters.about(found.parameters.rig, terms, TIMES)
+def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...], waves: bool) -> DriveModelScore:
+    parameters = RigParameters.about(found.parameters.rig, terms, TIMES, waves=waves)
     prior = prior_information(parameters, parameters.rig)
-    return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed))
+    return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed), waves)
 
 
 def _calibration(before: Rig, found: DriveAdjustment, known: tuple[tuple[DriveModelScore, ...], float],

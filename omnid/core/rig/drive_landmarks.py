@@ -16,10 +16,11 @@ from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
-from omnid.core.odometry.patch_alignment import affine_warps, align, disparity_slopes, warped_templates
+from omnid.core.odometry.patch_alignment import align, disparity_slopes
 from omnid.core.odometry.patch_fit import TEMPLATE_PX
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
+from omnid.core.rig.plane_patches import plane_templates
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
@@ -152,10 +153,11 @@ class DriveLandmarks:
         T_rect_odom = se3.inverse(current.T_odom_rect)
         known = {int(a): T_rect_odom @ self._keyframes[a].T_odom_rect for a in np.unique(anchors).tolist()}
         T_curr_ref = np.array([known[a] for a in anchors.tolist()]).reshape(-1, 4, 4)
-        warps = affine_warps(self._views[index], self._slopes[index], T_curr_ref, self._model, upper=upper)
         for a in known:
             at = np.flatnonzero(anchors == a)
-            templates[at] = warped_templates(self._keyframes[a].lower, self._views[index[at], :2], warps[at], near[at])
+            planes = self._views[index[at]], self._slopes[index[at]]
+            templates[at] = plane_templates(self._keyframes[a].lower, planes, T_curr_ref[at], self._model, near[at],
+                                            upper=upper)
         aligned = align(templates, current.upper if upper else current.lower, near, anchors)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([pixels[:, 0] % self._model.cylinder.width, pixels[:, 1]]), aligned.found
