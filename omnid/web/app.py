@@ -99,7 +99,8 @@ class Page:
         return FileResponse(page, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
 
     async def _metrics(self, _: Request) -> Response:
-        text = metrics(self._feed.state, self._feed.browsers, self.guard.refused, self._feed.inbox.dropped)
+        counts = {"dropped": self._feed.inbox.dropped, "stops": self._wheels.stops, "arms": self._wheels.arms}
+        text = metrics(self._feed.state, self._feed.browsers, self.guard.refused, counts)
         return PlainTextResponse(text, media_type=CONTENT_TYPE)
 
 

@@ -14,23 +14,27 @@ from omnid.web.snapshot import LONGEST_VALUE, MOST_VALUES
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _QUANTILES: Final = (0.5, 0.99)
+_TEXTS: Final = {"dropped": "Messages of the robot that the inbox dropped", "stops": "Stops asked for",
+                 "arms": "Requests to arm"}
 Sample = tuple[Mapping[str, str], float]  # labels and value
 
 
-def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], dropped: int) -> str:
-    """Return all metrics; refused: requests by reason; dropped: messages of the robot that the inbox could not hold."""
-    return "".join(_lines(state, browsers, refused, dropped))
+def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> str:
+    """Return all metrics; refused: requests by reason; counts: further counters, by name."""
+    return "".join(_lines(state, browsers, refused, counts))
 
 
-def _lines(state: RobotState, browsers: Browsers, refused: Mapping[str, int], dropped: int) -> Iterator[str]:
+def _lines(
+    state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]
+) -> Iterator[str]:
     yield from _metric("omnid_up", "gauge", "1 if the daemon's token is on the bus", [({}, float(state.alive is True))])
     yield from _metric("omnid_pose_rate_hz", "gauge", "Poses received per second", [({}, state.rate_hz)])
     yield from _metric("omnid_poses_total", "counter", "Poses received", [({}, state.poses)])
     yield from _metric("omnid_poses_missed_total", "counter", "Skipped sequence numbers", [({}, state.missed)])
     yield from _metric("omnid_messages_broken_total", "counter", "Messages that could not be decoded",
                        [({}, state.broken)])
-    yield from _metric("omnid_messages_dropped_total", "counter", "Messages that the page's inbox dropped",
-                       [({}, dropped)])
+    for name, count in counts.items():
+        yield from _metric(f"omnid_web_{name}_total", "counter", _TEXTS[name], [({}, count)])
     yield from _metric("omnid_tracking_state", "gauge", "1 for the state of the newest pose",
                        [({"state": str(name)}, float(state.state == name)) for name in TrackingState])
     for name, text, histogram in (

@@ -12,6 +12,7 @@ export function wireCommands() {
   const armButton = byId("arm");
   let sureUntil = 0;
   let newest = 0;
+  let wasArmed = null;
 
   async function stop() {
     newest += 1;
@@ -63,9 +64,14 @@ export function wireCommands() {
   document.addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), { capture: true });
 
   return {
-    setArmed(armed) {
+    // reported: false where the robot reports no wheels. Answers that are no longer true are taken away.
+    setArmed(armed, reported) {
       armButton.hidden = armed;
+      armButton.disabled = !reported;
       if (armed && sureUntil) unsure();
+      if (armed && wasArmed === false) showStop("", "");
+      if (!armed && wasArmed) byId("answer").textContent = "";
+      wasArmed = armed;
     },
   };
 }

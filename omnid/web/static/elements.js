@@ -13,5 +13,7 @@ export function element(name, properties, ...children) {
 
 // A number with so many decimals; a dash where there is none.
 export function fixed(value, decimals) {
-  return typeof value === "number" ? value.toFixed(decimals) : "–";
+  if (typeof value !== "number") return "–";
+  const text = value.toFixed(decimals);
+  return Number(text) === 0 ? (0).toFixed(decimals) : text; // no -0.0
 }

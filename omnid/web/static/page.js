@@ -54,7 +54,7 @@ function showWheels(wheels) {
   const source = wheels !== null && wheels.source ? `, commanded by ${wheels.source}` : "";
   byId("wheels").textContent = wheels === null ? "not reported: the robot has no motor, or is not there"
     : `${wheels.message}${source}`;
-  commands.setArmed(armed);
+  commands.setArmed(armed, wheels !== null);
 }
 
 function showWarnings(warnings) {

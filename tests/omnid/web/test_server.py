@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import http.client
 import json
+import shutil
 import signal
 import socket
+import ssl
 import time
 import zlib
 from contextlib import ExitStack
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +27,7 @@ from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.test_access import authority
 from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served
 from tests.replay.command import Command
 
@@ -261,3 +266,28 @@ def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys
 
 def test_a_taken_port_is_refused(server: WebServer, capsys: pytest.CaptureFixture[str]) -> None:
     assert "stop the other program" in Command(capsys).refused("web", "--listen", server.host)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+def test_tls(tmp_path: Path) -> None:
+    authority(tmp_path, "page")
+    with served("--connect", free_endpoint(), "--tls-certificate", tmp_path / "page.pem", "--tls-key",
+                tmp_path / "page.key") as server:
+        assert server.url.startswith("https://")
+        context = ssl.create_default_context(cafile=str(tmp_path / "page.pem"))
+        context.check_hostname = False
+        connection = http.client.HTTPSConnection("127.0.0.1", server.port, timeout=PATIENCE_S, context=context)
+        connection.request("GET", f"/?token={server.token}")
+        cookie = connection.getresponse().getheader("set-cookie") or ""
+        assert "secure" in cookie.lower()
+        connection.close()
+        with pytest.raises((OSError, http.client.HTTPException)):
+            server.request("/")
+
+
+def test_the_network_is_told_that_the_token_can_be_read() -> None:
+    with served("--connect", free_endpoint(), "--listen", "0.0.0.0:0", "--host", "robot.example") as server:
+        for host, status in ((f"192.168.1.7:{server.port}", 200), ("robot.example", 200), ("evil.example", 403)):
+            assert server.request("/metrics", headers={**server.bearer, "Host": host}).status == status
+        code, err = server.end()
+        assert code == 0 and "without encryption" in err and err.count("\n") == 1

@@ -1,0 +1,39 @@
+"""Metrics for Prometheus: values, labels, and what does not belong into them."""
+
+from __future__ import annotations
+
+import re
+
+from omnid.monitor.robot_state import RobotState
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.decode import Diagnostics
+from omnid.web.browsers import Browsers
+from omnid.web.metrics import metrics
+from omnid.web.remedies import remedy_of
+
+LINE = re.compile(r'[a-z_]+(\{[a-z]+="(\\.|[^"\\\n])*"(,[a-z]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')
+
+
+def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
+    state = RobotState()
+    state.alive = True
+    values = {"rate_hz": "29.5", "mode": "640x480", "bad": "nan", 'a"} 1\nomnid_up 0': "7", "back\\slash": "1e3"}
+    state.add_diagnostics(Diagnostics(1, (DiagnosticStatus("omnid: odometry", 1, "x", values),)))
+    counts = {"dropped": 3, "stops": 0, "arms": 1}
+    lines = metrics(state, Browsers([]), {"no token": 2}, counts).splitlines()
+    samples = [line for line in lines if not line.startswith("#")]
+    assert all(LINE.fullmatch(line) for line in samples), samples
+    assert 'omnid_status_value{part="odometry",key="rate_hz"} 29.5' in samples and "omnid_up 1" in samples
+    assert 'omnid_status_value{part="odometry",key="back\\\\slash"} 1000' in samples
+    assert 'omnid_web_refused_total{reason="no token"} 2' in samples and "omnid_web_dropped_total 3" in samples
+    assert sum(line.startswith("omnid_status_value") for line in samples) == 3
+    assert not any("quantile" in line for line in samples), "no latency is known yet"
+    names = [line.split()[2] for line in lines if line.startswith("# TYPE")]
+    assert len(names) == len(set(names)) and {re.split(r"[{ ]", line)[0] for line in samples} <= set(names)
+
+
+def test_every_part_that_can_warn_has_a_remedy() -> None:
+    parts = ("odometry", "pairing", "wheels", "bus", "recording", "rig", "load", "rig at start", "lower camera")
+    assert all(remedy_of(DiagnosticStatus(f"omnid: {part}", 1, "", {})) for part in parts)
+    assert remedy_of(DiagnosticStatus("omnid: wheels", 1, "", {"remedy": "send cmd/arm"})) == "send cmd/arm"
+    assert remedy_of(DiagnosticStatus("omnid: stage pair", 0, "", {})) == ""

@@ -1,0 +1,236 @@
+"""The page in a real browser: `apt-get install chromium`, `pip install playwright`, `python -m pytest -m browser`.
+
+The pictures are written to the folder OMNID_SCREENSHOTS, if that is set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.pose_attachment import PoseAttachment
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.omnid.web.servers import PATIENCE_S, WebServer, served
+from tests.replay.live import robot, wait_until
+from tests.replay.test_arming import MANUAL
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
+SIZES = {"phone": (390, 844), "desk": (1440, 900)}
+HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
+WAIT_MS = 20_000
+
+# A page of another site that tries everything; the browser sends the cookie along where its rules allow that.
+EVIL = """<!DOCTYPE html><title>evil</title><form id="form" method="post" action="http://HOST/stop"
+ target="frame"></form>
+<iframe name="frame"></iframe><iframe src="http://HOST/"></iframe><img src="http://HOST/recordings">
+<script src="http://HOST/static/page.js"></script><script>
+const tries = [fetch("http://HOST/stop", {method: "POST", mode: "no-cors", credentials: "include"}),
+  fetch("http://HOST/arm", {method: "POST", mode: "no-cors", credentials: "include", body: "x"}),
+  fetch("http://HOST/recordings", {credentials: "include"}).then((answer) => answer.text())];
+let opened = "no";
+const socket = new WebSocket("ws://HOST/live");
+socket.onmessage = () => { opened = "yes"; };
+document.getElementById("form").submit();
+Promise.allSettled(tries).then((results) => setTimeout(() => {
+  document.title = `tried ${opened} ${results[2].status}`; }, 1000));
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with playwright.sync_playwright() as tools:
+        found = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+@contextlib.contextmanager
+def opened(browser: Any, server: WebServer, size: str = "desk", scheme: str = "light") -> Iterator[Any]:
+    """Yield the page at a size; fail for errors in it and for requests to other hosts."""
+    width, height = SIZES[size]
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme,
+                                  has_touch=size == "phone")
+    page = context.new_page()
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda line: problems.append(line.text) if "Content Security Policy" in line.text else None)
+    page.on("request", lambda request: problems.append(request.url)
+            if not request.url.startswith((f"http://{server.host}/", f"ws://{server.host}/", "blob:")) else None)
+    page.goto(server.url)
+    page.wait_for_function("() => document.getElementById('state').textContent !== 'connecting'", timeout=WAIT_MS)
+    try:
+        yield page
+        assert problems == []
+    except BaseException:
+        picture(page, "failed")
+        raise
+    finally:
+        context.close()
+
+
+def picture(page: Any, name: str) -> None:
+    """Write a picture of the page."""
+    if folder := os.environ.get("OMNID_SCREENSHOTS"):
+        Path(folder).mkdir(exist_ok=True)
+        page.screenshot(path=f"{folder}/{name}.png")
+
+
+def shows(page: Any, element: str, text: str) -> None:
+    """Wait until an element holds a text."""
+    page.wait_for_function("([id, text]) => document.getElementById(id).textContent.includes(text)",
+                           arg=[element, text], timeout=WAIT_MS)
+
+
+def arm(page: Any, press: Callable[..., None]) -> None:
+    """Press the button until the robot is armed: between two presses a busy machine may take longer than it waits."""
+    end_s = time.monotonic() + PATIENCE_S
+    while page.inner_text("#armed") != "armed":
+        assert time.monotonic() < end_s, page.inner_text("#answer")
+        with contextlib.suppress(Exception):  # the button goes when the robot is armed
+            press("#arm", timeout=1000)
+        page.wait_for_timeout(300)
+
+
+def expect_it_fits(page: Any, size: str) -> None:
+    """Expect no horizontal scrolling, and the whole stop button on the screen, big enough for a thumb."""
+    width, height = SIZES[size]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    box = page.locator("#stop").bounding_box()
+    assert box["height"] >= 80 and box["width"] >= 0.9 * width
+    assert box["x"] >= 0 and box["y"] + box["height"] <= height and box["x"] + box["width"] <= width
+
+
+def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, scene: Path) -> None:
+    more = ("--set", "bus.panorama_hz=2", "--set", "record.enabled=true", "--set", f"record.folder={tmp_path / 'rec'}")
+    with robot(scene, tmp_path, *MANUAL, *more) as (daemon, operator, base), \
+            served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", tmp_path / "rec") as server:
+        operator.drive(0.3)
+        for size, scheme in (("phone", "light"), ("desk", "dark")):
+            with opened(browser, server, size, scheme) as page:
+                shows(page, "state", "tracking")
+                shows(page, "armed", "not armed")
+                expect_it_fits(page, size)
+                press = page.tap if size == "phone" else page.click
+                press("#arm")
+                assert not base.drives, "one press only asks"
+                arm(page, press)
+                wait_until(lambda: base.drives, "motion")
+                picture(page, f"{size}-armed")
+                press("#stop")
+                shows(page, "stop-answer", "the robot stops")
+                wait_until(lambda: not base.drives, "the stop")
+                shows(page, "armed", "not armed")
+                page.locator("#panorama-box > summary").scroll_into_view_if_needed()
+                press("#panorama-box > summary")
+                page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
+                page.locator("#recordings-box > summary").scroll_into_view_if_needed()
+                press("#recordings-box > summary")
+                shows(page, "recordings", "being written")
+                press("#parts-box > summary")
+                shows(page, "parts", "odometry")
+                expect_it_fits(page, size)
+                picture(page, f"{size}-all")
+        with opened(browser, server) as page:
+            arm(page, page.click)
+            wait_until(lambda: base.drives, "motion")
+            page.keyboard.press("Space")  # the focus is on the button Arm
+            wait_until(lambda: not base.drives, "the stop")
+            shows(page, "stop-answer", "the robot stops")
+        operator.stop_sending()
+        assert daemon.end()[0] == 0
+        with opened(browser, server) as page:
+            shows(page, "warnings", "its daemon has ended")
+            page.click("#recordings-box > summary")
+            page.click("#recordings button")
+            link = page.wait_for_selector("#recordings a", timeout=WAIT_MS)
+            with page.context.expect_page() as new:
+                link.click()
+            new.value.wait_for_load_state()
+            assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
+            picture(new.value, "report")
+            picture(page, "ended")
+
+
+def test_text_of_the_robot_is_never_html(browser: Any) -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server, \
+            opened(browser, server) as page:
+        entries = [DiagnosticStatus(f"{HOSTILE}{number}", 2, HOSTILE, {HOSTILE: HOSTILE}) for number in range(3)]
+        end_s = time.monotonic() + 20
+        while "onerror" not in page.inner_text("#warnings") or "script" not in page.text_content("#parts"):
+            assert time.monotonic() < end_s
+            bus.publish("status", codec.diagnostics_cdr(10**18, entries))
+            bus.publish("odom", odometry(1), PoseAttachment(1, HOSTILE, 0, 1, 1, 1).to_bytes())
+            page.wait_for_timeout(100)
+        shows(page, "state", "onerror")
+        assert page.locator("main img:not(#panorama), main script").count() == 0
+        assert page.title().startswith("omnid: ")  # "hacked" if any of it had run
+        expect_it_fits(page, "desk")
+        picture(page, "hostile")
+
+
+def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    with contextlib.ExitStack() as ends:
+        first = ends.enter_context(served("--connect", free_endpoint(), "--token-file", token))
+        page = ends.enter_context(opened(browser, first, "phone"))
+        shows(page, "warnings", "cannot reach")
+        first.process.kill()
+        shows(page, "lost", "No connection")
+        page.tap("#stop")
+        shows(page, "stop-answer", "STOP IS NOT SENT: use the emergency stop")
+        expect_it_fits(page, "phone")
+        picture(page, "phone-gone")
+        ends.enter_context(served("--connect", free_endpoint(), "--token-file", token, "--listen", first.host))
+        page.wait_for_function("() => document.getElementById('lost').hidden", timeout=WAIT_MS)
+        shows(page, "warnings", "cannot reach")
+
+
+def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
+    with served("--connect", free_endpoint()) as server:
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "text/html")
+                self.end_headers()
+                self.wfile.write(EVIL.replace("HOST", server.host).encode())
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        with contextlib.ExitStack() as ends:
+            site = HTTPServer(("127.0.0.1", 0), Handler)
+            ends.callback(site.server_close)
+            thread = threading.Thread(target=site.serve_forever)
+            thread.start()
+            ends.callback(thread.join)
+            ends.callback(site.shutdown)
+            context = browser.new_context()
+            ends.callback(context.close)
+            page = context.new_page()
+            page.goto(server.url)
+            shows(page, "robot", "omnid")
+            for host in ("127.0.0.1", "localhost"):  # the same site on another port, and another site
+                evil = context.new_page()
+                evil.goto(f"http://{host}:{site.server_port}/")
+                evil.wait_for_function("() => document.title.startsWith('tried')", timeout=WAIT_MS)
+                assert evil.title() == "tried no rejected"
+        metrics = server.request("/metrics", headers=server.bearer).text
+        counted = {line.split('"')[1]: int(line.rsplit(" ", 1)[1]) for line in metrics.splitlines()
+                   if line.startswith("omnid_web_refused_total")}
+        assert counted["cross-site"] >= 8, metrics
+        assert "omnid_web_stops_total 0" in metrics and "omnid_web_arms_total 0" in metrics
