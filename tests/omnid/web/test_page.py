@@ -1,6 +1,6 @@
 """The page in a real browser: `apt-get install chromium`, `pip install playwright`, `python -m pytest -m browser`.
 
-The pictures are written to the folder OMNID_SCREENSHOTS, if that is set.
+Screenshots are written to the folder OMNID_SCREENSHOTS, if that is set.
 """
 
 from __future__ import annotations
@@ -76,14 +76,14 @@ def opened(browser: Any, server: WebServer, size: str = "desk", scheme: str = "l
         yield page
         assert problems == []
     except BaseException:
-        picture(page, "failed")
+        screenshot(page, "failed")
         raise
     finally:
         context.close()
 
 
-def picture(page: Any, name: str) -> None:
-    """Write a picture of the page."""
+def screenshot(page: Any, name: str) -> None:
+    """Write a screenshot of the page."""
     if folder := os.environ.get("OMNID_SCREENSHOTS"):
         Path(folder).mkdir(exist_ok=True)
         page.screenshot(path=f"{folder}/{name}.png")
@@ -129,7 +129,7 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, s
                 assert not base.drives, "one press only asks"
                 arm(page, press)
                 wait_until(lambda: base.drives, "motion")
-                picture(page, f"{size}-armed")
+                screenshot(page, f"{size}-armed")
                 press("#stop")
                 shows(page, "stop-answer", "the robot stops")
                 wait_until(lambda: not base.drives, "the stop")
@@ -143,7 +143,7 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, s
                 press("#parts-box > summary")
                 shows(page, "parts", "odometry")
                 expect_it_fits(page, size)
-                picture(page, f"{size}-all")
+                screenshot(page, f"{size}-all")
         with opened(browser, server) as page:
             arm(page, page.click)
             wait_until(lambda: base.drives, "motion")
@@ -161,8 +161,8 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, s
                 link.click()
             new.value.wait_for_load_state()
             assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
-            picture(new.value, "report")
-            picture(page, "ended")
+            screenshot(new.value, "report")
+            screenshot(page, "ended")
 
 
 def test_text_of_the_robot_is_never_html(browser: Any) -> None:
@@ -180,7 +180,7 @@ def test_text_of_the_robot_is_never_html(browser: Any) -> None:
         assert page.locator("main img:not(#panorama), main script").count() == 0
         assert page.title().startswith("omnid: ")  # "hacked" if any of it had run
         expect_it_fits(page, "desk")
-        picture(page, "hostile")
+        screenshot(page, "hostile")
 
 
 def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: P
         page.tap("#stop")
         shows(page, "stop-answer", "STOP IS NOT SENT: use the emergency stop")
         expect_it_fits(page, "phone")
-        picture(page, "phone-gone")
+        screenshot(page, "phone-gone")
         ends.enter_context(served("--connect", free_endpoint(), "--token-file", token, "--listen", first.host))
         page.wait_for_function("() => document.getElementById('lost').hidden", timeout=WAIT_MS)
         shows(page, "warnings", "cannot reach")

@@ -285,7 +285,7 @@ def test_tls(tmp_path: Path) -> None:
             server.request("/")
 
 
-def test_the_network_is_told_that_the_token_can_be_read() -> None:
+def test_on_the_network_a_warning_says_that_the_token_can_be_read() -> None:
     with served("--connect", free_endpoint(), "--listen", "0.0.0.0:0", "--host", "robot.example") as server:
         for host, status in ((f"192.168.1.7:{server.port}", 200), ("robot.example", 200), ("evil.example", 403)):
             assert server.request("/metrics", headers={**server.bearer, "Host": host}).status == status
