@@ -14,6 +14,7 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.places.limits import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
 from omnid.errors import OmnidError
@@ -131,6 +132,14 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PlacesConfig:
+    """Recognition of places: loops, and the pose in the map."""
+
+    enabled: bool = knob(True, "recognise places and correct the pose in the map; off: it is that of odometry")
+    limits: PlaceLimits = field(default_factory=PlaceLimits)
+
+
+@dataclass(frozen=True, slots=True)
 class MappingConfig:
     """Voxel map of the whole run."""
 
@@ -198,6 +207,7 @@ class Config:
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     motor: MotorSettings = field(default_factory=MotorSettings)

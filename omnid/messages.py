@@ -13,7 +13,7 @@ from omnid.core.odometry.exposure_times import ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light
-from omnid.tracking_state import TrackingState
+from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
@@ -113,6 +113,18 @@ class OdometryUpdate:
     depth: StereoDepth
     features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
     light: Light = field(default_factory=Light)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceUpdate:
+    """Pose in the map after a pair: odom stays smooth, and T_map_odom carries the corrections (REP 105)."""
+
+    seq: int
+    stamp_ns: int
+    T_map_odom: Array  # (4, 4) map and odom are rig frames, both that of the first pair at the start
+    T_map_rig: Array  # (4, 4)
+    covariance: Array  # (6, 6) of T_map_rig, x y z rx ry rz in map axes, m^2 and rad^2
+    state: MapState
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,3 +11,11 @@ class TrackingState(StrEnum):
     TRACKING = "tracking"  # the pose has enough inliers
     DEGRADED = "degraded"  # few inliers, the first pose after a gap, or a refused frame
     LOST = "lost"  # the pose is only predicted and its covariance grows
+
+
+class MapState(StrEnum):
+    """Trust in the pose in the map."""
+
+    LOCALIZED = "localized"  # a place was recognised lately
+    ODOMETRY_ONLY = "odometry only"  # the pose in the map is that of odometry since the last place, or since the start
+    LOST = "lost"  # odometry is lost, and the pose in the map with it

@@ -73,7 +73,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.viewer omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
-        "omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration omnid.transport",
+        "omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration "
+        "omnid.transport",
     "omnid.controller":
         "drivers.errors drivers.motor drivers.motors drivers.motors.protocols drivers.motors.simulated "
         "omnid.core.control omnid.engine omnid.errors omnid.settings",
@@ -82,7 +83,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.mapping": "omnid.errors",
     "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
-    "omnid.core.places": "calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo",
+    "omnid.core.places":
+        "calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":

@@ -34,6 +34,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("outputs")
     group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
+    group.add_argument("--map-tum", type=Path, metavar="FILE", help="trajectory in the map, T_map_rig, as it was known "
+                       "at each pair: recognised places correct it")
     group.add_argument("--map", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
@@ -59,9 +61,9 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import load_config, unused_settings
     from omnid.runs.replay import ReplayOptions
 
-    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map=args.map, plan=args.plan,
-                            record=args.record, publish=args.publish, inline=args.inline, realtime=args.realtime,
-                            settings=args.config)
+    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map_tum=args.map_tum,
+                            map=args.map, plan=args.plan, record=args.record, publish=args.publish, inline=args.inline,
+                            realtime=args.realtime, settings=args.config)
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)

@@ -48,6 +48,7 @@ class RunCounters:
     resets: int  # gaps in the trajectory after which tracking began again
     drops: Mapping[str, int]  # messages lost, by reason; zeros too
     map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
+    places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
     motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
 
     @property

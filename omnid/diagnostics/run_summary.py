@@ -15,6 +15,8 @@ def summary_entries(counters: RunCounters) -> dict[str, str]:
                "states": states, "resets": str(counters.resets), "drops": _listed(counters.drops)}
     if counters.map:
         entries["map"] = _listed(counters.map)
+    if counters.places:
+        entries["places"] = _listed(counters.places)
     if counters.motor:
         motor = counters.motor
         entries["motor"] = f"{motor['commands']} commands sent, {motor['errors']} errors, {motor['stops']} stops"

@@ -198,7 +198,8 @@ def summary_status(counters: RunCounters) -> DiagnosticStatus:
     values = {"pairs": str(counters.pairs), "poses": str(counters.poses), str(Key.LENGTH_M): f"{counters.length_m:.4f}",
               **{f"poses_{state}": str(count) for state, count in counters.states.items()},
               Key.RESETS: str(counters.resets)}
-    for prefix, counts in (("dropped", counters.drops), ("map", counters.map), ("motor", counters.motor)):
+    for prefix, counts in (("dropped", counters.drops), ("map", counters.map), ("places", counters.places),
+                           ("motor", counters.motor)):
         values |= {f"{prefix}_{name}": str(count) for name, count in counts.items()}
     return DiagnosticStatus(status_names.SUMMARY, OK, "the run has ended", values)
 

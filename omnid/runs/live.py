@@ -21,6 +21,7 @@ from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
+from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.rig_monitor import RigMonitor, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.engine.flow import nothing
@@ -147,6 +148,7 @@ class LiveRun:
             commands,
             TICKERS,
             (ladder.status, partial(start_status, stages.rig_gate),
+             *([partial(places_status, stages.places)] if stages.places else ()),
              *(part.status for part in (bus, recorder, rig_monitor) if part)),
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)

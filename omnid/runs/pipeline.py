@@ -11,7 +11,7 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas
+from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, PlaceUpdate
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
@@ -19,16 +19,18 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping, no_wait
 from omnid.stages.odometry import OdometryStage, all_features
+from omnid.stages.places import Places
 from omnid.stages.rig_gate import RigGate, never
 from omnid.stages.stereo import Stereo
 
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """The consumers of a run; a map that no sink takes is not computed."""
+    """The consumers of a run; a map that no sink takes is not computed, nor are places."""
 
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
+    places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
     recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
     live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
@@ -47,6 +49,7 @@ class WiredStages(NamedTuple):
 
     rig_gate: RigGate
     mapping: Mapping | None
+    places: Places | None
 
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
@@ -67,6 +70,13 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         outgoing["bus-map"] = maps
         for name, map_sink in sinks.maps.items():
             graph.sink(name, map_sink, maps)
+    places: Places | None = None
+    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus):
+        places = Places(geometry, config)
+        updates: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
+        outgoing["bus-places"] = updates
+        for name, place_sink in sinks.places.items():
+            graph.sink(name, place_sink, updates)
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
     if sinks.recorder:
@@ -74,7 +84,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(rig_gate, mapping)
+    return WiredStages(rig_gate, mapping, places)
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

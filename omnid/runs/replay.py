@@ -33,8 +33,8 @@ from omnid.settings_dump import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs
-from omnid.sinks.pose_collector import PoseCollector
+from omnid.sinks.files import MapFile, MapTrajectoryFile, PlanFile, TrajectoryFile, check_outputs
+from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.geometry import Geometry
 from omnid.stages.rig_gate import RigContradictedError
@@ -62,6 +62,7 @@ class ReplayOptions:
     rig: Path | Rig | None = None  # None: the rig.toml that is attached to the log
     topics: Topics = (None, None)  # of the images; None: those of the rig, else by their names
     tum: Path | None = None
+    map_tum: Path | None = None
     map: Path | None = None
     plan: Path | None = None
     record: Path | None = None
@@ -78,7 +79,8 @@ class ReplayOptions:
     @property
     def files(self) -> list[tuple[str, Path]]:
         """The files that are written, each with its option."""
-        named = (("--tum", self.tum), ("--map", self.map), ("--plan", self.plan), ("--record", self.record))
+        named = (("--tum", self.tum), ("--map-tum", self.map_tum), ("--map", self.map),
+                 ("--plan", self.plan), ("--record", self.record))
         return [(name, path) for name, path in named if path is not None]
 
 
@@ -96,12 +98,15 @@ class _Replay:
     def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
         self._log, self._config, self._options = log, config, options
         self._poses = PoseCollector()
+        self._map_poses = MapPoseCollector()
         self._map: Slot[MapUpdate] = Slot()
         self._drive: ReplayDrive | None = None
         self._warnings: list[str] = []
 
     def run(self) -> RunResult:
         check_outputs(self._options.files, self._inputs())
+        if self._options.map_tum and not self._config.places.enabled:
+            raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
         graph = Graph(policy=NEWEST if self._options.realtime else LOSSLESS, threaded=not self._options.inline,
                       depth=self._config.graph.depth)
         with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:
@@ -173,8 +178,11 @@ class _Replay:
         if options.collect:
             sinks.poses["collect-poses"] = self._poses
             sinks.maps["collect-map"] = self._map
+            sinks.places["collect-places"] = self._map_poses
         if options.tum:
             sinks.poses["trajectory"] = TrajectoryFile(options.tum)
+        if options.map_tum:
+            sinks.places["map-trajectory"] = MapTrajectoryFile(options.map_tum)
         if options.map:
             sinks.maps["map"] = MapFile(options.map)
         if options.plan:
@@ -223,6 +231,8 @@ class _Replay:
             (*dict.fromkeys(self._warnings), *results.warnings()),
             None if newest is None else newest.points,
             session.signal,
+            self._map_poses.T_map_rig,
+            self._map_poses.states,
         )
 
 

@@ -18,7 +18,8 @@ from omnid.transport.codec import DiagnosticStatus
 
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
 PAIRING_DROPS: Final = ("unpaired", "repeated")  # begin the names of its counts
-BOOKKEEPING: Final = frozenset({"progress", "statistics", "collect-poses", "collect-map"})  # left out of the timings
+BOOKKEEPING: Final = frozenset(  # left out of the timings
+    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"})
 
 
 class RunReport:
@@ -30,8 +31,9 @@ class RunReport:
     def counters(self, statistics: RunStatistics) -> RunCounters:
         """Return the counters of the run with the given statistics."""
         counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
-        mapping = self._stages.mapping
-        return counters if mapping is None else replace(counters, map=mapping.counts)
+        mapping, places = self._stages.mapping, self._stages.places
+        return replace(counters, map={} if mapping is None else mapping.counts,
+                       places={} if places is None else places.counts)
 
     def timings(self) -> dict[str, SummaryRow]:
         """Return the times of the stages."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
-from omnid.tracking_state import TrackingState
+from omnid.tracking_state import MapState, TrackingState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +38,9 @@ class RunResult:
     warnings: tuple[str, ...]  # doubts about the input and what to do about them, one line each
     map: MapPoints | None  # points (M, 3) m in odom, with confidence, frames and age; None without a pair
     signal: int = 0  # number of the signal that ended the run early; 0: it came to its end
+    # Poses in the map as they were known at that time, with their states; empty where places are not recognised.
+    T_map_rig: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
+    map_states: tuple[MapState, ...] = ()  # (N,)
 
     def save_tum(self, path: str | PathLike[str]) -> None:
         """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).

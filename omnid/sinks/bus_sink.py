@@ -7,7 +7,7 @@ import time
 import cv2
 
 from drivers.frame import Frame
-from omnid.messages import OdometryUpdate
+from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.transport.bus import Bus
 from omnid.transport.features_attachment import features_to_bytes
@@ -22,11 +22,11 @@ class BusSink:
         self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
 
     def process(self, message: Outgoing) -> None:
-        """Publish a message, a pose with its attachment and the state of the odometry where it has changed."""
+        """Publish a message, a pose with its attachment and the states where they have changed."""
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        if isinstance(message, OdometryUpdate):
+        if isinstance(message, OdometryUpdate | PlaceUpdate):
             for topic, _, payload in self._states(message):
                 self._bus.publish(topic, payload)
 

@@ -12,13 +12,13 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.stages.odometry import of_base
-from omnid.tracking_state import TrackingState
+from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.stages.odometry import base_pose, of_base
+from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.status_names import ODOMETRY, Key
+from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
-Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate
+Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate
 
 
 class OutgoingMessage(NamedTuple):
@@ -57,6 +57,8 @@ class Encoder:
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
                 payload = codec.twist_stamped_cdr(stamp_ns + self.offset_ns, "base_link", velocity_mps, yaw_rate_radps)
                 yield OutgoingMessage("drive", codec.TWIST_SCHEMA, payload)
+            case PlaceUpdate():
+                yield from self._map_pose(message)
             case MapUpdate():
                 yield from self._map(message)
 
@@ -69,6 +71,15 @@ class Encoder:
         edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
                  codec.FrameTransform("base_link", "rig", self._T_base_rig)]
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+
+    def _map_pose(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
+        stamp_ns = update.stamp_ns + self.offset_ns
+        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
+        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self._T_base_rig)
+        pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, covariance)
+        yield OutgoingMessage("map_pose", codec.MAP_POSE_SCHEMA, pose)
+        edge = codec.FrameTransform("map", "odom", T_map_odom)
+        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
 
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
@@ -90,14 +101,26 @@ class Encoder:
 
 
 class StateReports:
-    """Yields a status whenever the state of the odometry changes; offset_ns: the Encoder's."""
+    """Yields a status whenever the state of the odometry, or of the pose in the map, changes; offset_ns: the Encoder's.
+    """
 
     def __init__(self, offset_ns: int = 0) -> None:
         self._offset_ns = offset_ns
         self._last: tuple[str, int] | None = None
+        self._last_in_map: MapState | None = None
 
-    def __call__(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
+    def __call__(self, message: OdometryUpdate | PlaceUpdate) -> Iterator[OutgoingMessage]:
         """Yield the status of a pose if its state differs from the last one."""
+        yield from self._of_odometry(message) if isinstance(message, OdometryUpdate) else self._in_map(message)
+
+    def _in_map(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
+        if update.state != self._last_in_map:
+            self._last_in_map = update.state
+            status = codec.DiagnosticStatus(PLACES, codec.ERROR if update.state is MapState.LOST else codec.OK,
+                                            update.state, {Key.STATE: update.state})
+            yield status_report(update.stamp_ns + self._offset_ns, [status])
+
+    def _of_odometry(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         now = (odometry.state, odometry.reset_counter)
         if now != self._last:
             self._last = now

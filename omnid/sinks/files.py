@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import TypeAlias
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 
@@ -82,24 +84,51 @@ def _try_to_open(path: Path) -> None:
 
 
 class TrajectoryFile:
-    """The trajectory T_odom_rig as TUM, one line a pair, written as soon as the pose is known.
+    """The trajectory T_odom_rig as TUM, one line a pair, written as soon as the pose is known."""
 
-    The file is opened for the first pose: a run without poses leaves an existing file as it was.
-    """
+    def __init__(self, path: Path) -> None:
+        self._file = _TumFile(path)
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Write the row of a pose."""
+        self._file.write(odometry.stamp_ns, odometry.T_odom_rig)
+
+    def finish(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class MapTrajectoryFile:
+    """The trajectory T_map_rig as TUM, one line a pair, as it was known at that time: later loops do not change it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = _TumFile(path)
+
+    def process(self, update: PlaceUpdate) -> None:
+        """Write the row of a pose."""
+        self._file.write(update.stamp_ns, update.T_map_rig)
+
+    def finish(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class _TumFile:
+    """A file that is opened for the first pose: a run without poses leaves an existing file as it was."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: FileIO | None = None
         self._whole_bytes = 0
 
-    def process(self, odometry: OdometryUpdate) -> None:
+    def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
         """Write the row of a pose."""
         try:
-            self._append(tum_row(odometry.stamp_ns, odometry.T_odom_rig).encode("ascii") + b"\n")
+            self._append(tum_row(stamp_ns, T).encode("ascii") + b"\n")
         except OSError as error:
             raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
 
-    def finish(self) -> None:
+    def close(self) -> None:
         """Close the file."""
         if self._file is not None:
             self._file.close()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.messages import OdometryUpdate
-from omnid.tracking_state import TrackingState
+from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.tracking_state import MapState, TrackingState
 
 FIRST_CAPACITY = 1024  # poses; doubled whenever it is reached
 
@@ -55,5 +55,28 @@ class PoseCollector:
 
     @property
     def states(self) -> tuple[TrackingState, ...]:
+        """States (N,)."""
+        return tuple(self._states)
+
+
+class MapPoseCollector:
+    """A sink that keeps every pose in the map with its state: 150 bytes a pose."""
+
+    def __init__(self) -> None:
+        self._poses: list[NDArray[np.float64]] = []
+        self._states: list[MapState] = []
+
+    def process(self, update: PlaceUpdate) -> None:
+        """Keep a pose."""
+        self._poses.append(update.T_map_rig)
+        self._states.append(update.state)
+
+    @property
+    def T_map_rig(self) -> NDArray[np.float64]:
+        """Poses (N, 4, 4)."""
+        return np.array(self._poses).reshape(-1, 4, 4)
+
+    @property
+    def states(self) -> tuple[MapState, ...]:
         """States (N,)."""
         return tuple(self._states)

@@ -13,7 +13,7 @@ from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLogState
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
+from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
@@ -113,8 +113,9 @@ class Recorder:
         self._write_added(stamp_ns if is_pose else stamp_ns - _POSE_AGE_NS)
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
-            if isinstance(message, OdometryUpdate) and self._encode is not None:
-                self._statistics.process(message)
+            if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
+                if isinstance(message, OdometryUpdate):
+                    self._statistics.process(message)
                 self._write(self._state_reports(replace(message, stamp_ns=stamp_ns)), stamp_ns)
             self._newest_ns = max(self._newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
@@ -151,11 +152,11 @@ class Recorder:
             return [OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))]
         return self._encode(message) if self._encode is not None else []
 
-    def _state_reports(self, odometry: OdometryUpdate) -> Iterable[OutgoingMessage]:
-        """The state of the odometry when it changes, and once in every file."""
+    def _state_reports(self, pose: OdometryUpdate | PlaceUpdate) -> Iterable[OutgoingMessage]:
+        """The state of the odometry or in the map when it changes, and once in every file."""
         if self._files != self.state.files:
             self._files, self._states = self.state.files, StateReports()
-        return self._states(odometry)
+        return self._states(pose)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:

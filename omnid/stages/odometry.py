@@ -84,12 +84,16 @@ def of_base(odometry: OdometryUpdate, T_base_rig: Array) -> tuple[Array, Array, 
 
     odom is here the base's frame at the first pair; the velocity is in the base frame.
     """
-    T_rig_base = se3.inverse(T_base_rig)
     A = se3.adjoint(T_base_rig)
-    T_odom_base = T_base_rig @ odometry.T_odom_rig @ T_rig_base
-    of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
-    covariance = in_axes(T_odom_base, A @ of_rig @ A.T)
+    T_odom_base, covariance = base_pose(odometry.T_odom_rig, odometry.covariance, T_base_rig)
     return T_odom_base, covariance, A @ odometry.velocity, A @ odometry.velocity_covariance @ A.T
+
+
+def base_pose(T_odom_rig: Array, covariance: Array, T_base_rig: Array) -> tuple[Array, Array]:
+    """Return the pose of the base and its covariance, for those of the rig; axes as in of_base."""
+    A = se3.adjoint(T_base_rig)
+    T_odom_base = T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig)
+    return T_odom_base, in_axes(T_odom_base, A @ in_axes(se3.inverse(T_odom_rig), covariance) @ A.T)
 
 
 def _method(geometry: Geometry, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:

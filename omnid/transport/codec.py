@@ -23,6 +23,7 @@ from omnid.errors import OmnidError
 
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
 POSE_SCHEMA = "geometry_msgs/msg/PoseStamped"
+MAP_POSE_SCHEMA = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
@@ -32,8 +33,8 @@ VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
-SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA, TWIST_SCHEMA,
-           VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
+SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, MAP_POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA,
+           TWIST_SCHEMA, VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
@@ -175,6 +176,14 @@ def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") ->
     """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
     message = ros.geometry_msgs__msg__PoseStamped(_header(stamp_ns, frame), _pose(T_frame_body))
     return _cdr(message, POSE_SCHEMA)
+
+
+def pose_with_covariance_cdr(stamp_ns: int, T_frame_body: Array, covariance: Array, frame: str = "map") -> bytes:
+    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in `frame`, its covariance in its axes.
+    """
+    pose = ros.geometry_msgs__msg__PoseWithCovariance(_pose(T_frame_body), _covariance(covariance))
+    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(_header(stamp_ns, frame), pose)
+    return _cdr(message, MAP_POSE_SCHEMA)
 
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:

@@ -21,6 +21,7 @@ WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
 RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
+PLACES: Final = f"{PREFIX}places"
 LOAD: Final = f"{PREFIX}load"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay

@@ -22,6 +22,7 @@ class Topic(NamedTuple):
 PUBLISHED: Final = {
     "odom": Topic(codec.ODOMETRY_SCHEMA, realtime=True, latched=True),
     "pose": Topic(codec.POSE_SCHEMA, realtime=True, latched=True),
+    "map_pose": Topic(codec.MAP_POSE_SCHEMA, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),

@@ -11,6 +11,7 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from tests.simulation import paths
 from tests.simulation.builders import corridor, room
+from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path
 from tests.simulation.rigs import make_rig
 from tests.simulation.sensor import Sensor
 from tests.simulation.surfaces import Scene
@@ -105,11 +106,34 @@ def spin(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(mild_rig(seed, size), paths.turns([12.0] * (pairs - 1), 0.0), corridor(seed))
 
 
+def two_laps(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return two laps around a block, the second one beside the first, and half of it on the way back."""
+    return SimulatedRun(mild_rig(seed, size), paths.vibrate(two_laps_path(seed, pairs), seed, 0.2), ring(seed))
+
+
+def twin(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a corridor whose second half repeats the first: no place of one half is a place of the other."""
+    return SimulatedRun(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.12, sway_m=0.15), twin_corridor(seed))
+
+
+def brick_corridor(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a corridor of identical bricks, there and back."""
+    there = paths.spline_path(seed, max(2, pairs // 2 + 1), 0.1, sway_m=0.15)
+    return SimulatedRun(mild_rig(seed, size), paths.back_again(there)[:pairs], bricks(seed, 0.05 * pairs + 4))
+
+
+def symmetric(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a loop in an empty room that looks the same after half a turn."""
+    return SimulatedRun(mild_rig(seed, size), paths.loop(seed, pairs, 1.3), symmetric_room(seed))
+
+
 # By name, with the default number of pairs.
 RECIPES: dict[str, tuple[Recipe, int]] = {
     "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
     "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
     "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
+    "two_laps": (two_laps, 384), "twin": (twin, 72), "brick_corridor": (brick_corridor, 120),
+    "symmetric": (symmetric, 110),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import cv2
@@ -11,8 +12,20 @@ from numpy.typing import NDArray
 ROWS, COLUMNS = 16, 128
 SMOOTH: Final = (31, 5)  # columns, rows: brightness that is taken out, as it changes with the light
 LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare
+THUMBNAIL_SCALE: Final = 30.0  # of a thumbnail's values: so many are the root mean square of its contrast
 
 Signature = NDArray[np.complex64]
+Thumbnail = NDArray[np.int8]
+
+
+def thumbnail(panorama: NDArray[np.uint8]) -> Thumbnail:
+    """Return the panorama (H, W) of a full turn at (ROWS, COLUMNS) without its slow changes of brightness.
+
+    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast.
+    """
+    contrast = _contrast(panorama)
+    scaled = np.rint(THUMBNAIL_SCALE * math.sqrt(contrast.size) * contrast)
+    return np.asarray(np.clip(scaled, -127, 127), np.int8)
 
 
 def signature(panorama: NDArray[np.uint8]) -> Signature:
@@ -21,16 +34,43 @@ def signature(panorama: NDArray[np.uint8]) -> Signature:
     It is the spectrum over azimuth of the panorama at 16x128 pixels without its slow changes of brightness, scaled to
     length 1; zeros for a panorama without contrast.
     """
+    return np.fft.rfft(_contrast(panorama), axis=1).astype(np.complex64)
+
+
+def signature_of(small: Thumbnail) -> Signature:
+    """Return the signature of the panorama that has a thumbnail."""
+    size = float(np.linalg.norm(small.astype(np.float32)))
+    return np.fft.rfft(small / max(size, 1.0), axis=1).astype(np.complex64)
+
+
+def similarity(a: Signature, b: Signature) -> float:
+    """Return the largest circular correlation of two panoramas over all headings, -1 .. 1."""
+    return float(_correlation(a, b).max())
+
+
+def similarities(a: Signature, others: NDArray[np.complex64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return the largest circular correlations (N,) with others (N, ROWS, ...), and the turns (N,) [rad] there.
+
+    A turn is the angle, to the left, from the heading of the other panorama to that of a.
+    """
+    correlation = np.fft.irfft(np.einsum("rk,nrk->nk", a, others.conj()), COLUMNS, axis=1)
+    best = correlation.argmax(axis=1)
+    shift = (best + COLUMNS // 2) % COLUMNS - COLUMNS // 2
+    # Azimuth falls from left to right: what moved to the right was turned away from.
+    return correlation.max(axis=1).astype(np.float32), 2 * math.pi / COLUMNS * shift
+
+
+def _correlation(a: Signature, b: Signature) -> NDArray[np.float64]:
+    return np.fft.irfft((a * b.conj()).sum(axis=0), COLUMNS)
+
+
+def _contrast(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the panorama at (ROWS, COLUMNS) without slow changes of brightness, of length 1, or zeros."""
     small = cv2.resize(panorama, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
     pad = SMOOTH[0] // 2
     turned = cv2.copyMakeBorder(small, 0, 0, pad, pad, cv2.BORDER_WRAP)
     contrast = small - cv2.blur(turned, SMOOTH)[:, pad:-pad]
     size = float(np.linalg.norm(contrast))
     if size < LEAST_CONTRAST * np.sqrt(small.size):
-        return np.zeros((ROWS, COLUMNS // 2 + 1), np.complex64)
-    return np.fft.rfft(contrast / size, axis=1).astype(np.complex64)
-
-
-def similarity(a: Signature, b: Signature) -> float:
-    """Return the largest circular correlation of two panoramas over all headings, -1 .. 1."""
-    return float(np.fft.irfft((a * b.conj()).sum(axis=0), COLUMNS).max())
+        return np.zeros((ROWS, COLUMNS), np.float32)
+    return np.asarray(contrast / size, np.float32)

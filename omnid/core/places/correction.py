@@ -1,0 +1,98 @@
+"""Correction of a map by its loops: the pose graph, weighted by the drift that the loops themselves show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.places.drift import drift_factor, relative_covariance
+from omnid.core.places.place_map import Link, PlaceMap
+from omnid.core.places.pose_graph import PoseEdges, optimise
+
+Array = NDArray[np.float64]
+
+LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
+KEYFRAMES_PER_LOOP: Final = 200  # a map of more keyframes waits for more loops until it is optimised again
+ACCEPTED: Final = 0.5  # least weight of a loop that stays
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Anchor:
+    """A keyframe whose covariance in the map is known."""
+
+    T_odom_rect: Array
+    of_odom: Array  # (6, 6) covariance in odom
+    of_map: Array  # (6, 6) covariance in the map
+
+
+class MapCorrection:
+    """Optimises the poses of a map when loops are closed."""
+
+    def __init__(self, places: PlaceMap) -> None:
+        self._places = places
+        self._anchor: _Anchor | None = None
+        self._waiting = 0  # loops since the last optimisation
+        self.rejected = 0  # loops that the graph refused
+        self.factor = 1.0  # on odometry's covariance, by the loops
+        self.optimisations = 0
+
+    def forget(self) -> None:
+        """Forget the covariance in the map: odom has been continued after a gap."""
+        self._anchor = None
+
+    def close(self, loops: list[Link], part: list[int]) -> None:
+        """Add loops and optimise the keyframes (ids) of a connected part, the oldest first, the newest last.
+
+        In a large map the optimisation waits for some loops, so that its cost does not grow with the square of the map.
+        """
+        self._places.links += loops
+        self._waiting += len(loops)
+        if self.optimisations and self._waiting <= len(part) // KEYFRAMES_PER_LOOP:
+            return
+        self._waiting = 0
+        self.optimisations += 1
+        row = {id: n for n, id in enumerate(part)}
+        links = [link for link in self._places.links if link.a in row]
+        self.factor = self._drift_factor(links)
+        edges = PoseEdges(np.array([(row[link.a], row[link.b]) for link in links]),
+                          np.array([link.T_a_b for link in links]),
+                          np.array([self._covariance(link) for link in links]),
+                          np.array([link.is_loop for link in links]))
+        result = optimise(np.array([self._places.poses[id] for id in part]), edges)
+        self._places.move(dict(zip(part, result.poses, strict=True)))
+        bad = {id(link) for link, weight in zip(links, result.weights.tolist(), strict=True) if weight < ACCEPTED}
+        self._places.links = [link for link in self._places.links if id(link) not in bad]
+        self.rejected += len(bad)
+        newest = self._places.keyframes[part[-1]]
+        if np.isfinite(result.covariance).all():
+            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
+
+    def covariance_at(self, T_odom_rect: Array, covariance: Array) -> Array:
+        """Return the covariance (6, 6) in the map of a pose whose covariance in odom is given."""
+        if self._anchor is None:
+            return covariance
+        T_anchor_rect = se3.inverse(self._anchor.T_odom_rect) @ T_odom_rect
+        A = se3.adjoint(se3.inverse(T_anchor_rect))
+        since = relative_covariance(T_anchor_rect, self._anchor.of_odom, covariance)
+        return np.asarray(A @ self._anchor.of_map @ A.T + self.factor * since)
+
+    def _covariance(self, link: Link) -> Array:
+        return link.covariance if link.is_loop else self.factor * link.covariance + LEAST_ODOMETRY
+
+    def _drift_factor(self, links: list[Link]) -> float:
+        """Return the factor on odometry's covariance that explains the loops within one run."""
+        pairs = [(link, self._places.keyframes[link.a], self._places.keyframes[link.b])
+                 for link in links if link.is_loop]
+        pairs = [(link, a, b) for link, a, b in pairs if a.session == b.session]
+        if not pairs:
+            return self.factor
+        T_a_b = np.array([se3.inverse(a.T_odom_rect) @ b.T_odom_rect for _, a, b in pairs])
+        by_loop = np.array([link.T_a_b for link, _, _ in pairs])
+        by_odometry = relative_covariance(T_a_b, np.array([a.covariance for _, a, _ in pairs]),
+                                          np.array([b.covariance for _, _, b in pairs]))
+        return drift_factor(se3.log(se3.inverse(by_loop) @ T_a_b), by_odometry + LEAST_ODOMETRY,
+                            np.array([link.covariance for link, _, _ in pairs]))

@@ -1,0 +1,48 @@
+"""Drift of odometry, as the loops show it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+
+Array = NDArray[np.float64]
+
+MEDIAN: Final = 5.348  # of the chi-squared distribution of six dimensions
+LARGEST: Final = 1e6  # factor on the covariance: a thousand times the standard deviation
+ROUNDS: Final = 40  # of the bisection
+
+
+def relative_covariance(T_a_b: Array, of_a: Array, of_b: Array) -> Array:
+    """Return the covariance (..., 6, 6) of T_a_b for poses whose covariances grow along the path from a to b.
+
+    What b has beyond a; its negative part, where the estimate of b became better than that of a, is left out.
+    """
+    A = se3.adjoint(se3.inverse(T_a_b))
+    grown = of_b - A @ of_a @ np.swapaxes(A, -1, -2)
+    values, vectors = np.linalg.eigh((grown + np.swapaxes(grown, -1, -2)) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+
+
+def drift_factor(errors: Array, by_odometry: Array, by_loop: Array) -> float:
+    """Return the factor >= 1 on odometry's covariance that explains the errors (N, 6) of loops.
+
+    errors: log of T_a_b by odometry in that by the loop; by_odometry, by_loop (N, 6, 6) their covariances. The factor
+    is the one at which the median of the squared Mahalanobis distances is that of the distribution: noise of the
+    images is in odometry's covariance, an error of the rig is not.
+    """
+
+    def median(factor: float) -> float:
+        S = factor * by_odometry + by_loop
+        return float(np.median((errors * np.linalg.solve(S, errors[:, :, None])[:, :, 0]).sum(axis=1)))
+
+    if not len(errors) or median(1.0) <= MEDIAN:
+        return 1.0
+    low, high = 0.0, float(np.log(LARGEST))
+    for _ in range(ROUNDS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if median(float(np.exp(middle))) > MEDIAN else (low, middle)
+    return float(np.exp(high))

@@ -1,0 +1,102 @@
+"""Consistency of recognitions over several frames: a single one never counts."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.places.place_map import Link
+from omnid.core.places.recognition import Recognition
+
+Array = NDArray[np.float64]
+
+CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
+KEPT: Final = 6  # recognitions that are remembered
+APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
+SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
+SURE_INLIERS: Final = 40  # of recognitions that count without motion between them
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A recognition, and the frame it was made in."""
+
+    recognition: Recognition
+    keyframe: int  # id of the newest keyframe of the run at that time
+    T_keyframe_rect: Array  # (4, 4) by odometry
+    covariance: Array  # (6, 6) of T_keyframe_rect
+    T_odom_rect: Array  # (4, 4)
+
+    def T_map_rect(self, poses: Mapping[int, Array]) -> Array:
+        """Return the pose of the frame in the map of these poses of keyframes."""
+        return np.asarray(poses[self.recognition.id] @ self.recognition.T_place_rect)
+
+    def T_map_odom(self, poses: Mapping[int, Array]) -> Array:
+        """Return the pose of odom in the map of these poses of keyframes."""
+        return np.asarray(self.T_map_rect(poses) @ se3.inverse(self.T_odom_rect))
+
+    def link(self) -> Link:
+        """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
+        found = Link(self.recognition.id, -1, self.recognition.T_place_rect, self.recognition.covariance,
+                     self.recognition.inliers)
+        return found.then(Link(self.keyframe, -1, self.T_keyframe_rect, self.covariance).reversed())
+
+
+class Hypotheses:
+    """Recognitions of the last frames."""
+
+    def __init__(self) -> None:
+        self._kept: deque[Hypothesis] = deque(maxlen=KEPT)
+        self._counted: deque[Hypothesis] = deque(maxlen=KEPT)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def clear(self) -> None:
+        """Forget all recognitions."""
+        self._kept.clear()
+
+    def take(self, one: Hypothesis) -> bool:
+        """True the first time: a recognition counts once."""
+        if any(one is counted for counted in self._counted):
+            return False
+        self._counted.append(one)
+        return True
+
+    def add(self, new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
+        """Add a recognition; return those that agree with it, itself last, where they are enough; else none."""
+        known = [kept for kept in self._kept if kept.recognition.id in poses and kept.keyframe in poses]
+        self._kept.append(new)
+        distinct: list[Hypothesis] = []
+        for one in (*(kept for kept in known if _consistent(kept, new, poses)), new):
+            if one.recognition.inliers >= SURE_INLIERS or all(_apart(one, other) for other in distinct):
+                distinct.append(one)
+        return distinct if len(distinct) >= CONSISTENT else []
+
+
+def _consistent(a: Hypothesis, b: Hypothesis, poses: Mapping[int, Array]) -> bool:
+    """True if both place the newer frame at the same pose in the map."""
+    difference = se3.inverse(a.T_map_odom(poses) @ b.T_odom_rect) @ b.T_map_rect(poses)
+    return length_m(difference) < SAME_M and angle_rad(difference) < SAME_RAD
+
+
+def _apart(a: Hypothesis, b: Hypothesis) -> bool:
+    moved = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
+    return length_m(moved) > APART_M or angle_rad(moved) > APART_RAD
+
+
+def length_m(T: Array) -> float:
+    """Return the length of the translation of a transform (4, 4)."""
+    return float(np.linalg.norm(T[:3, 3]))
+
+
+def angle_rad(T: Array) -> float:
+    """Return the angle of the rotation of a transform (4, 4)."""
+    return math.acos(min(1.0, max(-1.0, (float(np.trace(T[:3, :3])) - 1) / 2)))

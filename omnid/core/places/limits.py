@@ -1,0 +1,18 @@
+"""Limits of the map of places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omnid.settings import knob
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceLimits:
+    """Distance and number of the keyframes that stay."""
+
+    keyframe_m: float = knob(0.3, "distance after which a keyframe is kept for the recognition of the place, m",
+                             low=0.05, high=10)
+    keyframe_deg: float = knob(15.0, "turn after which a keyframe is kept, deg", low=1, high=180)
+    max_keyframes: int = knob(1000, "keyframes kept; more drop those that others are nearest to", low=2, high=100_000)
+    max_mb: float = knob(50.0, "memory of the keyframes, MB; the same", low=0.1, high=10_000)

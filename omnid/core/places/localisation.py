@@ -1,0 +1,226 @@
+"""Localisation in a map: keep keyframes of odometry, recognise places, close loops, and give the pose of odom.
+
+MapLocaliser.process is the algorithm, one frame at a time. Odometry stays as it is; T_map_odom carries the correction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.correction import MapCorrection
+from omnid.core.places.drift import relative_covariance
+from omnid.core.places.features import describe
+from omnid.core.places.hypotheses import Hypotheses, Hypothesis, angle_rad, length_m
+from omnid.core.places.limits import PlaceLimits
+from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_search import Expected, PlaceSearch
+from omnid.core.places.recognition import Recognition
+from omnid.core.places.signature import Thumbnail, thumbnail
+from omnid.tracking_state import MapState
+
+Array = NDArray[np.float64]
+
+WAIT_FACTOR: Final = 1.5  # of the distance between keyframes: then one is added where odometry adds none
+CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
+SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
+LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
+GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
+GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
+RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryFrame:
+    """A frame with its pose by odometry."""
+
+    stereo: StereoFrame
+    stamp_ns: int
+    T_odom_rect: Array  # (4, 4)
+    covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
+    lost: bool
+    resets: int  # gaps of unknown motion so far
+    is_keyframe: bool  # its dense depth is known
+    scan: Callable[[], NDArray[np.float32]]  # returns the nearest obstacles by azimuth, see mapping/range_scan.py
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPose:
+    """Pose of odom in the map, and of the frame."""
+
+    T_map_odom: Array  # (4, 4) of the rectified frame of the first pair
+    covariance: Array  # (6, 6) of T_map_rect, [t; r] in the rectified frame
+    state: MapState
+
+
+class MapLocaliser:
+    """Holds the map, and the pose of odom in it."""
+
+    def __init__(self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None) -> None:
+        """places: a map to be extended; None: a new one, which begins where odom does."""
+        self._model, self._limits = model, limits
+        self.places = places if places is not None else PlaceMap(limits.max_keyframes, round(1e6 * limits.max_mb))
+        self.search = PlaceSearch(model)
+        self.correction = MapCorrection(self.places)
+        self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
+        # Parts of the map between which no pose is known have numbers; this run begins a new part.
+        self._part_of = dict.fromkeys(self.places.keyframes, 0)
+        self._part = 1 if self.places.keyframes else 0
+        self._hypotheses = Hypotheses()
+        self._newest: PlaceKeyframe | None = None  # of this part, by odometry
+        self._T_map_odom = np.eye(4)
+        self._resets = 0
+        self._path_m = 0.0
+        self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
+        self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
+        self._last_T: Array | None = None
+        self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
+
+    def process(self, frame: OdometryFrame) -> MapPose:
+        """Return the pose of odom in the map after a frame."""
+        self._advance(frame)
+        if frame.lost:
+            return self._pose(frame, MapState.LOST)
+        is_keyframe = self._keyframe_is_due(frame)
+        if is_keyframe or self._search_is_due(frame):
+            small = thumbnail(frame.stereo.lower.panorama)
+            features = describe(frame.stereo)
+            # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
+            found = self._recognise(frame, small, features)
+            # 2. Keep the keyframe, linked to the one before by odometry.
+            if is_keyframe:
+                self._add(frame, small, features)
+            # 3. Correct the map where several frames agree.
+            if found is not None and self._newest is not None:
+                self._close_loop(frame, found, self._newest)
+        return self._pose(frame, self._state())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes and counters, for the status."""
+        return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
+                "dropped": self.places.dropped, "rejected": self.correction.rejected,
+                "ambiguous": self.search.ambiguous, "refused": self.search.refused}
+
+    def _advance(self, frame: OdometryFrame) -> None:
+        """Sum up the path; after a gap of unknown motion begin a new part of the map."""
+        if self._last_T is not None:
+            self._path_m += length_m(se3.inverse(self._last_T) @ frame.T_odom_rect)
+        self._last_T = frame.T_odom_rect
+        if frame.resets != self._resets:
+            self._resets = frame.resets
+            self._hypotheses.clear()
+            self._newest, self._recognised_at, self._searched = None, None, None
+            self._part = 1 + max(self._part_of.values(), default=-1)
+            self.correction.forget()
+
+    def _keyframe_is_due(self, frame: OdometryFrame) -> bool:
+        """True if the view has changed enough; better at a keyframe of odometry, whose depth is known already."""
+        if self._newest is None:
+            return True
+        moved = se3.inverse(self._newest.T_odom_rect) @ frame.T_odom_rect
+        change = max(length_m(moved) / self._limits.keyframe_m,
+                     angle_rad(moved) / math.radians(self._limits.keyframe_deg))
+        return change >= (1.0 if frame.is_keyframe else WAIT_FACTOR)
+
+    def _search_is_due(self, frame: OdometryFrame) -> bool:
+        """True if a recognition is to be checked, or where odom is in the map is not known."""
+        if self._searched is None:
+            return True
+        since_ns, moved = frame.stamp_ns - self._searched[0], se3.inverse(self._searched[1]) @ frame.T_odom_rect
+        if self._elsewhere() and self._recognised_at is None:
+            return since_ns >= SEARCH_NS
+        pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
+        return pending and (length_m(moved) > CHECK_M or angle_rad(moved) > CHECK_RAD)
+
+    def _elsewhere(self) -> list[int]:
+        """Return the keyframes of other parts of the map."""
+        return [id for id, part in self._part_of.items() if part != self._part]
+
+    def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
+        """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
+        self._searched = frame.stamp_ns, frame.T_odom_rect
+        found = self.search.near(small, features, self.places, self._expected(frame))
+        if found is None and (far := self._elsewhere()):
+            found = self.search.far(small, features, self.places, far)
+        return found
+
+    def _expected(self, frame: OdometryFrame) -> Expected:
+        """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
+        T_map_rect = self._T_map_odom @ frame.T_odom_rect
+        drift_m: dict[int, float] = {}
+        for id, part in self._part_of.items():
+            path_m = self._path_m - self._path_at.get(id, -math.inf)
+            if part != self._part or path_m < LOCAL_M:
+                continue
+            if self._recognised_at is not None:
+                since_m = self._path_m - self._recognised_at[0]
+                path_m = min(path_m, since_m + float(np.linalg.norm(
+                    self.places.poses[id][:3, 3] - self._recognised_at[1])))
+            drift_m[id] = path_m
+        return Expected(T_map_rect, {id: GATE_M + GATE_PER_M * path_m for id, path_m in drift_m.items()},
+                        {id: GATE_RAD + GATE_RAD_PER_M * path_m for id, path_m in drift_m.items()})
+
+    def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
+        """Add a keyframe to the map."""
+        keyframe = PlaceKeyframe(self.places.next_id, self._session, frame.stamp_ns, frame.T_odom_rect,
+                                 frame.covariance, small,
+                                 frame.scan().astype(np.float16), features)
+        link = None if self._newest is None else _by_odometry(self._newest, keyframe)
+        self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
+        self._part_of[keyframe.id], self._path_at[keyframe.id] = self._part, self._path_m
+        self._newest = keyframe
+        if self.places.keyframes.keys() != self._part_of.keys():
+            self._part_of = {id: part for id, part in self._part_of.items() if id in self.places.keyframes}
+            self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
+            self.search.forget(self.places)
+
+    def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
+        """Link a recognised place, once several frames agree, and correct the map."""
+        T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
+        since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
+        hypothesis = Hypothesis(found, newest.id, T_keyframe_rect, since, frame.T_odom_rect)
+        consistent = self._hypotheses.add(hypothesis, self.places.poses)
+        if not consistent:
+            return
+        other = self._part_of[found.id]
+        if other != self._part:
+            self._join(other, hypothesis.T_map_odom(self.places.poses))
+        links = [one.link() for one in consistent if self._hypotheses.take(one)]
+        part = sorted(id for id, number in self._part_of.items() if number == self._part)
+        self.correction.close([link for link in links if link.a != link.b], part)
+        self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
+        self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
+
+    def _join(self, other: int, T_map_odom: Array) -> None:
+        """Join this part of the map with another one, in whose frame T_map_odom is given; the older one stays."""
+        T_other_own = T_map_odom @ se3.inverse(self._T_map_odom)
+        stays = min(other, self._part)
+        moved = self._part if stays == other else other
+        by = T_other_own if moved == self._part else se3.inverse(T_other_own)
+        self.places.move({id: by @ self.places.poses[id] for id, part in self._part_of.items() if part == moved})
+        self._part_of = {id: stays if part == moved else part for id, part in self._part_of.items()}
+        self._part = stays
+
+    def _state(self) -> MapState:
+        """Return the state of a frame whose pose in odom is known."""
+        recent = self._recognised_at is not None and self._path_m - self._recognised_at[0] < RECENT_M
+        return MapState.LOCALIZED if recent else MapState.ODOMETRY_ONLY
+
+    def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
+        covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
+        return MapPose(self._T_map_odom, covariance, state)
+
+
+def _by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
+    """Return the edge between two keyframes as odometry measured it."""
+    T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
+    return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))

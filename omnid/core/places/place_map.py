@@ -1,0 +1,144 @@
+"""Places of a map: keyframes with what recognises them, their poses in the map, and the links between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+
+Array = NDArray[np.float64]
+
+OVERHEAD_BYTES = 1500  # of a keyframe beside its large arrays: poses, covariance, links
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceFeatures:
+    """SIFT features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
+
+    A view is column, lower row, upper row.
+    """
+
+    descriptors: NDArray[np.uint8]
+    views: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceKeyframe:
+    """Evidence by which a place is recognised; the rectified frame is that of the lower panorama."""
+
+    id: int
+    session: int  # number of the run that added it: 0 for the first run of a map
+    stamp_ns: int
+    T_odom_rect: Array  # (4, 4) as odometry estimated it, in the odom of its session
+    covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
+    thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see signature.py
+    scan: NDArray[np.float16]  # (360,) m, nearest obstacle by azimuth from -pi on, NaN unknown
+    features: PlaceFeatures
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the keyframe takes."""
+        arrays = (self.thumbnail, self.scan, self.features.descriptors, self.features.views)
+        return OVERHEAD_BYTES + sum(a.nbytes for a in arrays)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """An edge of the pose graph: the pose of keyframe b in the frame of keyframe a, T_true = T_a_b exp(xi)."""
+
+    a: int
+    b: int
+    T_a_b: Array  # (4, 4)
+    covariance: Array  # (6, 6) of xi = [t; r]
+    inliers: int = 0  # features that support a loop; 0: an edge of odometry
+
+    @property
+    def is_loop(self) -> bool:
+        """True if the edge comes from a place that was recognised."""
+        return self.inliers > 0
+
+    def reversed(self) -> Link:
+        """Return the same edge from b to a."""
+        A = se3.adjoint(self.T_a_b)
+        return Link(self.b, self.a, se3.inverse(self.T_a_b), A @ self.covariance @ A.T, self.inliers)
+
+    def then(self, other: Link) -> Link:
+        """Return the edge from a to the end of another one that starts at b."""
+        A = se3.adjoint(se3.inverse(other.T_a_b))
+        covariance = A @ self.covariance @ A.T + other.covariance
+        weakest = min((n for n in (self.inliers, other.inliers) if n), default=0)
+        return Link(self.a, other.b, self.T_a_b @ other.T_a_b, covariance, weakest)
+
+
+class PlaceMap:
+    """Keyframes by id with their poses T_map_rect, and the links between them; bounded in count and bytes."""
+
+    def __init__(self, max_keyframes: int = 1000, max_bytes: int = 50_000_000) -> None:
+        self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
+        self.keyframes: dict[int, PlaceKeyframe] = {}
+        self.poses: dict[int, Array] = {}
+        self.links: list[Link] = []
+        self.dropped = 0  # keyframes, because the map was full
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the keyframes take."""
+        return sum(keyframe.nbytes for keyframe in self.keyframes.values())
+
+    @property
+    def next_id(self) -> int:
+        """Id of the next keyframe."""
+        return max(self.keyframes, default=-1) + 1
+
+    @property
+    def loops(self) -> int:
+        """Number of links from places that were recognised."""
+        return sum(link.is_loop for link in self.links)
+
+    def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
+        """Add a keyframe with the link of odometry that leads to it; None where there is no such link.
+
+        A full map drops the keyframe that has the nearest neighbour, the older one of both.
+        """
+        self.keyframes[keyframe.id] = keyframe
+        self.poses[keyframe.id] = T_map_rect
+        if link is not None:
+            self.links.append(link)
+        while len(self) > max(2, self._max_keyframes) or (len(self) > 2 and self.nbytes > self._max_bytes):
+            self.drop(self._most_redundant(keyframe.id))
+
+    def drop(self, id: int) -> None:
+        """Drop a keyframe; what was linked to it is linked to the next one on its path, or to the one before."""
+        touching = [link for link in self.links if id in (link.a, link.b)]
+        self.links = [link for link in self.links if id not in (link.a, link.b)]
+        leaving = [link if link.a == id else link.reversed() for link in touching]
+        bridge = min((link for link in leaving if not link.is_loop), key=lambda link: link.b <= id, default=None)
+        if bridge is not None:
+            joined = [link.reversed().then(bridge) for link in leaving if link is not bridge and link.b != bridge.b]
+            self.links += [link if link.a < link.b else link.reversed() for link in joined]
+        del self.keyframes[id], self.poses[id]
+        self.dropped += 1
+
+    def _most_redundant(self, newest: int) -> int:
+        """Return the id of the keyframe, not the newest, that is nearest to another one; the older one of two."""
+        ids = [id for id in self.keyframes if id != newest]
+        at = np.array([self.poses[id][:3, 3] for id in ids])
+        squared = (at**2).sum(axis=1)
+        apart = squared[:, None] + squared[None] - 2 * at @ at.T
+        np.fill_diagonal(apart, np.inf)
+        return ids[int(apart.min(axis=1).argmin())]
+
+    def move(self, poses: dict[int, Array]) -> None:
+        """Set the poses T_map_rect of keyframes after an optimisation."""
+        self.poses.update(poses)
+
+    def without(self, links: set[int]) -> None:
+        """Remove links by their places in the list."""
+        self.links = [link for n, link in enumerate(self.links) if n not in links]
+

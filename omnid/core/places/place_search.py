@@ -1,0 +1,110 @@
+"""Search of a frame among the keyframes of a map: a shortlist by signatures, then geometry, then doubt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.places.hypotheses import angle_rad, length_m
+from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.recognition import Recognition, recognise
+from omnid.core.places.signature import Signature, signature_of, similarities
+
+Array = NDArray[np.float64]
+
+NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
+NEAR_CANDIDATES: Final = 3  # keyframes that are compared where odometry tells about where the robot is
+FAR_CANDIDATES: Final = 8  # keyframes that are compared where it does not
+NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
+FAR_INLIERS, FAR_SECTORS = 30, 5  # least support where it cannot tell
+RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
+RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """Pose in the map that odometry expects for the frame, and its largest errors relative to each keyframe."""
+
+    T_map_rect: Array  # (4, 4)
+    error_m: Mapping[int, float]  # by keyframe; a keyframe that is missing is not looked for
+    error_rad: Mapping[int, float]
+
+
+class PlaceSearch:
+    """Finds frames among keyframes, and counts what it refuses."""
+
+    def __init__(self, model: StereoModel) -> None:
+        self._model = model
+        self._signatures: dict[int, Signature] = {}
+        self.ambiguous = 0  # frames that fit two places equally well
+        self.refused = 0  # recognitions that odometry contradicts
+
+    def near(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
+             ) -> Recognition | None:
+        """Return the best recognition among keyframes near the expected pose that odometry does not contradict."""
+        at = expected.T_map_rect[:3, 3]
+        ids = [id for id, error_m in expected.error_m.items()
+               if np.linalg.norm(places.poses[id][:3, 3] - at) < NEAR_M + error_m]
+        found = [place for place in self._compare(small, features, places, ids, NEAR_CANDIDATES)
+                 if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS]
+        best = self._unambiguous(found, places.poses)
+        if best is not None and not _is_expected(best, places.poses, expected):
+            self.refused += 1
+            return None
+        return best
+
+    def far(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int]
+            ) -> Recognition | None:
+        """Return the best recognition among keyframes (ids) of which odometry does not know where they are."""
+        found = [place for place in self._compare(small, features, places, ids, FAR_CANDIDATES)
+                 if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS]
+        return self._unambiguous(found, places.poses)
+
+    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int], most: int
+                 ) -> list[Recognition]:
+        """Return the recognitions among the keyframes (ids) that look most similar, at most so many."""
+        if not ids:
+            return []
+        others = np.array([self._signature(places.keyframes[id]) for id in ids])
+        similar, turns_rad = similarities(signature_of(small), others)
+        chosen = np.argsort(-similar, kind="stable")[:most].tolist()
+        found = [recognise(features, places.keyframes[ids[n]].features, ids[n], float(turns_rad[n]), self._model)
+                 for n in chosen]
+        return [place for place in found if place is not None]
+
+    def _signature(self, keyframe: PlaceKeyframe) -> Signature:
+        if keyframe.id not in self._signatures:
+            self._signatures[keyframe.id] = signature_of(keyframe.thumbnail)
+        return self._signatures[keyframe.id]
+
+    def forget(self, places: PlaceMap) -> None:
+        """Forget the signatures of keyframes that the map does not hold any more."""
+        self._signatures = {id: found for id, found in self._signatures.items() if id in places.keyframes}
+
+    def _unambiguous(self, found: list[Recognition], poses: Mapping[int, Array]) -> Recognition | None:
+        """Return the recognition with most inliers, None where another place has nearly as many."""
+        best = max(found, key=lambda place: place.inliers, default=None)
+        if best is None:
+            return None
+        T = poses[best.id] @ best.T_place_rect
+        for place in found:
+            other = se3.inverse(T) @ poses[place.id] @ place.T_place_rect
+            elsewhere = length_m(other) > RUNNER_UP_M or angle_rad(other) > RUNNER_UP_RAD
+            if elsewhere and place.inliers > RUNNER_UP * best.inliers:
+                self.ambiguous += 1
+                return None
+        return best
+
+
+def _is_expected(place: Recognition, poses: Mapping[int, Array], expected: Expected) -> bool:
+    """True if a recognition is within the largest error of odometry."""
+    difference = se3.inverse(expected.T_map_rect) @ poses[place.id] @ place.T_place_rect
+    return (length_m(difference) < expected.error_m[place.id]
+            and angle_rad(difference) < expected.error_rad[place.id])

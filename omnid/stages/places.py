@@ -1,0 +1,69 @@
+"""Places stage: keeps keyframes of odometry, recognises places, and gives the pose of odom in the map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.config import Config
+from omnid.core.mapping.range_scan import RangeScan, range_scan
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.localisation import MapLocaliser, OdometryFrame
+from omnid.core.places.place_map import PlaceMap
+from omnid.messages import OdometryUpdate, PlaceUpdate, StereoDepth
+from omnid.stages.geometry import Geometry
+from omnid.stages.odometry import in_axes
+from omnid.tracking_state import MapState, TrackingState
+
+Array = NDArray[np.float64]
+
+
+class Places:
+    """Localise the poses of odometry in a map of places, which grows with them."""
+
+    def __init__(self, geometry: Geometry, config: Config, places: PlaceMap | None = None) -> None:
+        """places: a map to be extended, None: a new one."""
+        self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places)
+        self._T_rig_rect = geometry.T_rig_rect
+        height_m = float((geometry.rig.T_base_rig @ self._T_rig_rect)[2, 3])
+        low_m, high_m = config.mapping.heights_m
+        self._heights_m = (low_m - height_m, high_m - height_m)  # of obstacles, in the rectified frame
+        self._T_rect_rig = se3.inverse(self._T_rig_rect)
+        self._to_rig = se3.adjoint(self._T_rig_rect)
+        self._to_rect = se3.adjoint(self._T_rect_rig)
+        self.state = MapState.ODOMETRY_ONLY  # of the newest pose
+
+    @property
+    def map(self) -> PlaceMap:
+        """The map of places."""
+        return self._localiser.places
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes and counters of the map."""
+        return self._localiser.counts
+
+    def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
+        """Return the pose in the map at a pair."""
+        pose = self._localiser.process(self._frame(odometry))
+        self.state = pose.state
+        T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
+        T_map_rig = T_map_odom @ odometry.T_odom_rig
+        covariance = in_axes(T_map_rig, self._to_rig @ pose.covariance @ self._to_rig.T)
+        return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state)
+
+    def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
+        """Return the frame in terms of the rectified frame."""
+        depth, pair = odometry.depth, odometry.depth.panoramas
+        usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
+        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, lambda: depth.disparity, usable, pair.times)
+        T_odom_rect = self._T_rect_rig @ odometry.T_odom_rig @ self._T_rig_rect
+        of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
+        return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, self._to_rect @ of_rig @ self._to_rect.T,
+                             odometry.state is TrackingState.LOST, odometry.reset_counter,
+                             len(odometry.features.new) > 0, lambda: self._scan(odometry.depth))
+
+    def _scan(self, depth: StereoDepth) -> RangeScan:
+        """Return the range scan of a pair."""
+        return range_scan(se3.apply(self._T_rect_rig, depth.points), self._heights_m)

@@ -1,0 +1,122 @@
+"""A drive there and back along a corridor whose odometry drifts: the map corrects it, and says what it knows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.core.mapping.range_scan import range_scan
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.limits import PlaceLimits
+from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
+from omnid.tracking_state import MapState
+from tests.omnid.core.scenery import Array, RenderedCameras, motion_errors
+from tests.simulation import corridor
+from tests.simulation.paths import planar_poses
+
+STEP_M = 0.2
+OUT = np.arange(0.0, 4.2, STEP_M)
+# The way back is 0.15 m aside, in the opposite direction.
+XY = np.concatenate([np.column_stack([OUT, 0 * OUT]), np.column_stack([OUT[::-1], 0 * OUT + 0.15])])
+POSES = planar_poses(XY, np.repeat([0.0, np.pi], len(OUT)))
+DRIFT = se3.exp([0.004, 0.003, 0.0, 0, 0, np.deg2rad(0.08)])  # of each step
+COVARIANCE = np.diag([0.002] * 3 + [np.deg2rad(0.05)] * 3) ** 2  # of each step
+
+
+@pytest.fixture(scope="module")
+def frames(cameras: RenderedCameras) -> list[StereoFrame]:
+    return [cameras.frame(100 + k, T) for k, T in enumerate(POSES)]
+
+
+def odometry(frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 0, start: int = 0
+             ) -> list[OdometryFrame]:
+    """The frames with poses that drift, from the identity on."""
+    found, T, covariance = [], np.eye(4), np.zeros((6, 6))
+    for k, stereo in enumerate(frames):
+        if k:
+            step = se3.inverse(poses[k - 1]) @ poses[k] @ DRIFT
+            A = se3.adjoint(se3.inverse(step))
+            T, covariance = T @ step, A @ covariance @ A.T + COVARIANCE
+        found.append(OdometryFrame(stereo, (start + k) * 100_000_000, T, covariance, False, resets, True,
+                                   lambda: range_scan(np.zeros((0, 3)), (-1.0, 1.0))))
+    return found
+
+
+def run(localiser: MapLocaliser, frames: Sequence[OdometryFrame]) -> list[MapPose]:
+    return [localiser.process(frame) for frame in frames]
+
+
+@pytest.fixture(scope="module")
+def out(cameras: RenderedCameras, frames: list[StereoFrame]) -> MapLocaliser:
+    """The way out; tests take a copy."""
+    localiser = MapLocaliser(cameras.model, PlaceLimits())
+    run(localiser, odometry(frames[: len(OUT)]))
+    return localiser
+
+
+def test_loops_halve_the_error_and_odom_never_jumps(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    localiser, drive = deepcopy(out), odometry(frames)
+    found = run(MapLocaliser(cameras.model, PlaceLimits()), drive)
+    # The same frames give the same bytes.
+    for a, b in zip(run(localiser, drive[len(OUT):]), found[len(OUT):], strict=True):
+        assert a.T_map_odom.tobytes() == b.T_map_odom.tobytes() and a.covariance.tobytes() == b.covariance.tobytes()
+    truth = [se3.inverse(POSES[0]) @ T for T in POSES]
+    by_odometry = [motion_errors(frame.T_odom_rect, T)[0] for frame, T in zip(drive, truth, strict=True)]
+    in_map = [motion_errors(pose.T_map_odom @ frame.T_odom_rect, T)[0]
+              for pose, frame, T in zip(found, drive, truth, strict=True)]
+    assert by_odometry[-1] > 0.1 and in_map[-1] < 0.3 * by_odometry[-1]
+    assert localiser.counts["loops"] >= 5 and localiser.counts["rejected"] == 0
+    # The map's end error lies within what the covariance says, which is far less than that of odometry.
+    sigma = float(np.sqrt(np.trace(found[-1].covariance[:3, :3])))
+    assert in_map[-1] < 4 * sigma and sigma < 0.1
+    states = [pose.state for pose in found]
+    assert states[0] is MapState.ODOMETRY_ONLY and states[-1] is MapState.LOCALIZED
+    first = states.index(MapState.LOCALIZED)
+    assert all(np.array_equal(pose.T_map_odom, np.eye(4)) for pose in found[:first])
+    # A place that was left 3 m ago is recognised within 1 m.
+    assert first * STEP_M < 3.0 + OUT[-1] / 2 + 1.0 + 1.0
+
+
+def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame], out: MapLocaliser) -> None:
+    """After the reset odom is meaningless in the map until three frames agree."""
+    localiser = deepcopy(out)
+    there = list(range(len(OUT) + 8, len(OUT) + 14))
+    lost = replace(odometry(frames)[0], lost=True)
+    assert localiser.process(lost).state is MapState.LOST
+    again = odometry([frames[k] for k in there], POSES[there], resets=1, start=1000)
+    found = run(localiser, again)
+    assert found[0].state is MapState.ODOMETRY_ONLY and found[-1].state is MapState.LOCALIZED
+    error_m, error_rad = motion_errors(found[-1].T_map_odom @ again[-1].T_odom_rect,
+                                       se3.inverse(POSES[0]) @ POSES[there[-1]])
+    assert error_m < 0.25 and error_rad < 0.05  # the drift of the drive there
+
+
+def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    first = deepcopy(out)
+    kept = len(first.places)
+    second = MapLocaliser(cameras.model, PlaceLimits(), first.places)
+    back = slice(len(OUT) + 3, len(OUT) + 14)
+    drive = odometry(frames[back], POSES[back])
+    found = run(second, drive)
+    assert found[-1].state is MapState.LOCALIZED and len(second.places) > kept
+    error_m, _ = motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect,
+                               se3.inverse(POSES[0]) @ POSES[back][-1])
+    assert error_m < 0.25
+    assert {k.session for k in second.places.keyframes.values()} == {0, 1}
+
+
+def test_in_an_unknown_building_it_goes_on_as_odometry(cameras: RenderedCameras, out: MapLocaliser) -> None:
+    elsewhere = replace(cameras, scene=corridor(8))
+    drive = odometry([elsewhere.frame(300 + k, T) for k, T in enumerate(POSES[:8])])
+    found = run(MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places), drive)
+    assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY}
+    assert all(np.array_equal(pose.T_map_odom, np.eye(4)) for pose in found)
