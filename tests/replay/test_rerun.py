@@ -19,8 +19,8 @@ from tests.replay.recorded import recorded_run
 
 POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
-PUBLISHED = {"/omnid/odom", "/omnid/pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status", "/omnid/drive",
-             *IMAGES}
+PUBLISHED = {"/omnid/odom", "/omnid/pose", "/omnid/map_pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status",
+             "/omnid/drive", *IMAGES}
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
@@ -56,6 +56,12 @@ def of(messages: list[Message], topic: str) -> list[Message]:
     return [message for message in messages if message.topic == topic]
 
 
+def transforms(messages: list[Message], child: str) -> list[Message]:
+    """The messages of /tf with an edge to a frame: places publish theirs beside those of odometry."""
+    return [message for message in of(messages, "/tf")
+            if any(edge.child_frame_id == child for edge in message.content.transforms)]
+
+
 def test_a_recording_holds_all_messages_rig_and_settings(
     recording: Path, messages: list[Message], scene: Path
 ) -> None:
@@ -79,13 +85,16 @@ def test_log_times_are_the_stamps(messages: list[Message]) -> None:
     lower = {message.stamp_ns for message in of(messages, IMAGES[0])}
     poses = [message.stamp_ns for message in of(messages, "/omnid/odom")]
     assert set(poses) <= lower and len(poses) > POSES // 2
-    for topic in ("/omnid/pose", "/tf"):
-        assert [message.stamp_ns for message in of(messages, topic)] == poses
+    assert [message.stamp_ns for message in of(messages, "/omnid/pose")] == poses
+    assert [message.stamp_ns for message in transforms(messages, "base_link")] == poses
+    in_map = [message.stamp_ns for message in of(messages, "/omnid/map_pose")]
+    assert [message.stamp_ns for message in transforms(messages, "odom")] == in_map and set(in_map) <= set(poses)
 
 
 def test_all_messages_of_a_pose_agree(messages: list[Message]) -> None:
     """Odometry, PoseStamped and the transform hold the same pose."""
-    pose_messages = zip(*(of(messages, topic) for topic in ("/omnid/odom", "/omnid/pose", "/tf")), strict=True)
+    pose_messages = zip(of(messages, "/omnid/odom"), of(messages, "/omnid/pose"), transforms(messages, "base_link"),
+                        strict=True)
     for odom, pose, tf in (tuple(message.content for message in three) for three in pose_messages):
         assert odom.pose.pose == pose.pose
         edge = next(edge for edge in tf.transforms if edge.child_frame_id == "base_link")

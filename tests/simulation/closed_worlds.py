@@ -49,7 +49,7 @@ def two_laps_path(seed: int, pairs: int) -> Array:
     So all of the second lap has been seen before, half of it in the opposite direction.
     """
     rng = np.random.default_rng([seed, 32])
-    turning = round(180 / TURN_DEG) - 1
+    turning = min(round(180 / TURN_DEG) - 1, pairs // 2)
     driving = pairs - turning
     there, back = driving * 3 // 4, driving - driving * 3 // 4
     phases = rng.uniform(0, 2 * np.pi, 2)

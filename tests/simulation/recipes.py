@@ -116,6 +116,14 @@ def twin(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(mild_rig(seed, size), paths.spline_path(seed, pairs, 0.12, sway_m=0.15), twin_corridor(seed))
 
 
+def there_and_back(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a corridor and the way back in it, 0.15 m aside and in the opposite direction."""
+    x = 0.15 * np.arange(-(-pairs // 2))
+    xy = np.concatenate([np.column_stack([x, 0 * x]), np.column_stack([x[::-1], 0 * x + 0.15])])
+    poses = paths.planar_poses(xy, np.repeat([0.0, np.pi], len(x)))[:pairs]
+    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, 0.075 * pairs + 4))
+
+
 def brick_corridor(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return a corridor of identical bricks, there and back."""
     there = paths.spline_path(seed, max(2, pairs // 2 + 1), 0.1, sway_m=0.15)
@@ -132,8 +140,8 @@ RECIPES: dict[str, tuple[Recipe, int]] = {
     "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
     "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
     "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
-    "two_laps": (two_laps, 384), "twin": (twin, 72), "brick_corridor": (brick_corridor, 120),
-    "symmetric": (symmetric, 110),
+    "two_laps": (two_laps, 384), "there_and_back": (there_and_back, 60), "twin": (twin, 72),
+    "brick_corridor": (brick_corridor, 120), "symmetric": (symmetric, 110),
 }
 
 

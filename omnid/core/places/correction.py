@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
 KEYFRAMES_PER_LOOP: Final = 200  # a map of more keyframes waits for more loops until it is optimised again
-ACCEPTED: Final = 0.5  # least weight of a loop that stays
+ACCEPTED: Final = 0.5  # least weight of a loop that counts
+RECENT: Final = 8  # loops that tell the present drift; one that is refused may count later, while it is among them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +66,7 @@ class MapCorrection:
         result = optimise(np.array([self._places.poses[id] for id in part]), edges)
         self._places.move(dict(zip(part, result.poses, strict=True)))
         bad = {id(link) for link, weight in zip(links, result.weights.tolist(), strict=True) if weight < ACCEPTED}
+        bad -= {id(link) for link in _recent_loops(links)}
         self._places.links = [link for link in self._places.links if id(link) not in bad]
         self.rejected += len(bad)
         newest = self._places.keyframes[part[-1]]
@@ -94,5 +96,13 @@ class MapCorrection:
         by_loop = np.array([link.T_a_b for link, _, _ in pairs])
         by_odometry = relative_covariance(T_a_b, np.array([a.covariance for _, a, _ in pairs]),
                                           np.array([b.covariance for _, _, b in pairs]))
-        return drift_factor(se3.log(se3.inverse(by_loop) @ T_a_b), by_odometry + LEAST_ODOMETRY,
-                            np.array([link.covariance for link, _, _ in pairs]))
+        errors, spread = se3.log(se3.inverse(by_loop) @ T_a_b), np.array([link.covariance for link, _, _ in pairs])
+        by_odometry = by_odometry + LEAST_ODOMETRY
+        # The drift of the whole path, or of its newest part where that is larger: a rig may have been bent meanwhile.
+        return max(drift_factor(errors[-count:], by_odometry[-count:], spread[-count:])
+                   for count in (len(pairs), RECENT))
+
+
+def _recent_loops(links: list[Link]) -> list[Link]:
+    """Return the newest loops."""
+    return [link for link in links if link.is_loop][-RECENT:]

@@ -11,7 +11,8 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
-MEDIAN: Final = 5.348  # of the chi-squared distribution of six dimensions
+QUANTILE: Final = 0.75  # of the squared distances that the factor explains: the others may be wrong loops
+EXPECTED: Final = 7.841  # that quantile of the chi-squared distribution of six dimensions
 LARGEST: Final = 1e6  # factor on the covariance: a thousand times the standard deviation
 ROUNDS: Final = 40  # of the bisection
 
@@ -31,18 +32,18 @@ def drift_factor(errors: Array, by_odometry: Array, by_loop: Array) -> float:
     """Return the factor >= 1 on odometry's covariance that explains the errors (N, 6) of loops.
 
     errors: log of T_a_b by odometry in that by the loop; by_odometry, by_loop (N, 6, 6) their covariances. The factor
-    is the one at which the median of the squared Mahalanobis distances is that of the distribution: noise of the
-    images is in odometry's covariance, an error of the rig is not.
+    is the one at which a quantile of the squared Mahalanobis distances is that of the distribution: noise of the images
+    is in odometry's covariance, an error of the rig is not.
     """
 
-    def median(factor: float) -> float:
+    def squared(factor: float) -> float:
         S = factor * by_odometry + by_loop
-        return float(np.median((errors * np.linalg.solve(S, errors[:, :, None])[:, :, 0]).sum(axis=1)))
+        return float(np.quantile((errors * np.linalg.solve(S, errors[:, :, None])[:, :, 0]).sum(axis=1), QUANTILE))
 
-    if not len(errors) or median(1.0) <= MEDIAN:
+    if not len(errors) or squared(1.0) <= EXPECTED:
         return 1.0
     low, high = 0.0, float(np.log(LARGEST))
     for _ in range(ROUNDS):
         middle = (low + high) / 2
-        low, high = (middle, high) if median(float(np.exp(middle))) > MEDIAN else (low, middle)
+        low, high = (middle, high) if squared(float(np.exp(middle))) > EXPECTED else (low, middle)
     return float(np.exp(high))

@@ -36,6 +36,7 @@ TOPICS = {
     "/omnid/cloud": "sensor_msgs/msg/PointCloud2", "/omnid/drive": "geometry_msgs/msg/TwistStamped",
     "/omnid/map": "nav_msgs/msg/OccupancyGrid",
     "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
+    "/omnid/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage", "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",

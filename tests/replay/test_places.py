@@ -1,0 +1,72 @@
+"""A drive there and back with a rig that is slightly wrong: the trajectory in the map is better, and published."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from calib import se3
+from calib.rig_file import read_rig, write_rig
+from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import evaluate
+from omnid.transport.decode import decode_diagnostics
+from omnid.transport.status_names import PLACES
+from tests.drivers.logs.mcap_logs import STORE
+from tests.replay.command import Command
+from tests.simulation import build, write_log
+from tests.simulation.rigs import with_upper_rotated
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with log.mcap, truth.txt and a rig whose upper camera is rotated by 0.3 degrees."""
+    folder = tmp_path_factory.mktemp("drive")
+    run = build("there_and_back", seed=3, size=256)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    write_rig(folder / "wrong.toml", with_upper_rotated(read_rig(folder / "rig.toml"), (0.2, -0.2, 0.1)))
+    return folder
+
+
+def test_the_trajectory_in_the_map_is_better_and_the_same_threaded_and_inline(
+    omnid: Command, tmp_path: Path, drive: Path
+) -> None:
+    for name, more in (("a", ["--record", tmp_path / "out.mcap"]), ("b", ["--inline"])):
+        files = ("--tum", tmp_path / f"{name}.odom", "--map-tum", tmp_path / name, *more)
+        result = omnid.replay(drive / "log.mcap", *files, "--set", "stereo.rig_check=off", rig=drive / "wrong.toml")
+        assert result.code == 0 and result.count("loops") >= 3
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    odom, in_map, truth = (read_tum(path) for path in (tmp_path / "a.odom", tmp_path / "a", drive / "truth.txt"))
+    assert np.array_equal(odom.stamps_ns, in_map.stamps_ns)
+    by_odometry, by_map = evaluate(odom, truth), evaluate(in_map, truth)
+    assert by_odometry.end_error_m > 0.01 and by_map.end_error_m < 0.6 * by_odometry.end_error_m
+    _assert_published(tmp_path / "out.mcap", in_map.T, odom.T)
+
+
+def _assert_published(log: Path, T_map_rig: np.ndarray, T_odom_rig: np.ndarray) -> None:
+    """Check map -> odom, the pose in the map and its state in a recording; the base is the rig."""
+    with log.open("rb") as file:
+        reader = make_reader(file)
+        found: dict[str, list] = {"/tf": [], "/omnid/map_pose": [], "/omnid/status": []}
+        for schema, channel, message in reader.iter_messages(list(found)):
+            found[channel.topic].append(STORE.deserialize_cdr(message.data, schema.name)
+                                        if channel.topic != "/omnid/status" else decode_diagnostics(message.data))
+    edges = [edge for message in found["/tf"] for edge in message.transforms if edge.header.frame_id == "map"]
+    assert {edge.child_frame_id for edge in edges} == {"odom"} and len(edges) == len(T_map_rig)
+    for edge, T in zip(edges, T_map_rig @ se3.inverse(T_odom_rig), strict=True):
+        t = edge.transform.translation
+        np.testing.assert_allclose((t.x, t.y, t.z), T[:3, 3], atol=1e-6)
+    last = found["/omnid/map_pose"][-1]
+    assert last.header.frame_id == "map" and last.pose.covariance[0] > 0
+    assert last.pose.pose.position.x == pytest.approx(T_map_rig[-1, 0, 3], abs=1e-6)
+    states = [status.values["state"] for statuses in found["/omnid/status"] for status in statuses.statuses
+              if status.name == PLACES]
+    assert states == ["odometry only", "localized"]
+
+
+def test_without_places_there_is_no_trajectory_in_the_map(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--map-tum",
+                          tmp_path / "map.txt", "--set", "places.enabled=false")
+    assert "places.enabled" in error
