@@ -67,7 +67,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.commands":
         "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "
         "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
-        "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.rig "
+        "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.places omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
         "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
         "omnid.viewer omnid.web",
@@ -84,7 +84,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places":
-        "calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings omnid.tracking_state",
+        "calib.panorama calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings "
+        "omnid.tracking_state",
     "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":
@@ -96,7 +97,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.engine": "drivers.frame omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
-    "omnid.formats": "calib.se3 omnid.core.mapping omnid.errors",
+    "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.places omnid.errors",
     "omnid.messages": "omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
+from omnid.formats.whole_file import write_whole
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("confidence", "<f4"), ("frames", "<i4"), ("age", "<i4")])
 _HEADER = """ply
@@ -35,7 +35,7 @@ def write_ply(path: str | Path, points: MapPoints) -> None:
     vertices = np.empty(len(points.xyz), dtype=_VERTEX)
     for name in ("xyz", "confidence", "frames", "age"):
         vertices[name] = getattr(points, name)
-    _write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
+    write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
 
 
 def read_ply(path: str | Path) -> MapPoints:
@@ -54,19 +54,3 @@ def read_ply(path: str | Path) -> MapPoints:
         )
     vertices = np.frombuffer(body, dtype=_VERTEX)
     return MapPoints(*(np.ascontiguousarray(vertices[name]) for name in ("xyz", "confidence", "frames", "age")))
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    try:
-        # On the same file system, so that the rename is atomic.
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            with partial.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())  # a robot may be switched off at any time
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error

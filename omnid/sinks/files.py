@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
 from omnid.formats.ply import write_ply
@@ -20,6 +21,7 @@ from omnid.formats.tum import tum_row
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
+REPLACED: Final = ("--map", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
@@ -68,7 +70,7 @@ def _require_file(option: str, path: Path) -> None:
         raise OmnidError(f"{option} {path}: expected a file to write, found a folder")
     if not path.parent.is_dir():
         raise OmnidError(f"{option} {path}: there is no folder {path.parent}; make it first")
-    if option in ("--map", "--plan") and path.exists() and not path.is_file():
+    if option in REPLACED and path.exists() and not path.is_file():
         raise OmnidError(f"{option} {path}: expected a file that can be replaced, found a device or a pipe")
 
 
@@ -166,8 +168,13 @@ class PlanFile:
 
     def process(self, update: MapUpdate) -> None:
         """Write the image."""
-        image = cv2.imencode(".png", plan_view(update.points, update.path_xy))[1]
-        try:
-            self._path.write_bytes(image.tobytes())
-        except OSError as error:
-            raise OmnidError(f"{self._path}: cannot be written: {error.strerror or error}") from error
+        write_plan(self._path, update.points, update.path_xy)
+
+
+def write_plan(path: Path, points: MapPoints, path_xy: NDArray[np.float64]) -> None:
+    """Write the plan view of points with a path (N, 2) [m] as PNG. Raises OmnidError."""
+    image = cv2.imencode(".png", plan_view(points, path_xy))[1]
+    try:
+        path.write_bytes(image.tobytes())
+    except OSError as error:
+        raise OmnidError(f"{path}: cannot be written: {error.strerror or error}") from error

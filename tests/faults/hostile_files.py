@@ -29,6 +29,7 @@ from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_recovery import recover
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
+from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from omnid.settings_dump import dump
 from omnid.transport import codec
@@ -38,6 +39,7 @@ from omnid.transport.pose_attachment import PoseAttachment
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
 from tests.faults.mutation import mutated
+from tests.omnid.formats.place_maps import RIG, some_places
 from tests.simulation import build, write_log
 
 ROOT: Final = Path(__file__).parents[2]
@@ -86,6 +88,12 @@ def messages() -> Mapping[str, bytes]:
             "status": codec.diagnostics_cdr(10**18, [status] * 5)}
 
 
+def map_bytes(folder: Path) -> bytes:
+    """Return a map of places."""
+    write_places(folder / "good.omap", some_places(4, features=8), RIG)
+    return (folder / "good.omap").read_bytes()
+
+
 def camera_text(folder: Path) -> bytes:
     """Return a camera.toml."""
     mounted = read_rig(folder / "rig.toml").lower
@@ -99,6 +107,7 @@ FORMATS: Final = {
                             lambda path: parse_kalibr(path.read_bytes())),
     "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
+    "place.omap": Format(map_bytes, read_places),
     "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),
     "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_log),
     "log.db3": Format(lambda folder: write_db3(folder / "bag", pairs(4)).read_bytes(), read_frames),

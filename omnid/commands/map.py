@@ -1,0 +1,119 @@
+"""`omnid map`: show and export maps of places."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.json_output import add_json, print_json
+
+if TYPE_CHECKING:
+    from omnid.core.places.place_rig import PlaceRig
+    from omnid.core.places.place_views import PlaceSummary
+
+CELL_M = 0.05
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `map` to the command line."""
+    parser = subparsers.add_parser("map", help="show and export maps of places (.omap)")
+    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
+    info = actions.add_parser("info", help="keyframes, sessions, loops, size, and the rig that made the map")
+    info.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap")
+    add_json(info)
+    info.set_defaults(run=run_info)
+    _add_export(actions)
+
+
+def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    export = actions.add_parser("export", help="write a map for other programs")
+    export.add_argument("map", type=Path, metavar="FILE.omap")
+    export.add_argument("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age")
+    export.add_argument("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths")
+    export.add_argument("--grid", type=Path, metavar="FILE.yaml", help="occupancy grid for nav2 and map_server; the "
+                        "image beside it is FILE.pgm")
+    export.add_argument("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m")
+    export.set_defaults(run=run_export)
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Print the content of each map; return 2 if one is none."""
+    from omnid.core.places.place_views import summary
+    from omnid.errors import OmnidError
+    from omnid.formats.place_file import read_places
+
+    code, found = 0, []
+    for number, path in enumerate(args.maps):
+        try:
+            places, rig = read_places(path)
+        except OmnidError as error:
+            print(f"omnid: {error}", file=sys.stderr)
+            code = 2
+            continue
+        sizes = summary(places, rig)
+        found.append({"path": path, "size_bytes": path.stat().st_size, "rig_hash": rig.rig_hash, **_plain(sizes)})
+        if not args.json:
+            print(*[""] * bool(number), *_described(path, sizes, rig), sep="\n")
+    if args.json:
+        print_json(found)
+    return code
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Write the files that are asked for."""
+    from omnid.core.places import place_views
+    from omnid.errors import OmnidError
+    from omnid.formats.grid_map import write_grid
+    from omnid.formats.place_file import read_places
+    from omnid.formats.ply import write_ply
+    from omnid.sinks.files import check_outputs, write_plan
+
+    named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
+    outputs = [(option, path) for option, path in named if path is not None]
+    if not outputs:
+        raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
+    if not 0.005 <= args.cell <= 10:
+        raise OmnidError(f"--cell {args.cell:g}: expected an edge of 0.005 to 10 m")
+    images = [("--grid's image", args.grid.with_suffix(".pgm"))] if args.grid else []
+    check_outputs([*outputs, *images], [("the map that is read", args.map)])
+    places, rig = read_places(args.map)
+    if args.grid:
+        write_grid(args.grid, place_views.grid(places, rig, args.cell))
+    if args.ply or args.plan:
+        points = place_views.landmarks(places, rig)
+        if args.ply:
+            write_ply(args.ply, points)
+        if args.plan:
+            write_plan(args.plan, points, place_views.base_poses(places, rig)[:, :2, 3])
+    return 0
+
+
+def _plain(sizes: PlaceSummary) -> dict[str, object]:
+    from dataclasses import asdict
+
+    return asdict(sizes)
+
+
+def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
+    per_keyframe = path.stat().st_size / max(1, sizes.keyframes)
+    yield f"map          {path}"
+    yield f"size         {path.stat().st_size / 1e6:.1f} MB, {per_keyframe / 1e3:.0f} kB a keyframe"
+    yield f"time         {_utc(sizes.first_stamp_ns)} to {_utc(sizes.last_stamp_ns)}"
+    yield f"sessions     {sizes.sessions}"
+    yield f"keyframes    {sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped"
+    yield f"loops        {sizes.loops}"
+    yield f"path         {sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m"
+    if sizes.parts > 1:
+        yield f"parts        {sizes.parts}, between which no pose is known"
+    yield (f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
+           f"{rig.cylinder.width} x {rig.cylinder.height} px")
+
+
+def _utc(stamp_ns: int) -> str:
+    """Return the time of day, or the seconds if the stamp is not a plausible Unix time."""
+    seconds = stamp_ns // 10**9
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%SZ}" if 0 < seconds < 2**33 else f"{seconds} s"

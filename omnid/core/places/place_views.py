@@ -1,0 +1,91 @@
+"""Views of a map of places: its landmarks, its grid and its paths, in the axes of the robot's base at the start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.mapping.occupancy_grid import Grid
+from omnid.core.mapping.scan_grid import scan_grid
+from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
+from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_rig import PlaceRig
+from omnid.core.stereo.triangulation import triangulate
+
+Array = NDArray[np.float64]
+
+SIGMA_PX: Final = 0.3  # standard deviation of a disparity
+MAX_SIGMA_M: Final = 0.3  # largest standard deviation of a landmark that is shown
+VOXEL_M: Final = 0.05  # in which landmarks of several keyframes are fused
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceSummary:
+    """Sizes of a map of places."""
+
+    keyframes: int
+    sessions: int
+    features: int
+    loops: int
+    dropped: int  # keyframes that were dropped because the map was full
+    parts: int  # of keyframes that no link joins; 1: all is one map
+    path_m: float  # length of the links of odometry
+    extent_m: tuple[float, float]  # along x and y
+    first_stamp_ns: int
+    last_stamp_ns: int
+
+
+def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
+    """Return the sizes of a map."""
+    keyframes = [places.keyframes[id] for id in sorted(places.keyframes)]
+    xy = base_poses(places, rig)[:, :2, 3]
+    extent = np.ptp(xy, axis=0) if len(xy) else np.zeros(2)
+    stamps = [keyframe.stamp_ns for keyframe in keyframes] or [0]
+    return PlaceSummary(
+        len(keyframes), len({keyframe.session for keyframe in keyframes}),
+        sum(len(keyframe.features.views) for keyframe in keyframes), places.loops, places.dropped, len(parts(places)),
+        float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
+        (float(extent[0]), float(extent[1])), min(stamps), max(stamps))
+
+
+def parts(places: PlaceMap) -> list[list[int]]:
+    """Return the ids of the keyframes that links join, part by part, the largest first."""
+    part_of = {id: {id} for id in sorted(places.keyframes)}
+    for link in places.links:
+        a, b = part_of[link.a], part_of[link.b]
+        if a is not b:
+            small, large = sorted((a, b), key=len)
+            large |= small
+            part_of.update(dict.fromkeys(small, large))
+    different = {id(part): sorted(part) for part in part_of.values()}
+    return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
+
+
+def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
+    """Return the poses (K, 4, 4) of the base at the keyframes, in the base's axes at the start of the map."""
+    T = np.array([places.poses[id] for id in sorted(places.keyframes)]).reshape(-1, 4, 4)
+    return np.asarray(rig.T_base_rect @ T @ se3.inverse(rig.T_base_rect))
+
+
+def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
+    """Return the occupancy grid of the keyframes' range scans, the newest evidence last."""
+    ids = sorted(places.keyframes, key=lambda id: (places.keyframes[id].session, places.keyframes[id].stamp_ns, id))
+    poses = np.array([rig.T_base_rect @ places.poses[id] for id in ids]).reshape(-1, 4, 4)
+    return scan_grid([places.keyframes[id].scan.astype(np.float32) for id in ids], poses, cell_m)
+
+
+def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
+    """Return the landmarks of all keyframes, fused in voxels."""
+    count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
+    fused = VoxelMap(VOXEL_M, 1 << max(4, (2 * count).bit_length()))
+    for id in sorted(places.keyframes):
+        points = triangulate(places.keyframes[id].features.views.astype(float), rig.cylinder, rig.baseline_m)
+        radius = np.hypot(points[:, 0], points[:, 1])
+        sigma_m = SIGMA_PX * radius**2 / (rig.cylinder.focal_px * rig.baseline_m)
+        sure = sigma_m < MAX_SIGMA_M
+        fused.insert(se3.apply(rig.T_base_rect @ places.poses[id], points[sure]), sigma_m[sure] ** 2, id)
+    return fused.points(min_frames=1)

@@ -1,0 +1,46 @@
+"""Occupancy grids in the format of ROS's map_server and nav2: a PGM image and a YAML file that describes it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid
+from omnid.errors import OmnidError
+from omnid.formats.whole_file import write_whole
+
+_WHITE, _BLACK, _GREY = 254, 0, 205  # free, occupied and unknown, as map_saver writes them
+# With nav2's default of 0.25, grey (255 - 205) / 255 = 0.196 would count as free.
+_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*\.pgm")
+_YAML = """image: {image}
+mode: trinary
+resolution: {cell_m:.6g}
+origin: [{x:.6f}, {y:.6f}, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+
+
+def write_grid(path: Path, grid: Grid) -> None:
+    """Write `path`, which ends in .yaml, and the image beside it, whose name ends in .pgm.
+
+    Raises OmnidError if they cannot be written.
+    """
+    if path.suffix not in (".yaml", ".yml"):
+        raise OmnidError(f"{path}: expected a name that ends in .yaml; the image gets the same name with .pgm")
+    image = np.full(grid.cells.shape, _GREY, np.uint8)
+    image[grid.cells == FREE] = _WHITE
+    image[grid.cells == OCCUPIED] = _BLACK
+    height, width = grid.cells.shape
+    pixels = path.with_suffix(".pgm")
+    write_whole(pixels, b"P5\n%d %d\n255\n" % (width, height) + image[::-1].tobytes())  # the first row is the highest y
+    x, y = grid.corner
+    write_whole(path, _YAML.format(image=_quoted(pixels.name), cell_m=grid.cell_m, x=x, y=y).encode())
+
+
+def _quoted(name: str) -> str:
+    """Return a name as a YAML string."""
+    return name if _PLAIN.fullmatch(name) else "'" + name.replace("'", "''") + "'"

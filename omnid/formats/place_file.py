@@ -1,0 +1,194 @@
+"""Map files (.omap): a map of places as an SQLite database; the format is described in OMAP.md.
+
+A map is written to a temporary file beside it, synced and renamed, so that a program that is killed leaves the old map
+whole. What is read is checked: the schema by its text, each row by its checksum, each value by its range.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from glob import escape
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_rig import PlaceRig
+from omnid.errors import OmnidError
+from omnid.formats import place_rows
+from omnid.formats.place_rows import BadRowError
+
+VERSION: Final = 1
+APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
+MAGIC: Final = b"SQLite format 3\0"
+MAX_FILE_BYTES: Final = 1 << 30
+MAX_VALUE_BYTES: Final = 1 << 20  # of one value in the database
+MAX_KEYFRAMES: Final = 100_000
+MAX_LINKS: Final = 1_000_000
+MAX_STEPS: Final = 50  # blocks of a million instructions that SQLite may take to read a map
+SCHEMA: Final = {
+    "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, T_map_rect BLOB, "
+                "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
+                "crc32 INTEGER)",
+    "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
+    "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, width INTEGER, height INTEGER, "
+           "row0 REAL, baseline_m REAL, T_rig_rect BLOB, T_base_rig BLOB, rig_hash TEXT, crc32 INTEGER)",
+}
+
+
+def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
+    """Write a map; the file is replaced at once, never written in part. Raises OmnidError if that is impossible."""
+    path = Path(path)
+    try:
+        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            _remove_abandoned(path)
+            _write(partial, places, rig)
+            _sync(partial)
+            os.replace(partial, path)
+            _sync(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+    except (OSError, ValueError, sqlite3.Error) as error:
+        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
+
+
+def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:
+    """Return the map of a file and the rig by which it was made.
+
+    into: an empty map that is filled, whose bounds hold as soon as a keyframe is added to it.
+    Raises OmnidError, in one line, for any file that is no whole map.
+    """
+    path = Path(path)
+    _require_map(path)
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+            return _read(_Reader(database), PlaceMap() if into is None else into)
+    except BadRowError as error:
+        raise OmnidError(f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
+                         ) from error
+    except (sqlite3.Error, OverflowError, MemoryError, UnicodeDecodeError) as error:
+        raise OmnidError(f"{path}: the map is damaged: {' '.join(str(error).split())}; take a copy, or build it again "
+                         "with `omnid map build`") from error
+
+
+def _require_map(path: Path) -> None:
+    """Check the header: that of an SQLite database, ours, of this version."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            header = file.read(100)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise OmnidError(f"{path}: cannot read the map: {getattr(error, 'strerror', None) or error}") from error
+    if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
+        raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
+    version = int.from_bytes(header[60:64])
+    if version != VERSION:
+        raise OmnidError(f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
+                         "`omnid map build`, or update omnid")
+    if size > MAX_FILE_BYTES:
+        raise OmnidError(f"{path}: expected a map of at most {MAX_FILE_BYTES >> 20} MB, found {size >> 20} MB")
+
+
+def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
+    """Write the database; the same map gives the same bytes."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
+        # Not synced here, and without a journal: the file has another name until it is whole.
+        for setting in ("journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}",
+                        f"user_version = {VERSION}"):
+            database.execute(f"PRAGMA {setting}")
+        database.execute("BEGIN")
+        for text in SCHEMA.values():
+            database.execute(text)
+        ids = sorted(places.keyframes)
+        keyframes = (place_rows.keyframe_row(places.keyframes[id], places.poses[id]) for id in ids)
+        _insert(database, "keyframe", keyframes)
+        _insert(database, "link", (place_rows.link_row(link) for link in places.links))
+        _insert(database, "map", [place_rows.map_row(rig, len(ids), len(places.links), places.dropped)])
+        database.execute("COMMIT")
+
+
+def _insert(database: sqlite3.Connection, table: str, rows: Iterable[place_rows.Row]) -> None:
+    """Insert rows, each with its checksum as the last value."""
+    marks = ", ".join("?" * (SCHEMA[table].count(",") + 1))
+    database.executemany(f"INSERT INTO {table} VALUES ({marks})", ((*row, place_rows.checksum(row)) for row in rows))
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove temporary files of writers of this map that were killed."""
+    for part in path.parent.glob(f".{escape(path.name)}.*.part"):
+        process = part.name.split(".")[-2]
+        if process.isdecimal() and not Path("/proc", process).exists():
+            part.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+class _Reader:
+    """Rows of a database that may be hostile: bounded work, no code of the file, checked sums."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database, self._steps = database, 0
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
+        database.set_progress_handler(self._too_long, 1_000_000)
+        for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
+            database.execute(f"PRAGMA {setting}")
+        found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(SCHEMA) + 1))
+        if found != SCHEMA:
+            raise BadRowError("its tables are not those of a map")
+
+    def rows(self, table: str, most: int) -> Iterator[place_rows.Row]:
+        """Yield the rows of a table without their checksums, at most so many."""
+        for number, row in enumerate(self._database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
+            if number >= most:
+                raise BadRowError(f"more than {most} rows of {table}")
+            if place_rows.checksum(row[:-1]) != row[-1]:
+                raise BadRowError(f"the checksum of row {number + 1} of {table} is wrong")
+            yield row[:-1]
+
+    def _too_long(self) -> bool:
+        """True ends the query."""
+        self._steps += 1
+        return self._steps > MAX_STEPS
+
+
+def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
+    heads = list(reader.rows("map", 1))
+    if not heads:
+        raise BadRowError("the table map is empty")
+    head = place_rows.read_map_row(heads[0])
+    keyframes = [place_rows.read_keyframe_row(row, head.rig) for row in reader.rows("keyframe", MAX_KEYFRAMES)]
+    links = [place_rows.read_link_row(row) for row in reader.rows("link", MAX_LINKS)]
+    for name, found, expected in (("keyframes", len(keyframes), head.keyframes), ("links", len(links), head.links)):
+        if found != expected:
+            raise BadRowError(f"expected {expected} {name}, found {found}")
+    _check(keyframes, links)
+    for keyframe, T_map_rect in keyframes:
+        places.keyframes[keyframe.id], places.poses[keyframe.id] = keyframe, T_map_rect
+    places.links, places.dropped = links, head.dropped
+    return places, head.rig
+
+
+def _check(keyframes: list[tuple[PlaceKeyframe, NDArray[np.float64]]], links: list[Link]) -> None:
+    """Check poses and covariances, all at once, and that links join keyframes."""
+    ids = {keyframe.id for keyframe, _ in keyframes}
+    if any(link.a not in ids or link.b not in ids or link.a == link.b for link in links):
+        raise BadRowError("a link joins no two keyframes")
+    of_keyframes: list[Any] = [keyframe for keyframe, _ in keyframes]
+    place_rows.require_rigid([T for _, T in keyframes] + [k.T_odom_rect for k in of_keyframes]
+                             + [link.T_a_b for link in links])
+    place_rows.require_covariances([keyframe.covariance for keyframe in of_keyframes], 0.0)
+    place_rows.require_covariances([link.covariance for link in links], place_rows.LEAST_VARIANCE)

@@ -1,0 +1,67 @@
+"""`omnid map info|export`: what is printed and written, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from omnid.cli import main
+from omnid.formats.place_file import write_places
+from omnid.formats.ply import read_ply
+from tests.omnid.formats.place_maps import RIG, some_places
+
+
+@pytest.fixture
+def omap(tmp_path: Path) -> Path:
+    """Write a map of 12 keyframes."""
+    write_places(tmp_path / "a.omap", some_places(12, features=20), RIG)
+    return tmp_path / "a.omap"
+
+
+def test_info_tells_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "info", str(omap)]) == 0
+    printed = capsys.readouterr().out
+    for text in ("sessions     2", "keyframes    12, with 240 features; 3 were dropped", "loops        1",
+                 "path         3.3 m", "rig          0123abcd0123, baseline 0.2400 m, panoramas of 1304 x 378 px"):
+        assert text in printed
+
+
+def test_info_as_json_and_of_a_file_that_is_no_map(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (omap.parent / "b.omap").write_bytes(b"no map")
+    assert main(["map", "info", "--json", str(omap), str(omap.parent / "b.omap")]) == 2
+    printed = capsys.readouterr()
+    [found] = json.loads(printed.out)
+    assert (found["keyframes"], found["sessions"], found["loops"], found["parts"]) == (12, 2, 1, 1)
+    assert printed.err.count("\n") == 1 and "expected a map of places" in printed.err
+
+
+def test_export_writes_what_is_asked_for(omap: Path) -> None:
+    out = omap.parent
+    assert main(["map", "export", str(omap), "--ply", str(out / "a.ply"), "--plan", str(out / "a.png"), "--grid",
+                 str(out / "a.yaml"), "--cell", "0.1"]) == 0
+    assert len(read_ply(out / "a.ply").xyz) > 50
+    assert cv2.imread(str(out / "a.png")) is not None
+    assert "resolution: 0.1\n" in (out / "a.yaml").read_text() and (out / "a.pgm").read_bytes().startswith(b"P5\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "nothing to write"),
+        (["--grid", "{}/a.png"], "expected a name that ends in .yaml"),
+        (["--ply", "{}/a.omap"], "this is the map that is read as well"),
+        (["--ply", "{}/none/a.ply"], "there is no folder"),
+        (["--ply", "{}/a.ply", "--cell", "0"], "expected an edge of 0.005 to 10 m"),
+    ],
+)
+def test_mistakes_are_one_line(
+    omap: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = omap.read_bytes()
+    assert main(["map", "export", str(omap), *(option.format(omap.parent) for option in options)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert omap.read_bytes() == before

@@ -1,0 +1,211 @@
+"""Map files: round trip, size, the same bytes, atomic writing, damaged, foreign and hostile files."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_rig import seen_by
+from omnid.errors import OmnidError
+from omnid.formats.place_file import APPLICATION_ID, read_places, write_places
+from omnid.formats.ply import write_ply
+from tests.faults.mutation import mutated
+from tests.omnid.formats.place_maps import RIG, some_places
+from tests.omnid.formats.test_ply import some_points
+
+
+def same(a: object, b: object) -> bool:
+    """True if two values, dataclasses or arrays are equal to the last bit."""
+    if dataclasses.is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    return a == b
+
+
+@pytest.mark.parametrize("count", [0, 1, 25])
+def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
+    places = some_places(count)
+    write_places(tmp_path / "a.omap", places, RIG)
+    read, rig = read_places(tmp_path / "a.omap")
+    assert same(rig, RIG) and read.dropped == places.dropped
+    assert list(read.keyframes) == list(places.keyframes)
+    assert all(same(read.keyframes[id], places.keyframes[id]) for id in places.keyframes)
+    assert all(same(read.poses[id], places.poses[id]) for id in places.keyframes)
+    assert len(read.links) == len(places.links)
+    assert all(same(a, b) for a, b in zip(read.links, places.links, strict=True))
+
+
+def test_a_keyframe_takes_less_than_50_kb_and_the_same_map_has_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_places(tmp_path / f"{name}.omap", some_places(40), RIG)
+    content = (tmp_path / "a.omap").read_bytes()
+    assert len(content) < 40 * 50_000
+    assert content == (tmp_path / "b.omap").read_bytes()
+
+
+def test_the_bounds_of_the_map_that_is_filled_hold(tmp_path: Path) -> None:
+    write_places(tmp_path / "a.omap", some_places(10), RIG)
+    places, _ = read_places(tmp_path / "a.omap", PlaceMap(max_keyframes=5))
+    assert len(places) == 10
+    places.add(dataclasses.replace(places.keyframes[0], id=10), np.eye(4))
+    assert len(places) == 5
+
+
+def test_any_mutation_of_a_map_is_a_map_or_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.omap"
+    write_places(path, some_places(4, features=8), RIG)
+    good, refused = path.read_bytes(), 0
+    for number in range(400):
+        path.write_bytes(mutated(random.Random(f"omap {number}"), good))
+        try:
+            read_places(path)
+        except OmnidError as error:
+            refused += 1
+            assert "\n" not in str(error) and str(error).startswith(str(path))
+    assert refused > 200
+
+
+@pytest.mark.parametrize("size", [0, 15, 99, 100, 4096, -1])
+def test_a_cut_map_is_refused(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "a.omap"
+    write_places(path, some_places(4), RIG)
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(OmnidError, match=r"a\.omap: "):
+        read_places(path)
+
+
+def test_foreign_files_are_refused(tmp_path: Path) -> None:
+    write_ply(tmp_path / "map.ply", some_points(1000))
+    other = sqlite3.connect(tmp_path / "other.db")
+    other.execute("CREATE TABLE keyframe (id INTEGER)")
+    other.close()
+    for path in (tmp_path / "map.ply", tmp_path / "other.db"):
+        with pytest.raises(OmnidError, match="expected a map of places"):
+            read_places(path)
+    for path in (tmp_path / "missing.omap", tmp_path, tmp_path / "a\0b"):
+        with pytest.raises(OmnidError, match="cannot read the map"):
+            read_places(path)
+
+
+def changed(path: Path, *statements: str) -> Path:
+    """Change a map by SQL."""
+    database = sqlite3.connect(path)
+    for statement in statements:
+        database.execute(statement)
+    database.commit()
+    database.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("PRAGMA user_version = 2", "version 2, expected 1"),
+        ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
+        ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
+        ("DELETE FROM keyframe WHERE id = 3", "expected 4 keyframes, found 3"),
+        ("DELETE FROM link WHERE rowid = 1", "expected 4 links, found 3"),
+        ("DELETE FROM map", "the table map is empty"),
+        ("CREATE TRIGGER t AFTER INSERT ON link BEGIN DELETE FROM link; END", "tables are not those"),
+        ("CREATE TABLE other (a)", "tables are not those"),
+    ],
+)
+def test_a_map_that_was_changed_is_refused(tmp_path: Path, statement: str, message: str) -> None:
+    write_places(tmp_path / "a.omap", some_places(4), RIG)
+    with pytest.raises(OmnidError, match=message):
+        read_places(changed(tmp_path / "a.omap", statement))
+
+
+def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
+    path = tmp_path / "a.omap"
+    endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x FROM n"
+    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 1",
+            *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map")))
+    with pytest.raises(OmnidError, match="tables are not those"):
+        read_places(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"T_odom_rect": np.full((4, 4), np.nan)}, "a pose is not finite"),
+        ({"T_odom_rect": np.diag([2.0, 0.5, 1, 1])}, "a pose is no rotation"),
+        ({"T_odom_rect": np.diag([-1.0, 1, 1, 1])}, "a pose is no rotation"),
+        ({"covariance": -np.eye(6)}, "a covariance is not positive"),
+        ({"covariance": np.triu(np.ones((6, 6)))}, "a covariance is not symmetric"),
+        ({"covariance": np.full((6, 6), np.inf)}, "a covariance is not finite"),
+        ({"scan": np.full(360, 1000, np.float16)}, "a range of keyframe"),
+        ({"thumbnail": np.zeros((16, 64), np.int8)}, "an array has another size"),
+        ({"session": -1}, "outside its range"),
+    ],
+)
+def test_values_outside_their_range_are_refused_in_spite_of_a_right_checksum(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    places = some_places(3)
+    places.keyframes[1] = dataclasses.replace(places.keyframes[1], **change)
+    write_places(tmp_path / "a.omap", places, RIG)
+    with pytest.raises(OmnidError, match=message):
+        read_places(tmp_path / "a.omap")
+
+
+def test_links_to_nowhere_and_links_without_uncertainty_are_refused(tmp_path: Path) -> None:
+    for change, message in (({"b": 99}, "joins no two keyframes"), ({"a": 2}, "joins no two keyframes"),
+                            ({"covariance": np.zeros((6, 6))}, "not positive")):
+        places = some_places(3)
+        places.links[1] = dataclasses.replace(places.links[1], **change)
+        write_places(tmp_path / "a.omap", places, RIG)
+        with pytest.raises(OmnidError, match=message):
+            read_places(tmp_path / "a.omap")
+
+
+def test_a_map_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(OmnidError, match=r"cannot write the map: .*: choose another file$"):
+        write_places(tmp_path / "no folder" / "a.omap", some_places(1), RIG)
+
+
+def test_a_program_that_is_killed_while_it_writes_leaves_the_old_map(tmp_path: Path) -> None:
+    path, old = tmp_path / "a.omap", some_places(3)
+    write_places(path, old, RIG)
+    before = path.read_bytes()
+    code = ("import sys; from tests.omnid.formats.place_maps import *; from omnid.formats.place_file import *\n"
+            "places = some_places(60); print('ready', flush=True)\nwhile True: write_places(sys.argv[1], places, RIG)")
+    rng = random.Random(1)
+    for _ in range(3):
+        with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE,
+                              cwd=Path(__file__).parents[3]) as writer:
+            assert writer.stdout is not None and writer.stdout.readline()
+            time.sleep(rng.uniform(0.0, 0.1))
+            os.kill(writer.pid, signal.SIGKILL)
+        places, _ = read_places(path)
+        assert len(places) in (3, 60)
+        assert len(places) == 60 or path.read_bytes() == before
+    write_places(path, old, RIG)
+    assert os.listdir(tmp_path) == ["a.omap"]
+
+
+def test_a_map_is_seen_by_the_same_rig_with_another_horizon_but_not_by_another_rig() -> None:
+    places, shifted = some_places(2), dataclasses.replace(RIG, cylinder=Cylinder(1304, 380, 130.75))
+    before = places.keyframes[1].features.views.copy()
+    assert RIG.difference(shifted) == ""
+    seen_by(places, RIG, shifted)
+    np.testing.assert_allclose(places.keyframes[1].features.views - before, [[0, 2, 2]] * 256, atol=1e-4)
+    smaller = dataclasses.replace(RIG, cylinder=Cylinder(1000, 378, 128.75))
+    assert "panoramas of 1304 columns, not 1000" in RIG.difference(smaller)
+    assert "0.2400 m, not 0.3000 m" in RIG.difference(dataclasses.replace(RIG, baseline_m=0.3))
+    turned = dataclasses.replace(RIG, T_rig_rect=RIG.T_rig_rect @ se3.exp([0, 0, 0, 0, 0, 0.1]))
+    assert "5.7 degrees" in RIG.difference(turned)
