@@ -22,9 +22,11 @@ Array = NDArray[np.float64]
 class Places:
     """Localise the poses of odometry in a map of places, which grows with them."""
 
-    def __init__(self, geometry: Geometry, config: Config, places: PlaceMap | None = None) -> None:
-        """places: a map to be extended, None: a new one."""
-        self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places)
+    def __init__(self, geometry: Geometry, config: Config, places: PlaceMap | None = None, *,
+                 localize_only: bool = False) -> None:
+        """places: a map to be extended, None: a new one. localize_only: the map stays as it is."""
+        self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places,
+                                       localize_only=localize_only)
         self._T_rig_rect = geometry.T_rig_rect
         height_m = float((geometry.rig.T_base_rig @ self._T_rig_rect)[2, 3])
         low_m, high_m = config.mapping.heights_m
@@ -34,10 +36,9 @@ class Places:
         self._to_rect = se3.adjoint(self._T_rect_rig)
         self.state = MapState.ODOMETRY_ONLY  # of the newest pose
 
-    @property
     def map(self) -> PlaceMap:
-        """The map of places."""
-        return self._localiser.places
+        """Return the places whose poses are known relative to the first one: what can be saved."""
+        return self._localiser.map()
 
     @property
     def counts(self) -> dict[str, int]:

@@ -45,8 +45,10 @@ class MapCorrection:
         """Forget the covariance in the map: odom has been continued after a gap."""
         self._anchor = None
 
-    def close(self, loops: list[Link], part: list[int]) -> None:
+    def close(self, loops: list[Link], part: list[int], fixed: frozenset[int] = frozenset()) -> None:
         """Add loops and optimise the keyframes (ids) of a connected part, the oldest first, the newest last.
+
+        fixed: keyframes (ids) that stay where they are; if there is none in the part, the oldest one stays.
 
         In a large map the optimisation waits for some loops, so that its cost does not grow with the square of the map.
         """
@@ -63,7 +65,8 @@ class MapCorrection:
                           np.array([link.T_a_b for link in links]),
                           np.array([self._covariance(link) for link in links]),
                           np.array([link.is_loop for link in links]))
-        result = optimise(np.array([self._places.poses[id] for id in part]), edges)
+        stays = np.array([id in fixed for id in part])
+        result = optimise(np.array([self._places.poses[id] for id in part]), edges, stays if stays.any() else None)
         self._places.move(dict(zip(part, result.poses, strict=True)))
         bad = {id(link) for link, weight in zip(links, result.weights.tolist(), strict=True) if weight < ACCEPTED}
         bad -= {id(link) for link in _recent_loops(links)}

@@ -33,6 +33,7 @@ WAIT_FACTOR: Final = 1.5  # of the distance between keyframes: then one is added
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
 SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
 LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
+TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
 GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
 RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
@@ -64,10 +65,18 @@ class MapPose:
 class MapLocaliser:
     """Holds the map, and the pose of odom in it."""
 
-    def __init__(self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None) -> None:
-        """places: a map to be extended; None: a new one, which begins where odom does."""
-        self._model, self._limits = model, limits
-        self.places = places if places is not None else PlaceMap(limits.max_keyframes, round(1e6 * limits.max_mb))
+    def __init__(self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None, *,
+                 localize_only: bool = False) -> None:
+        """places: a map to be extended; None: a new one, which begins where odom does.
+
+        localize_only: the map stays as it is. The newest keyframes of the run tie odom to it, and are no places.
+        """
+        self._limits = limits
+        self.places = places if places is not None else PlaceMap()
+        self._fixed = frozenset(self.places.keyframes) if localize_only else frozenset()
+        self._localize_only = localize_only
+        self.places.bound(len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
+                          round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed))
         self.search = PlaceSearch(model)
         self.correction = MapCorrection(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
@@ -108,7 +117,13 @@ class MapLocaliser:
         """Sizes and counters, for the status."""
         return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
                 "dropped": self.places.dropped, "rejected": self.correction.rejected,
+                "unjoined": len(set(self._part_of.values())) - 1 if self._part_of else 0,
                 "ambiguous": self.search.ambiguous, "refused": self.search.refused}
+
+    def map(self) -> PlaceMap:
+        """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
+        oldest = self._part_of.get(min(self._part_of, default=0))
+        return self.places.part(id for id, part in self._part_of.items() if part == oldest)
 
     def _advance(self, frame: OdometryFrame) -> None:
         """Sum up the path; after a gap of unknown motion begin a new part of the map."""
@@ -143,7 +158,11 @@ class MapLocaliser:
 
     def _elsewhere(self) -> list[int]:
         """Return the keyframes of other parts of the map."""
-        return [id for id, part in self._part_of.items() if part != self._part]
+        return [id for id, part in self._part_of.items() if part != self._part and self._is_place(id)]
+
+    def _is_place(self, id: int) -> bool:
+        """True if a keyframe holds what recognises it."""
+        return len(self.places.keyframes[id].features.views) > 0
 
     def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
@@ -159,7 +178,7 @@ class MapLocaliser:
         drift_m: dict[int, float] = {}
         for id, part in self._part_of.items():
             path_m = self._path_m - self._path_at.get(id, -math.inf)
-            if part != self._part or path_m < LOCAL_M:
+            if part != self._part or path_m < LOCAL_M or not self._is_place(id):
                 continue
             if self._recognised_at is not None:
                 since_m = self._path_m - self._recognised_at[0]
@@ -171,6 +190,11 @@ class MapLocaliser:
 
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
         """Add a keyframe to the map."""
+        if self._localize_only:
+            features = PlaceFeatures(features.descriptors[:0], features.views[:0])
+            ties = [id for id in self.places.keyframes if id not in self._fixed]
+            for id in ties[: len(ties) - TIES + 1]:
+                self.places.drop(id)
         keyframe = PlaceKeyframe(self.places.next_id, self._session, frame.stamp_ns, frame.T_odom_rect,
                                  frame.covariance, small,
                                  frame.scan().astype(np.float16), features)
@@ -196,7 +220,7 @@ class MapLocaliser:
             self._join(other, hypothesis.T_map_odom(self.places.poses))
         links = [one.link() for one in consistent if self._hypotheses.take(one)]
         part = sorted(id for id, number in self._part_of.items() if number == self._part)
-        self.correction.close([link for link in links if link.a != link.b], part)
+        self.correction.close([link for link in links if link.a != link.b], part, self._fixed)
         self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
+MOST_LOOPS = 4  # that a dropped keyframe leaves to its neighbour: the most certain ones
 OVERHEAD_BYTES = 1500  # of a keyframe beside its large arrays: poses, covariance, links
 
 
@@ -112,6 +114,7 @@ class PlaceMap:
             self.links.append(link)
         while len(self) > max(2, self._max_keyframes) or (len(self) > 2 and self.nbytes > self._max_bytes):
             self.drop(self._most_redundant(keyframe.id))
+            self.dropped += 1
 
     def drop(self, id: int) -> None:
         """Drop a keyframe; what was linked to it is linked to the next one on its path, or to the one before."""
@@ -121,9 +124,10 @@ class PlaceMap:
         bridge = min((link for link in leaving if not link.is_loop), key=lambda link: link.b <= id, default=None)
         if bridge is not None:
             joined = [link.reversed().then(bridge) for link in leaving if link is not bridge and link.b != bridge.b]
-            self.links += [link if link.a < link.b else link.reversed() for link in joined]
+            loops = sorted((link for link in joined if link.is_loop), key=lambda link: float(np.trace(link.covariance)))
+            self.links += [link if link.a < link.b else link.reversed()
+                           for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])]
         del self.keyframes[id], self.poses[id]
-        self.dropped += 1
 
     def _most_redundant(self, newest: int) -> int:
         """Return the id of the keyframe, not the newest, that is nearest to another one; the older one of two."""
@@ -134,11 +138,19 @@ class PlaceMap:
         np.fill_diagonal(apart, np.inf)
         return ids[int(apart.min(axis=1).argmin())]
 
+    def bound(self, max_keyframes: int, max_bytes: int) -> None:
+        """Set other bounds, which hold from the next keyframe on."""
+        self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
+
+    def part(self, ids: Iterable[int]) -> PlaceMap:
+        """Return a map of some keyframes, and the links between them."""
+        chosen = set(ids)
+        part = PlaceMap(self._max_keyframes, self._max_bytes)
+        part.keyframes = {id: keyframe for id, keyframe in self.keyframes.items() if id in chosen}
+        part.poses = {id: self.poses[id] for id in part.keyframes}
+        part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
+        return part
+
     def move(self, poses: dict[int, Array]) -> None:
         """Set the poses T_map_rect of keyframes after an optimisation."""
         self.poses.update(poses)
-
-    def without(self, links: set[int]) -> None:
-        """Remove links by their places in the list."""
-        self.links = [link for n, link in enumerate(self.links) if n not in links]
-

@@ -114,6 +114,34 @@ def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
     assert {k.session for k in second.places.keyframes.values()} == {0, 1}
 
 
+def test_localisation_alone_leaves_the_map_as_it_is(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    known = deepcopy(out).places
+    before = {id: pose.copy() for id, pose in known.poses.items()}
+    back = slice(len(OUT) + 3, len(OUT) + 14)
+    drive = odometry(frames[back], POSES[back])
+    localiser = MapLocaliser(cameras.model, PlaceLimits(), known, localize_only=True)
+    found = run(localiser, drive)
+    assert found[-1].state is MapState.LOCALIZED
+    for id, pose in before.items():
+        np.testing.assert_allclose(known.poses[id], pose, atol=1e-9)
+    ties = [keyframe for id, keyframe in known.keyframes.items() if id not in before]
+    assert ties and not any(len(keyframe.features.views) for keyframe in ties)
+
+
+def test_what_is_saved_is_joined_with_the_oldest_place(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    """A run that never recognised anything is left out, and counted."""
+    elsewhere = replace(cameras, scene=corridor(8))
+    localiser = MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places)
+    run(localiser, odometry([elsewhere.frame(320, POSES[0])]))
+    assert localiser.counts["unjoined"] == 1 and len(localiser.places) == len(out.places) + 1
+    saved = localiser.map()
+    assert list(saved.keyframes) == list(out.places.keyframes) and len(saved.links) == len(out.places.links)
+
+
 def test_in_an_unknown_building_it_goes_on_as_odometry(cameras: RenderedCameras, out: MapLocaliser) -> None:
     elsewhere = replace(cameras, scene=corridor(8))
     drive = odometry([elsewhere.frame(300 + k, T) for k, T in enumerate(POSES[:8])])
