@@ -71,10 +71,10 @@ def rotation_log(R: ArrayLike) -> Array:
 def exp(xi: ArrayLike) -> Array:
     """Return the transform (..., 4, 4) of a twist xi (..., 6) = [translation; rotation vector]."""
     xi = np.asarray(xi, float)
-    _, b, c = _series(np.linalg.norm(xi[..., 3:], axis=-1))
+    a, b, c = _series(np.linalg.norm(xi[..., 3:], axis=-1))
     W = hat(xi[..., 3:])
-    V = np.eye(3) + b * W + c * W @ W
-    return transform(rotation_exp(xi[..., 3:]), (V @ xi[..., :3, None])[..., 0])
+    R, V = np.eye(3) + a * W + b * W @ W, np.eye(3) + b * W + c * W @ W
+    return transform(R, (V @ xi[..., :3, None])[..., 0])
 
 
 def log(T: ArrayLike) -> Array:

@@ -93,8 +93,8 @@ class ReferenceKernels:
         self.lk_ns.append(time.thread_time_ns() - start_ns)
 
 
-def measure(folder: Path, pairs: int, overrides: Sequence[str]) -> Budget:
-    """Run the stages inline over so many pairs, to and fro through the log, and return the times."""
+def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Budget:
+    """Run the stages inline over so many pairs, hz a second, to and fro through the log, and return the times."""
     config = load_config(None, overrides)
     frames = list(LogReader(folder / "log.mcap").frames())
     place = geometry(with_rims(rig_of(folder), frames), config.panorama)
@@ -105,7 +105,7 @@ def measure(folder: Path, pairs: int, overrides: Sequence[str]) -> Budget:
         graph = Graph(threaded=False)
         sinks = Sinks({"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference},
                       {"map": MapFile(Path(work) / "m")})
-        read = graph.source("read", lambda: to_and_fro(frames, pairs))
+        read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
         wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
         graph.run()
     count = pairs - SKIPPED
@@ -153,14 +153,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--pairs", type=int, default=200, help="pairs of a run (default: %(default)s)")
+    parser.add_argument("--hz", type=float, default=10.0, help="pairs a second by their stamps, whatever the log's own "
+                        "rate is: the map takes 5 a second; the motion from pair to pair stays (default: %(default)s)")
     parser.add_argument("--runs", type=int, default=5, help="runs, of which the medians are printed (default: 5)")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="computing processes per core beside it")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
     args = parser.parse_args()
-    if args.pairs < SKIPPED + 2 * REFERENCE_EVERY or args.runs < 1:
-        parser.error(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}, --runs at least 1")
+    if args.pairs < SKIPPED + 2 * REFERENCE_EVERY or args.runs < 1 or args.hz <= 0:
+        parser.error(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}, --runs at least 1, --hz above 0")
     with busy_processes(args.busy * (os.cpu_count() or 1)):
-        print(table([measure(args.folder, args.pairs, args.overrides) for _ in range(args.runs)]))
+        print(table([measure(args.folder, args.pairs, args.hz, args.overrides) for _ in range(args.runs)]))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ STEPS: Final = (
     Step("Gauss-Newton", "omnid.core.odometry.frame_to_map", "gauss_newton"),
     Step("align patches", "omnid.core.odometry.local_map", "LocalMap.align"),
     Step("warps", "omnid.core.odometry.local_map", "affine_warps"),
-    Step("templates", "omnid.core.odometry.local_map", "warped_templates"),
+    Step("templates", "omnid.core.odometry.local_map", "templates_of"),
     Step("align rows", "omnid.core.odometry.frame_to_map", "align_rows"),
     Step("templates", "omnid.core.odometry.patch_alignment", "warped_templates"),
     Step("fit patches", "omnid.core.odometry.patch_alignment", "fit_patches"),

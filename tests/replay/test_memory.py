@@ -28,13 +28,13 @@ PERIOD_NS = 100_000_000
 SETTLED, GROWTH_MIB = 200, 12.0
 
 
-def to_and_fro(frames: list[Frame], pairs: int) -> Iterator[Frame]:
+def to_and_fro(frames: list[Frame], pairs: int, period_ns: int = PERIOD_NS) -> Iterator[Frame]:
     """Yield the frames of so many pairs, forwards and backwards, with rising stamps."""
     both = [frames[i : i + 2] for i in range(0, len(frames), 2)]
     path = cycle([*both, *both[-2:0:-1]])
     for k in range(pairs):
         for frame in next(path):
-            yield replace(frame, stamp_ns=k * PERIOD_NS)
+            yield replace(frame, stamp_ns=k * period_ns)
 
 
 class MemoryMonitor:

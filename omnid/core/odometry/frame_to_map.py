@@ -14,7 +14,14 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
-from omnid.core.odometry.pose_estimation import GaussNewtonResult, SharedError, StereoModel, gauss_newton, ransac
+from omnid.core.odometry.pose_estimation import (
+    CONVERGED,
+    GaussNewtonResult,
+    SharedError,
+    StereoModel,
+    gauss_newton,
+    ransac,
+)
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 
@@ -24,11 +31,12 @@ Indices = NDArray[np.intp]
 
 MIN_LANDMARKS = 6  # below which six unknowns are no estimate
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
-STEPS = (2, 4)  # of Gauss-Newton in each round at most; a round takes the inliers of the one before
-ENOUGH_ROWS = 120  # disparities measured in a frame that are enough
+# Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
+COARSE_STEPS, STEPS = (3,), (2, 4)
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
+COARSE_CONVERGED = 1e-4  # m and rad: a smaller step of the coarse pose is the last one
 COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet warped to the new viewpoint
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
 # errors are correlated.
@@ -53,7 +61,7 @@ class FrameToMap:
     def __init__(self, local_map: LocalMap, model: StereoModel, klt: KltSettings) -> None:
         self._map, self._model = local_map, model
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
-        self._stereo_klt = replace(klt, levels=1)  # the predicted disparity is good to a few pixels
+        self._stereo_klt = replace(klt, levels=0)  # the predicted disparity is good to a few pixels
 
     def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure | None = None
                  ) -> CoarsePose | None:
@@ -76,7 +84,7 @@ class FrameToMap:
         landmarks = tracks.landmarks[is_inlier]
         noise = shift.noise(exposure.motion)[is_inlier] if exposure and shift else None
         solution, kept = self._solve(landmarks, views[is_inlier], T_curr_guess @ T_guess_odom, self._coarse_model,
-                                     noise)
+                                     noise, converged=COARSE_CONVERGED)
         if solution is None:
             return None
         chosen = np.flatnonzero(is_inlier)[kept]
@@ -118,9 +126,10 @@ class FrameToMap:
             variance += np.einsum("ni,ij,nj->n", of_depth, exposure.motion.covariance, of_depth)
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
-        inliers = min(len(coarse.landmarks), len(landmarks))
-        return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, tracks.visible,
-                            len(tracks.landmarks), inliers, landmarks, views, pixels, variance[kept], rejected)
+        visible, tracked, supporting = (
+            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks)))
+        return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, visible, tracked,
+                            min(supporting, len(landmarks)), landmarks, views, pixels, variance[kept], rejected)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
@@ -154,9 +163,6 @@ class FrameToMap:
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
         if shift:
             guess += shift.lower - shift.upper
-        elif len(guess) >= 2 * ENOUGH_ROWS:
-            # The depths of landmarks change little from frame to frame: every second one in turn is measured.
-            guess[(self._map.store.table.id[tracks.landmarks] + frame.seq) % 2 == 1] = np.nan
         # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
         near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
         rows, variance = align_rows(pair, tracks.pixels, near)
@@ -164,19 +170,19 @@ class FrameToMap:
 
     def _solve(
         self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None,
-        shared: SharedError | None = None,
+        shared: SharedError | None = None, converged: float = CONVERGED,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
         solution = None
-        for steps in STEPS:
+        for steps in COARSE_STEPS if model is self._coarse_model else STEPS:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
             of_views = None if noise is None else noise[kept]
             of_all = None if shared is None else shared.of(kept)
             solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
-                                    of_views, steps, of_all)
+                                    of_views, steps, of_all, converged)
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

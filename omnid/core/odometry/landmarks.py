@@ -161,9 +161,7 @@ class LandmarkStore:
         known = np.isfinite(disparity)
         rows, disparity = rows[known], disparity[known]
         T_rect_odom = se3.inverse(T_odom_rect)
-        anchors = self.table.anchor[rows]
-        T_curr_anchor = np.array(
-            [T_rect_odom @ self.keyframes[seq].T_odom_rect for seq in anchors.tolist()]).reshape(-1, 4, 4)
+        T_curr_anchor = self.from_anchors(T_rect_odom, rows)
         points = self.table.anchor_points[rows]
         seen = se3.apply(T_curr_anchor, points[:, None])[:, 0]
         predicted = view(seen, self._model.cylinder, self._model.baseline_m)
@@ -179,7 +177,7 @@ class LandmarkStore:
         corrected[rows] = points + PH * (gain * innovation)[:, None]
         spread[rows] = P - gain[:, None, None] * PH[:, :, None] * PH[:, None, :]
         self.table = replace(self.table, anchor_points=corrected, anchor_covariance=spread)
-        for seq in np.unique(anchors).tolist():
+        for seq in np.unique(self.table.anchor[rows]).tolist():
             self.move_keyframe(seq, self.keyframes[seq].T_odom_rect, self.keyframes[seq].covariance)
 
     def update_tracked(self, rows: Indices, pixels: Array) -> None:
@@ -193,6 +191,13 @@ class LandmarkStore:
         misses[rows] = 0
         self.table = replace(self.table, pixels=seen, misses=misses)
         self._select(misses < self._max_misses)
+
+    def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
+        """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
+        seqs = np.array(list(self.keyframes), np.intp)
+        T_odom_anchor = np.array([keyframe.T_odom_rect for keyframe in self.keyframes.values()]).reshape(-1, 4, 4)
+        order = np.argsort(seqs)
+        return np.asarray((T_rect_odom @ T_odom_anchor)[order[np.searchsorted(seqs[order], self.table.anchor[rows])]])
 
     def anchor_shares(self, rows: Indices) -> dict[int, float]:
         """Return for each keyframe the share of the landmarks (rows of the table) that it anchors."""

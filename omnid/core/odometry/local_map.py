@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
-from omnid.core.odometry.patch_alignment import AlignedPatches, affine_warps, align, warped_templates
-from omnid.core.odometry.patch_fit import TEMPLATE_PX
+from omnid.core.odometry.patch_alignment import AlignedPatches, affine_warps, align, templates_of
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import view
@@ -20,7 +19,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 COARSE_ITERATIONS = 8  # of Lucas-Kanade on each level: the patches are aligned afterwards
-BACK_LEVELS = 1  # of the track back from a prediction: RANSAC rejects what it lets pass
+REACH_PX = 2  # of the alignment: a new landmark, whose depth is uncertain, may be off by more than a pixel
 EDGE_ROWS = 3  # px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked
 
 
@@ -31,7 +30,8 @@ class Tracks:
     landmarks: Indices  # (M,) rows of the table of landmarks
     pixels: Array  # (M, 2) px where they were found
     predicted: Array  # (M, 3) px: views that the guessed pose predicts
-    visible: int  # landmarks that were predicted within the panorama
+    visible: int  # landmarks that were searched: those predicted within the panorama, or a sample of them
+    each_counts: float = 1.0  # landmarks within the panorama, for each that was searched
 
 
 class LocalMap:
@@ -40,6 +40,7 @@ class LocalMap:
     def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 8, max_misses: int = 3) -> None:
         self._model, self._klt = model, klt
         self._coarse_klt = replace(klt, iterations=min(klt.iterations, COARSE_ITERATIONS))
+        self._near_klt = replace(self._coarse_klt, levels=0)
         self.store = LandmarkStore(model, max_keyframes, max_misses)
         self._last: PaddedPanorama | None = None
 
@@ -62,23 +63,26 @@ class LocalMap:
         self.store.update_tracked(landmarks, pixels)
         self._last = lower
 
-    def track(self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None) -> Tracks:
-        """Track the landmarks of the last panorama into a new one, from the pixels that a guessed pose predicts.
+    def track(self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0,
+              near: bool = False) -> Tracks:
+        """Track landmarks of the last panorama into a new one, from the pixels that a guessed pose predicts.
 
-        most: track only about so many, evenly chosen, to compare guesses cheaply.
+        most: only about so many, evenly chosen; None: all. With another turn, others are chosen. near: the guess is
+        good to a few pixels, so that no pyramid is needed; where it is not, wrong tracks pass the check.
         """
         rows, predicted = self.visible(T_odom_rect)
         known = np.isfinite(self.store.table.pixels[rows, 0])
         rows, predicted = rows[known], predicted[known]
+        count = len(rows)
         if most is not None:
-            every = max(1, -(-len(rows) // most))
-            rows, predicted = rows[::every], predicted[::every]
+            every = max(1, -(-count // most))
+            chosen = np.flatnonzero((self.store.table.id[rows] + turn) % every == 0)
+            rows, predicted = rows[chosen], predicted[chosen]
         if self._last is None:
             return Tracks(rows[:0], np.zeros((0, 2)), predicted[:0], 0)
-        back_levels = BACK_LEVELS if most is None else self._klt.levels
         before = self.store.table.pixels[rows]
-        pixels, found = track(self._last, lower, before, predicted[:, :2], self._coarse_klt, back_levels)
-        return Tracks(rows[found], pixels[found], predicted[found], len(rows))
+        pixels, found = track(self._last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
+        return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
         """Return the landmarks (M,) that a pose predicts within the panorama, and their views (M, 3) [px]."""
@@ -99,13 +103,8 @@ class LocalMap:
         points = se3.apply(T_rect_odom, table.points[landmarks])
         predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2] - shift
         anchors = table.anchor[landmarks]
-        T_curr_ref = np.array([T_rect_odom @ keyframes[seq].T_odom_rect for seq in anchors.tolist()])
-        warps = affine_warps(
-            table.views[landmarks], table.slopes[landmarks], T_curr_ref.reshape(-1, 4, 4), self._model
-        )
-        templates = np.zeros((len(landmarks), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
-        for seq in np.unique(anchors).tolist():
-            own = np.flatnonzero(anchors == seq)
-            pixels = table.anchor_pixels[landmarks[own]]
-            templates[own] = warped_templates(keyframes[seq].lower, pixels, warps[own], predicted[own])
-        return align(templates, lower, predicted, anchors)
+        T_curr_ref = self.store.from_anchors(T_rect_odom, landmarks)
+        warps = affine_warps(table.views[landmarks], table.slopes[landmarks], T_curr_ref, self._model)
+        images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
+        templates = templates_of(images, anchors, table.anchor_pixels[landmarks], warps, predicted)
+        return align(templates, lower, predicted, anchors, REACH_PX)

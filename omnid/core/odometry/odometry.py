@@ -41,6 +41,9 @@ LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
 SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 degrees
 START_ROUNDS = 2  # of starting a map again, once the velocity is known
+# Landmarks tracked from the last panorama at most, others in the next frame: enough for the start of the refinement,
+# which aligns the patches of all landmarks.
+TRACKED = 330
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
@@ -96,9 +99,9 @@ class VisualOdometry:
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
         estimate: PoseEstimate | None = None
-        for T_guess in self._guesses(frame, usable, T_predicted) if searched else ():
+        for T_guess, is_near in self._guesses(frame, usable, T_predicted) if searched else ():
             # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-            tracks = self._map.track(frame.lower, T_guess)
+            tracks = self._map.track(frame.lower, T_guess, TRACKED, turn=frame.seq, near=is_near)
 
             # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
             #    on the bearings in both panoramas (IV.C, in place of eq. 9).
@@ -165,23 +168,26 @@ class VisualOdometry:
             self._map.clear()
             self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
             exposure = self._exposure(frame, motion)
-            tracks = self._map.track(frame.lower, estimate.T_odom_rect)
+            tracks = self._map.track(frame.lower, estimate.T_odom_rect, TRACKED, turn=frame.seq)
             coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
             again = self._refine(frame, coarse, exposure, dt_s) if coarse else None
             estimate = again if again is not None else replace(estimate, landmarks=estimate.landmarks[:0])
         return estimate
 
-    def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[Array]:
-        """Yield guesses of the pose: the prediction; then, if it was not good, the best yaw hypothesis there (IV.F).
+    def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[tuple[Array, bool]]:
+        """Yield guesses of the pose, and whether they count as near: the prediction, which nearly always is near.
 
-        The hypotheses are the peaks of the circular correlation with the last panorama, then the paper's steps.
+        Then, each if what was before was not good: the prediction, searched with a pyramid; the best yaw hypothesis
+        there (IV.F). The hypotheses are the peaks of the circular correlation with the last panorama, then the paper's
+        steps.
         """
-        yield T_predicted
+        yield T_predicted, True
+        yield T_predicted, False
         assert self._previous is not None
         peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable)
         T_unturned = self._T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
-        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks))
+        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
 
     def _is_good(self, estimate: PoseEstimate | None) -> bool:
         """True if no other guess is needed."""

@@ -7,6 +7,7 @@ some decimetres. Here each keyframe patch is warped by the affine map that pose,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.patch_fit import CELL_PX, TEMPLATE_PX, PatchFit, fit_patches
+from omnid.core.odometry.patch_fit import TEMPLATE_PX, WINDOW_PX, PatchFit, fit_patches
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate, view
@@ -25,6 +26,7 @@ Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
 
 HALF_BASE_PX = 4.0  # half the base of the difference quotients that give the warp
+REACH_PX = 1  # of patches whose pose and depth are known well
 CROSS_PX = 0.5  # by which a patch may move sideways in the upper panorama from where it was tracked to
 MAX_STRETCH, MIN_AREA = 2.0, 0.25  # of a warp: largest element and smallest determinant
 SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the disparity is measured
@@ -85,12 +87,14 @@ class AlignedPatches:
         return AlignedPatches(predicted + fit.shift, fit.covariance, fit.fits)
 
 
-def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices) -> AlignedPatches:
+def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
+          ) -> AlignedPatches:
     """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
-    groups (N,): patches that come from one image have one number.
+    groups (N,): patches that come from one image have one number. reach_px: a patch that has to move so far was
+    predicted wrongly.
     """
-    cells = _cut(current, np.rint(predicted))
+    cells = _cut(current, np.rint(predicted), WINDOW_PX + 2 * reach_px)
     return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
 
 
@@ -103,8 +107,9 @@ def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near:
     known = np.flatnonzero(np.isfinite(near).all(axis=1))
     predicted = near[known]
     upright = np.broadcast_to(np.eye(2), (len(known), 2, 2))
+    one = np.zeros(len(known), np.intp)
     templates = warped_templates(pair[0], points[known], upright, predicted)
-    found = align(templates, pair[1], predicted, np.zeros(len(known), np.intp))
+    found = align(templates, pair[1], predicted, one)
     fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < CROSS_PX)
     aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
     aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
@@ -126,25 +131,36 @@ def warped_templates(keyframe: PaddedPanorama, pixels: Array, warps: Array, pred
 
     They are sampled so that their pixels are whole pixels of the panorama in which they are predicted.
     """
+    return templates_of({0: keyframe}, np.zeros(len(pixels), np.intp), pixels, warps, predicted)
+
+
+def templates_of(images: Mapping[int, PaddedPanorama], anchors: Indices, pixels: Array, warps: Array, predicted: Array
+                 ) -> Image:
+    """Return `warped_templates` of several images of one size; anchors (N,): the key of the image of each."""
+    templates = np.empty((len(pixels), TEMPLATE_PX**2), np.uint8)
     if not len(pixels):
-        return np.zeros((0, TEMPLATE_PX, TEMPLATE_PX), np.uint8)
+        return templates.reshape(-1, TEMPLATE_PX, TEMPLATE_PX)
+    order = np.argsort(anchors, kind="stable")
+    size = next(iter(images.values()))
     back = np.linalg.inv(warps).astype(np.float32)
     centre = (back @ (np.rint(predicted) - predicted).astype(np.float32)[:, :, None])[:, :, 0]
-    centre += np.column_stack([pixels[:, 0] % keyframe.width + keyframe.pad_px, pixels[:, 1]]).astype(np.float32)
+    centre += np.column_stack([pixels[:, 0] % size.width + size.pad_px, pixels[:, 1]]).astype(np.float32)
+    back, centre = back[order], centre[order]
     side = np.arange(TEMPLATE_PX, dtype=np.float32) - TEMPLATE_PX // 2
     columns, rows = (
-        (centre[:, axis, None] + back[:, axis, 1, None] * side)[:, :, None] + (back[:, axis, 0, None] * side)[:, None]
-        for axis in (0, 1)
+        ((centre[:, axis, None] + back[:, axis, 1, None] * side)[:, :, None] + (back[:, axis, 0, None] * side)[:, None]
+         ).reshape(templates.shape) for axis in (0, 1)
     )
-    shape = len(pixels), TEMPLATE_PX**2
-    patches = cv2.remap(keyframe.image, columns.reshape(shape), rows.reshape(shape), cv2.INTER_LINEAR,
-                        borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(patches, np.uint8).reshape(-1, TEMPLATE_PX, TEMPLATE_PX)
+    keys, first = np.unique(anchors[order], return_index=True)
+    for key, start, end in zip(keys.tolist(), first, [*first[1:], len(order)], strict=True):
+        templates[order[start:end]] = cv2.remap(images[key].image, columns[start:end], rows[start:end],
+                                                cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return templates.reshape(-1, TEMPLATE_PX, TEMPLATE_PX)
 
 
-def _cut(panorama: PaddedPanorama, centres: Array) -> Image:
-    """Return cells (N, CELL, CELL) around whole pixels (N, 2), also across the seam; the border is repeated."""
-    image, side = panorama.image, np.arange(CELL_PX) - CELL_PX // 2
+def _cut(panorama: PaddedPanorama, centres: Array, side_px: int) -> Image:
+    """Return cells (N, side, side) around whole pixels (N, 2), also across the seam; the border is repeated."""
+    image, side = panorama.image, np.arange(side_px) - side_px // 2
     columns = (centres[:, :1] % panorama.width).astype(np.intp) + panorama.pad_px + side
     rows = centres[:, 1:].astype(np.intp) + side
     columns = columns.clip(0, image.shape[1] - 1)

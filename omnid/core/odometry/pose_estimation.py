@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import MIN_RADIUS_M, triangulate, view, view_jacobian
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -19,7 +20,7 @@ RANSAC_THRESHOLD_PX = 2.0  # largest error of a view in the consensus set
 RANSAC_MISSED = 1e-6  # probability that no hypothesis was free of outliers, at which the search ends
 KERNEL_WIDTH = 2.5  # standard deviations at which the Cauchy kernel halves the weight of an error
 GAUSS_NEWTON_STEPS = 6  # at most
-CONVERGED = 1e-6  # m and rad: a smaller step is the last one
+CONVERGED = 1e-5  # m and rad: a smaller step is the last one
 DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
 
 
@@ -138,55 +139,80 @@ class GaussNewtonResult:
 
 
 def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS, shared: SharedError | None = None
-                 ) -> GaussNewtonResult:
+                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS, shared: SharedError | None = None,
+                 converged: float = CONVERGED) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
-    corner and landmark; noise as in `whitening`. A shared error is estimated along with the motion. It replaces eq. (9)
-    of Dang et al. 2012, which measures in 3-D and is biased short.
+    corner and landmark; noise as in `whitening`. A shared error is estimated along with the motion. A step shorter
+    than `converged` [m and rad] is the last one. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is
+    biased short.
     """
-    W = whitening(landmarks, covariance, views, T, model, noise)
-    clean = np.where(np.isnan(views), 0.0, views)
     if shared is None:
         shared = SharedError.none(len(views))
+    W = whitening(landmarks, covariance, views, T, model, noise)
+    equations = _NormalEquations(landmarks, np.where(np.isnan(views), 0.0, views), W, model, shared)
     error = np.zeros(len(shared.covariance))
-    H, g, squared = _normal_equations(landmarks, clean, T, W, model, shared, error)
+    H, g, squared = equations.at(T, error)
     for _ in range(steps):
         step = np.linalg.solve(H, g)
         T, error = se3.exp(step[:6]) @ T, error + step[6:]
-        if np.abs(step[:6]).max() < CONVERGED:
+        if np.abs(step[:6]).max() < converged:
             break  # the last equations hold here as well
-        H, g, squared = _normal_equations(landmarks, clean, T, W, model, shared, error)
+        H, g, squared = equations.at(T, error)
     spread = np.asarray(np.linalg.inv(H), float)
     return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])
 
 
-def _normal_equations(landmarks: Array, views: Array, T: Array, W: Array, model: StereoModel, shared: SharedError,
-                      error: Array) -> tuple[Array, Array, Array]:
-    """Return H, g of H [step; change] = g, and the squared errors (N,) of the views.
+class _NormalEquations:
+    """Normal equations of N views. Arrays are kept as rows of N values, over which numpy loops fastest."""
 
-    step: [t; r] on the left of T; change (K,): of the shared error (K,).
-    """
-    points = se3.apply(T, landmarks)
-    residual = (W @ model.residual(points, views + shared.derivatives @ error)[:, :, None])[:, :, 0]
-    squared = (residual**2).sum(axis=1)
-    weight = 1 / (1 + squared / KERNEL_WIDTH**2)
-    by_point = W @ view_jacobian(points, model.cylinder, model.baseline_m)
-    # The rotation's part is points x rows of by_point.
-    x, y, z = points.T[:, :, None]
-    J = np.empty((len(points), 3, 6 + len(error)))
-    J[:, :, :3] = by_point
-    J[:, :, 3] = y * by_point[:, :, 2] - z * by_point[:, :, 1]
-    J[:, :, 4] = z * by_point[:, :, 0] - x * by_point[:, :, 2]
-    J[:, :, 5] = x * by_point[:, :, 1] - y * by_point[:, :, 0]
-    if len(error):
-        J[:, :, 6:] = -W @ shared.derivatives
-    flat = J.reshape(-1, J.shape[2])
-    weighted = flat * np.repeat(weight, 3)[:, None]
-    H, g = weighted.T @ flat + DAMPING * np.eye(J.shape[2]), weighted.T @ residual.ravel()
-    if len(error):
-        prior = np.linalg.inv(shared.covariance)
-        H[6:, 6:] += prior
-        g[6:] -= prior @ error
-    return H, g, squared
+    def __init__(self, landmarks: Array, views: Array, W: Array, model: StereoModel, shared: SharedError) -> None:
+        self._landmarks, self._views = np.ascontiguousarray(landmarks.T), np.ascontiguousarray(views.T)
+        self._W = np.ascontiguousarray(W.transpose(1, 2, 0))  # (3, 3, N)
+        self._model = model
+        self._by_error = (-W @ shared.derivatives).transpose(2, 1, 0)  # (K, 3, N)
+        self._prior = np.linalg.inv(shared.covariance)
+
+    def at(self, T: Array, error: Array) -> tuple[Array, Array, Array]:
+        """Return H, g of H [step; change] = g, and the squared errors (N,) of the views.
+
+        step: [t; r] on the left of T; change (K,): of the shared error (K,).
+        """
+        J = np.zeros((7 + len(error), 3, self._views.shape[1]))
+        self._linearise(T[:3, :3] @ self._landmarks + T[:3, 3:], J)
+        # Whitening, in place: W is a lower triangle.
+        W = self._W
+        J[:7, 2] = W[2, 0] * J[:7, 0] + W[2, 1] * J[:7, 1] + W[2, 2] * J[:7, 2]
+        J[:7, 1] = W[1, 0] * J[:7, 0] + W[1, 1] * J[:7, 1]
+        J[:7, 0] *= W[0, 0]
+        J[7:] = self._by_error
+        residual = J[0] - np.tensordot(error, self._by_error, 1) if len(error) else J[0]
+        squared = (residual**2).sum(axis=0)
+        weight = 1 / (1 + squared / KERNEL_WIDTH**2)
+        flat, weighted = J[1:].reshape(len(J) - 1, -1), (J[1:] * weight).reshape(len(J) - 1, -1)
+        H, g = weighted @ flat.T + DAMPING * np.eye(len(flat)), weighted @ residual.ravel()
+        H[6:, 6:] += self._prior
+        g[6:] -= self._prior @ error
+        return H, g, squared
+
+    def _linearise(self, points: Array, into: Array) -> None:
+        """Write the residuals (3, N) of the views of points (3, N), and the derivatives (6, 3, N) by [t; r]."""
+        x, y, z = points
+        cylinder, baseline_m = self._model.cylinder, self._model.baseline_m
+        f, per_r = cylinder.focal_px, 1.0 / np.maximum(np.sqrt(x * x + y * y), MIN_RADIUS_M)
+        along_x, along_y, scale = x * per_r, y * per_r, f * per_r
+        column = (math.pi - np.arctan2(y, x)) * f - 0.5
+        lower = cylinder.row0 - scale * z
+        into[0, 0] = cylinder.wrap(self._views[0] - column)
+        into[0, 1] = self._views[1] - lower
+        into[0, 2] = self._views[2] - lower - scale * baseline_m
+        # Column: f (pi - atan2(y, x)); its derivative by a turn about z is -f.
+        into[1, 0], into[2, 0] = scale * along_y, -scale * along_x
+        into[4, 0], into[5, 0], into[6, 0] = -z * into[2, 0], z * into[1, 0], -f
+        # Rows: row0 - f height / r; a turn about z does not change them.
+        for row, height in ((1, z), (2, z - baseline_m)):
+            outward = scale * per_r * height
+            into[1, row], into[2, row], into[3, row] = outward * along_x, outward * along_y, -scale
+            into[4, row] = y * into[3, row] - z * into[2, row]
+            into[5, row] = z * into[1, row] - x * into[3, row]

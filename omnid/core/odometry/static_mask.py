@@ -32,38 +32,39 @@ class StaticMask:
     """Learn, at half resolution, where structure stays the same while the robot moves."""
 
     def __init__(self) -> None:
-        self._reference: tuple[Image, Array] | None = None
+        self._reference: tuple[Image, Flags, Array] | None = None  # panorama at half resolution, structure, pose
         self._streak: NDArray[np.uint8] | None = None
         self._blocked: Flags | None = None
 
     def observe(self, panorama: Image, T_odom_rect: Array) -> None:
         """Compare the panorama (H, W) at an accepted pose with the last one, once the view should have moved."""
         if self._reference is None:
-            self._reference = (_half(panorama), T_odom_rect)
+            half = _half(panorama)
+            self._reference = (half, _structured(half), T_odom_rect)
             return
-        flow = expected_flow(se3.inverse(self._reference[1]) @ T_odom_rect, self._reference[0].shape[1])
+        flow = expected_flow(se3.inverse(self._reference[2]) @ T_odom_rect, self._reference[0].shape[1])
         if np.mean(flow > MIN_FLOW_RAD) > MOVED_RATIO:
             half = _half(panorama)
-            self._compare(half, flow > MIN_FLOW_RAD, panorama.shape)
-            self._reference = (half, T_odom_rect)
+            structured = _structured(half)
+            self._compare(half, structured, flow > MIN_FLOW_RAD, panorama.shape)
+            self._reference = (half, structured, T_odom_rect)
 
     def without(self, usable: Flags) -> Flags:
         """Return usable (H, W) without what is known to be fixed, and a margin around it."""
         return usable if self._blocked is None else usable & ~self._blocked
 
-    def _compare(self, half: Image, moving: Flags, shape: tuple[int, ...]) -> None:
+    def _compare(self, half: Image, structured: Flags, moving: Flags, shape: tuple[int, ...]) -> None:
         """Count one comparison; columns (W/2,) that should not have moved keep their evidence."""
         assert self._reference is not None
-        before = self._reference[0]
-        same = (cv2.absdiff(half, before) <= SAME_LEVEL) & _structured(half) & _structured(before)
+        before, structured_before, _ = self._reference
+        same = (cv2.absdiff(half, before) <= SAME_LEVEL) & structured & structured_before
         streak = np.zeros(half.shape, np.uint8) if self._streak is None else self._streak
         # One change halves the evidence: the world loses it as soon as another object comes into view.
-        counted = np.where(same, np.minimum(streak + 1, MAX_EVIDENCE), streak // 2).astype(np.uint8)
+        counted = np.where(same, np.minimum(streak + np.uint8(1), np.uint8(MAX_EVIDENCE)), streak >> 1)
         self._streak = np.where(moving, counted, streak)
-        fixed = (self._streak >= EVIDENCE).astype(np.uint8)
-        fixed = np.asarray(cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-        margin = np.ones((4 * REACH_PX + 1, 4 * REACH_PX + 1), np.uint8)
-        self._blocked = np.asarray(cv2.dilate(fixed, margin) > 0)
+        margin = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
+        fixed = cv2.dilate((self._streak >= EVIDENCE).view(np.uint8), margin)
+        self._blocked = np.asarray(cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8).view(bool)
 
 
 def expected_flow(T_before_after: Array, columns: int) -> Array:

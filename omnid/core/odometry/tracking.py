@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -50,12 +50,9 @@ class KltSettings:
 
 
 def track(
-    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings, back_levels: int = MAX_LEVELS
+    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Track points (N, 2) of a into b, from a guess (N, 2), with the forward-backward check.
-
-    back_levels: pyramid levels at most of the track back. It begins where it should end, so that few are enough where
-    the guess is good; with few, more of the wrong tracks pass.
 
     Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
     returned in [0, width). The status of Lucas-Kanade is no evidence: it only tells that the iteration ended.
@@ -63,7 +60,7 @@ def track(
     if not len(points):
         return points.copy(), np.zeros(0, bool)
     there, found = flow(a, b, points, guess, klt)
-    back, returned = flow(b, a, there, points, replace(klt, levels=min(klt.levels, back_levels)))
+    back, returned = flow(b, a, there, points, klt)
     error = back - points
     error[:, 0] = (error[:, 0] + a.width / 2) % a.width - a.width / 2
     close = (error**2).sum(axis=1) < klt.max_error_px**2

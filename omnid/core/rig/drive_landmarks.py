@@ -32,6 +32,7 @@ MAX_KEYFRAMES = 25  # that see a landmark: its patch looks different from farthe
 MIN_KEYFRAMES = 3  # that must see a landmark before it says anything of the rig
 APART_PX = 9
 EDGE_ROWS = 4
+REACH_PX = 2  # of patches: the rig is not known well yet
 TRACK = KltSettings(window_px=15, levels=3, max_error_px=0.5)
 TRACK_UPPER = KltSettings(window_px=15, levels=1, max_error_px=0.5)
 
@@ -158,7 +159,7 @@ class DriveLandmarks:
             planes = self._views[index[at]], self._slopes[index[at]]
             templates[at] = plane_templates(self._keyframes[a].lower, planes, T_curr_ref[at], self._model, near[at],
                                             upper=upper)
-        aligned = align(templates, current.upper if upper else current.lower, near, anchors)
+        aligned = align(templates, current.upper if upper else current.lower, near, anchors, REACH_PX)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([pixels[:, 0] % self._model.cylinder.width, pixels[:, 1]]), aligned.found
 

@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.patch_fit import CELL_PX, PatchFit, fit_patches
+from omnid.core.odometry.patch_fit import WINDOW_PX, PatchFit, fit_patches
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.7, -0.45])  # of the current patches, px
 ONE_IMAGE = np.zeros(400, np.intp)
+REACH_PX = 2
+CELL_PX = WINDOW_PX + 2 * REACH_PX
 
 
 def patches(count: int, shift: Array, *, gain: float = 1.0, offset: float = 0.0, contrast: float = 30.0,
