@@ -57,7 +57,7 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
     """
     count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
     inner = slice(reach - NEAR_PX, cells.shape[1] - reach + NEAR_PX)
-    near = _Windows(templates, cells[:, inner, inner])
+    near = _ShiftedWindows(templates, cells[:, inner, inner])
     normal = near.normal
     trace = normal[:, 0, 0] + normal[:, 1, 1]
     determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1] ** 2
@@ -68,13 +68,13 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
     weighted = normal.copy()
     weighted[:, 2, 2] += prior
     weighted[~textured] += np.eye(3) * (1.0 + trace[~textured, None, None])
-    equations = _Equations(np.asarray(np.linalg.inv(weighted)), prior * gain)
+    equations = _PatchEquations(np.asarray(np.linalg.inv(weighted)), prior * gain)
 
     shift, solution, residual = _solve(near, equations, np.zeros((count, 2)), textured)
     # Few patches move far: only theirs are the windows at all shifts.
     far = np.flatnonzero(textured & (np.abs(shift).max(axis=1, initial=0.0) >= NEAR_PX))
     if reach > NEAR_PX and len(far):
-        windows = _Windows(templates[far], cells[far])
+        windows = _ShiftedWindows(templates[far], cells[far])
         shift[far], solution[far], residual[far] = _solve(windows, equations.of(far), shift[far], textured[far])
     fits = textured & (np.abs(shift).max(axis=1, initial=0.0) < reach)
     fits &= (solution[:, 2] > GAIN_RANGE[0]) & (solution[:, 2] < GAIN_RANGE[1])
@@ -82,18 +82,18 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
 
 
 @dataclass(frozen=True, slots=True)
-class _Equations:
+class _PatchEquations:
     """Normal equations of patches whose right sides depend on the windows."""
 
     inverse: Array  # (N, 3, 3) of the left sides
     of_gain: Array  # (N,) the prior's part of the right sides
 
-    def of(self, which: Indices) -> _Equations:
+    def of(self, which: Indices) -> _PatchEquations:
         """Return the equations of some patches."""
-        return _Equations(self.inverse[which], self.of_gain[which])
+        return _PatchEquations(self.inverse[which], self.of_gain[which])
 
 
-def _solve(windows: _Windows, equations: _Equations, start: Array, textured: Flags) -> tuple[Array, Array, Array]:
+def _solve(windows: _ShiftedWindows, equations: _PatchEquations, start: Array, textured: Flags) -> tuple[Array, Array, Array]:
     """Return shifts (N, 2) from a start, solutions (N, 3) and mean squared residuals (N,) of textured (N,) patches.
 
     The iteration of a patch ends where it converges or leaves the reach of the windows.
@@ -119,7 +119,7 @@ def _solve(windows: _Windows, equations: _Equations, start: Array, textured: Fla
     return shift, solution, residual
 
 
-class _Windows:
+class _ShiftedWindows:
     """Templates with their gradients, and windows of the current image at the whole shifts around each patch.
 
     A bilinear window is a weighted sum of four of them, so that its products with template and gradients are the same

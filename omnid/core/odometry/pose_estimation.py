@@ -151,7 +151,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
     if shared is None:
         shared = SharedError.none(len(views))
     W = whitening(landmarks, covariance, views, T, model, noise)
-    equations = _NormalEquations(landmarks, np.where(np.isnan(views), 0.0, views), W, model, shared)
+    equations = _PoseEquations(landmarks, np.where(np.isnan(views), 0.0, views), W, model, shared)
     error = np.zeros(len(shared.covariance))
     H, g, squared = equations.at(T, error)
     for _ in range(steps):
@@ -164,7 +164,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
     return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])
 
 
-class _NormalEquations:
+class _PoseEquations:
     """Normal equations of N views. Arrays are kept as rows of N values, over which numpy loops fastest."""
 
     def __init__(self, landmarks: Array, views: Array, W: Array, model: StereoModel, shared: SharedError) -> None:
