@@ -93,7 +93,8 @@ class _PatchEquations:
         return _PatchEquations(self.inverse[which], self.of_gain[which])
 
 
-def _solve(windows: _ShiftedWindows, equations: _PatchEquations, start: Array, textured: Flags) -> tuple[Array, Array, Array]:
+def _solve(windows: _ShiftedWindows, equations: _PatchEquations, start: Array, textured: Flags
+           ) -> tuple[Array, Array, Array]:
     """Return shifts (N, 2) from a start, solutions (N, 3) and mean squared residuals (N,) of textured (N,) patches.
 
     The iteration of a patch ends where it converges or leaves the reach of the windows.
