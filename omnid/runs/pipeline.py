@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, PlaceUpdate
@@ -31,6 +32,8 @@ class Sinks:
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
+    known_places: PlaceMap | None = None  # the map to begin with
+    localize_only: bool = False  # it stays as it is
     recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
     live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
@@ -72,7 +75,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
             graph.sink(name, map_sink, maps)
     places: Places | None = None
     if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus):
-        places = Places(geometry, config)
+        places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only)
         updates: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
         outgoing["bus-places"] = updates
         for name, place_sink in sinks.places.items():

@@ -16,6 +16,7 @@ from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
+from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
@@ -74,6 +75,8 @@ class ReplayOptions:
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
     observer: Callable[[Geometry, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
+    places: PlaceMap | None = None  # the map to begin with; it is extended
+    localize_only: bool = False  # ... it stays as it is
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
@@ -167,6 +170,7 @@ class _Replay:
         """Open all outputs before the run, so that one that cannot be opened ends it now."""
         options, config = self._options, self._config
         sinks = Sinks(poses={"statistics": session.statistics}, map_every_s=options.map_every_s,
+                      known_places=options.places, localize_only=options.localize_only,
                       recorder=options.observer(geometry, session.graph.telemetry) if options.observer else None,
                       bus=self._bus(session, geometry) if options.publish else None)
         if config.motor.port:
@@ -233,6 +237,7 @@ class _Replay:
             session.signal,
             self._map_poses.T_map_rig,
             self._map_poses.states,
+            results.places() if self._options.collect else None,
         )
 
 

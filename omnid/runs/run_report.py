@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from drivers.logs.log_reader import LogReader
+from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.input_warnings import input_warnings
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.status import stage_status, summary_status
@@ -34,6 +35,10 @@ class RunReport:
         mapping, places = self._stages.mapping, self._stages.places
         return replace(counters, map={} if mapping is None else mapping.counts,
                        places={} if places is None else places.counts)
+
+    def places(self) -> PlaceMap | None:
+        """Return the map of places as it can be saved; None where there is none."""
+        return None if self._stages.places is None else self._stages.places.map()
 
     def timings(self) -> dict[str, SummaryRow]:
         """Return the times of the stages."""

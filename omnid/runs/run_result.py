@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunCounters
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
@@ -41,6 +42,7 @@ class RunResult:
     # Poses in the map as they were known at that time, with their states; empty where places are not recognised.
     T_map_rig: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
     map_states: tuple[MapState, ...] = ()  # (N,)
+    places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
 
     def save_tum(self, path: str | PathLike[str]) -> None:
         """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).

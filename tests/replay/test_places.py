@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,11 @@ from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import read_rig, write_rig
+from omnid.config import Config
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.tracking_state import MapState
 from omnid.transport.decode import decode_diagnostics
 from omnid.transport.status_names import PLACES
 from tests.drivers.logs.mcap_logs import STORE
@@ -64,6 +69,24 @@ def _assert_published(log: Path, T_map_rig: np.ndarray, T_odom_rig: np.ndarray) 
     states = [status.values["state"] for statuses in found["/omnid/status"] for status in statuses.statuses
               if status.name == PLACES]
     assert states == ["odometry only", "localized"]
+
+
+def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path) -> None:
+    """It localises within a second, in another world it does not; localize_only leaves the map as it was."""
+    first = run_log(scene / "log.mcap", Config(), ReplayOptions(rig=scene / "rig.toml", collect=True))
+    assert first.places is not None and len(first.places) >= 3
+    poses = {id: pose.copy() for id, pose in first.places.poses.items()}
+    again = ReplayOptions(rig=scene / "rig.toml", collect=True, places=first.places, localize_only=True)
+    for log, known in ((scene, True), (elsewhere, False)):
+        result = run_log(log / "log.mcap", Config(), replace(again, places=deepcopy(first.places)))
+        assert (MapState.LOCALIZED in result.map_states[:10]) == known
+        assert result.places is not None and result.places.poses.keys() >= poses.keys()
+        assert all(np.allclose(result.places.poses[id], pose, atol=1e-9) for id, pose in poses.items())
+        if known:
+            errors = se3.log(se3.inverse(first.T_odom_rig[10:]) @ result.T_map_rig[10:])
+            assert np.abs(errors[:, :3]).max() < 0.01 and np.abs(errors[:, 3:]).max() < 0.005
+        else:
+            assert set(result.map_states) == {MapState.ODOMETRY_ONLY}
 
 
 def test_without_places_there_is_no_trajectory_in_the_map(omnid: Command, tmp_path: Path, scene: Path) -> None:
