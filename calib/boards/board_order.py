@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.boards.board import Board
 from calib.boards.corner_candidates import Grey, sample
@@ -45,19 +46,20 @@ def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
     """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it."""
     for upright in (grid_to_array(grid), _rotated_quarter(grid_to_array(grid))):
         known = np.isfinite(upright[..., 0])
-        for j in range(1, known.shape[0] - board.rows):
-            for i in range(1, known.shape[1] - board.columns):
-                around = known[j - 1:j + board.rows + 1, i - 1:i + board.columns + 1]
-                if _is_isolated(around):
-                    yield upright[j:j + board.rows, i:i + board.columns]
+        if known.shape[0] >= board.rows + 2 and known.shape[1] >= board.columns + 2:
+            around = np.lib.stride_tricks.sliding_window_view(known, (board.rows + 2, board.columns + 2))
+            for j, i in np.argwhere(_are_isolated(around)) + 1:
+                yield upright[j:j + board.rows, i:i + board.columns]
 
 
-def _is_isolated(around: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> bool:
-    inside = around[1:-1, 1:-1]
-    borders = (inside[0], inside[-1], inside[:, 0], inside[:, -1])
-    beyond = (around[0, 1:-1], around[-1, 1:-1], around[1:-1, 0], around[1:-1, -1])
-    return bool(inside.mean() >= MIN_FILLED and min(border.mean() for border in borders) >= MIN_BORDER
-                and max(row.mean() for row in beyond) < BEYOND)
+def _are_isolated(around: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the mask (J, I) of windows with their surroundings (J, I, rows + 2, columns + 2) that show a board."""
+    inside = around[..., 1:-1, 1:-1]
+    borders = [inside[..., 0, :], inside[..., -1, :], inside[..., 0], inside[..., -1]]
+    beyond = [around[..., 0, 1:-1], around[..., -1, 1:-1], around[..., 1:-1, 0], around[..., 1:-1, -1]]
+    filled = inside.mean(axis=(-2, -1)) >= MIN_FILLED
+    ends = np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
+    return np.asarray(filled & ends & (np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND))
 
 
 def _rotated_quarter(corners: Array) -> Array:
@@ -69,11 +71,12 @@ def largest_rectangle(grid: Grid) -> tuple[int, int]:
     """Return columns and rows of the largest full rectangle in a grid: the size of a board that may be present."""
     known = np.isfinite(grid_to_array(grid)[..., 0])
     heights, best = np.zeros(known.shape[1], int), (0, 0)
+    widths = np.arange(1, known.shape[1] + 1)
     for row in known:
         heights = np.where(row, heights + 1, 0)
-        for i in range(len(heights)):
+        for i in np.flatnonzero(heights):
             lowest = np.minimum.accumulate(heights[i:])
-            width = int(np.argmax(lowest * np.arange(1, len(lowest) + 1))) + 1
+            width = int(np.argmax(lowest * widths[:len(lowest)])) + 1
             best = max(best, (width, int(lowest[width - 1])), key=lambda sides: sides[0] * sides[1])
     return best
 

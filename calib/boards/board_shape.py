@@ -98,17 +98,34 @@ def is_complete_board(image: Grey, corners: Array) -> bool:
 
     Brickwork and chequered floors continue beyond that ring.
     """
+    around, beyond = _outer_steps(image, corners)
+    return _fraction_above(around, MIN_STEP) >= MIN_AROUND and not _goes_on(beyond)
+
+
+def is_bounded_board(image: Grey, corners: Array) -> bool:
+    """True if no second ring of squares surrounds the corners (rows, columns, 2); the first may be hidden."""
+    return not _goes_on(_outer_steps(image, corners)[1])
+
+
+def _goes_on(beyond: Sequence[Sequence[Array]]) -> bool:
+    return max(_fraction_above(side, BEYOND_STEP) for side in beyond) > MAX_BEYOND
+
+
+def _outer_steps(image: Grey, corners: Array) -> tuple[list[Array], list[list[Array]]]:
+    """Return the grey steps in the ring of squares around the corners, and of the second ring by side.
+
+    Steps are in parts of the median step within the board, above 0 where the colours alternate.
+    """
     level = _square_means(image, corners)
     sign = np.where(np.indices(level.shape).sum(axis=0) % 2 == 0, 1.0, -1.0)
     down, along = np.diff(level, axis=0) * sign[1:], np.diff(level, axis=1) * sign[:, 1:]
     usual = float(np.nanmedian(np.concatenate([down[2:-2, 2:-2].ravel(), along[2:-2, 2:-2].ravel()])))
     down, along = down / usual, along / usual
-    beyond = ((along[0, 1:-1], down[0, 1:-1]), (along[-1, 1:-1], down[-1, 1:-1]),
-              (down[1:-1, 0], along[1:-1, 0]), (down[1:-1, -1], along[1:-1, -1]))
-    around = (along[1, 1:-1], along[-2, 1:-1], down[1:-1, 1], down[1:-1, -2], down[1, 1:-1], down[-2, 1:-1],
-              along[1:-1, 1], along[1:-1, -2])
-    goes_on = max(_fraction_above(side, BEYOND_STEP) for side in beyond) > MAX_BEYOND
-    return _fraction_above(around, MIN_STEP) >= MIN_AROUND and not goes_on
+    beyond = [[along[0, 1:-1], down[0, 1:-1]], [along[-1, 1:-1], down[-1, 1:-1]],
+              [down[1:-1, 0], along[1:-1, 0]], [down[1:-1, -1], along[1:-1, -1]]]
+    around = [along[1, 1:-1], along[-2, 1:-1], down[1:-1, 1], down[1:-1, -2], down[1, 1:-1], down[-2, 1:-1],
+              along[1:-1, 1], along[1:-1, -2]]
+    return around, beyond
 
 
 def _fraction_above(steps: Sequence[Array], least: float) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib.models.camera import Array
 
@@ -172,13 +173,15 @@ def _merge_levels(levels: list[CornerCandidates]) -> CornerCandidates:
 
 
 def _suppress_duplicates(pixels: Array, reach: Array) -> NDArray[np.intp]:
-    """Return indices of the points without an earlier point within their reach [px]."""
-    cells: dict[tuple[int, int], list[int]] = {}
-    side, kept = float(reach.max(initial=SAME_PX)), []
-    for index, (u, v) in enumerate(pixels):
-        cell = (int(u // side), int(v // side))
-        near = [j for du in (-1, 0, 1) for dv in (-1, 0, 1) for j in cells.get((cell[0] + du, cell[1] + dv), ())]
-        if not any(np.hypot(*(pixels[j] - pixels[index])) < max(reach[j], reach[index]) for j in near):
-            cells.setdefault(cell, []).append(index)
-            kept.append(index)
-    return np.array(kept, dtype=np.intp)
+    """Return indices of the points without an earlier, kept point within the reach [px] of one of the two."""
+    if not len(pixels):
+        return np.zeros(0, np.intp)
+    pairs = cKDTree(pixels).query_pairs(float(reach.max()), output_type="ndarray")
+    apart = np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
+    pairs = pairs[apart < reach[pairs].max(axis=1)]
+    kept = np.ones(len(pixels), bool)
+    # In order of the earlier point: it is known by then if that one is kept.
+    for earlier, later in pairs[np.argsort(pairs[:, 0], kind="stable")].tolist():
+        if kept[earlier]:
+            kept[later] = False
+    return np.flatnonzero(kept)

@@ -87,13 +87,18 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
     return cells
 
 
-def grow_grid(image: Grey, grid: Grid) -> Grid:
-    """Return the grid with every corner added that its neighbours predict and the image shows."""
+def grow_grid(image: Grey, grid: Grid, most: int = MAX_CELLS) -> Grid:
+    """Return the grid with every corner added that its neighbours predict and the image shows.
+
+    A grid of more than most corners does not grow any further.
+    """
     grid, refused = dict(grid), set[Cell]()
     contrast = _usual_contrast(image, grid)
     for _ in range(MAX_ROUNDS):
+        if len(grid) > most:
+            break
         guesses = {cell: guess for cell in _border(grid) - refused if (guess := predict(grid, cell)) is not None}
-        if not guesses or len(grid) > MAX_CELLS:
+        if not guesses:
             break
         found = _accept_predicted(image, grid, guesses, contrast)
         refused |= set(guesses) - set(found)
@@ -141,6 +146,15 @@ def spacing(grid: Grid, cell: Cell) -> float:
               if (one := grid.get((i + di, j + dj))) is not None
               and (other := grid.get((i + di - side * dj, j + dj + side * di))) is not None]
     return float(min(steps or beside, default=0.0))
+
+
+def with_clockwise_axes(grid: Grid) -> Grid:
+    """Return the grid, its axes swapped if necessary, so that columns turn clockwise to rows."""
+    turns = [np.linalg.det(np.stack([along - corner, down - corner])) for (i, j), corner in grid.items()
+             if (along := grid.get((i + 1, j))) is not None and (down := grid.get((i, j + 1))) is not None]
+    if np.sum(np.sign(turns)) >= 0:
+        return grid
+    return {(row, column): pixel for (column, row), pixel in grid.items()}
 
 
 def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -> Grid:

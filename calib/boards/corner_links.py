@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib.boards.corner_candidates import CornerCandidates, Grey, sample
 from calib.models.camera import Array
 
 # Number of nearest candidates among which an arm's neighbour is chosen.
 NEAREST = 28
-# Rows of the distance matrix computed at once, which bounds memory.
-BLOCK = 512
 # Largest angle between an arm and the line to its neighbour: edges in a mirror image are curved.
 MAX_TURN_RAD = np.deg2rad(22)
 # The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it. Its
@@ -51,17 +50,11 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[NDArray[np.
 def _pairs(pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return indices a, b (M,) of near candidates and their distances [px]."""
     near = min(NEAREST, len(pixels) - 1)
-    firsts, seconds, lengths = [], [], []
-    norm = (pixels**2).sum(axis=1)
-    for start in range(0, len(pixels), BLOCK):
-        block = pixels[start:start + BLOCK]
-        squared = np.maximum(norm[start:start + BLOCK, None] + norm - 2 * block @ pixels.T, 0.0)
-        squared[np.arange(len(block)), start + np.arange(len(block))] = np.inf
-        chosen = np.argpartition(squared, near - 1, axis=1)[:, :near]
-        firsts.append(np.repeat(start + np.arange(len(block)), near))
-        seconds.append(chosen.ravel())
-        lengths.append(np.sqrt(np.take_along_axis(squared, chosen, axis=1)).ravel())
-    return np.concatenate(firsts), np.concatenate(seconds), np.concatenate(lengths)
+    lengths, found = cKDTree(pixels).query(pixels, near + 1)
+    first = np.repeat(np.arange(len(pixels)), near + 1)
+    second, length = found.ravel().astype(np.int64), lengths.ravel()
+    other = first != second
+    return first[other], second[other], length[other]
 
 
 def _arms(corners: CornerCandidates, a: NDArray[np.int64], b: NDArray[np.int64]

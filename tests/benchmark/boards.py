@@ -1,5 +1,7 @@
 """Board detection in hard renderings, compared with OpenCV: `python -m tests.benchmark.boards [--seed 1] [--count 50]`.
 
+`--near`: near, large and slanted boards in wide-angle lenses, some with a frame that covers their edge.
+
 A board is found if all its corners are near the true ones, and wrong if one is not: a wrong board corrupts a
 calibration without notice. omnid's detector is also applied to the same scenes without the board, where every detection
 is wrong.
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
 from calib.models.camera import Array
+from tests.benchmark.boards_near import render_near_board
 from tests.benchmark.boards_rendered import HardBoard, render_hard_board
 
 # Tolerance of a corner in parts of its square's narrower side, or in pixels; the next edge is half a side away.
@@ -82,10 +85,12 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="number of the first image")
     parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--near", action="store_true", help="boards near a wide-angle lens")
     args = parser.parse_args(arguments)
+    render = render_near_board if args.near else render_hard_board
     sums = {name: Counter[str]() for name in DETECTORS}
     for number in range(args.first, args.first + args.count):
-        rendered = render_hard_board(args.seed, number)
+        rendered = render(args.seed, number)
         outcomes_of = {name: count([rendered], detect, empty=name == "omnid") for name, detect in DETECTORS.items()}
         for name, found in outcomes_of.items():
             sums[name] += found

@@ -8,6 +8,7 @@ import pytest
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
 from tests.benchmark.boards import DETECTORS, classify_detection, count, meets_requirement
+from tests.benchmark.boards_near import render_near_board
 from tests.benchmark.boards_rendered import HardBoard, render_hard_board
 
 # Small images of every kind of mirror and of many walls.
@@ -34,3 +35,13 @@ def test_classifies_a_board_shifted_by_a_square_as_wrong() -> None:
     rendered = HardBoard("", Board(5, 4, 0.03), image, image, corners)
     detections = (None, corners[::-1] + 0.5, corners + np.array([10.0, 0.0]))
     assert [classify_detection(found, rendered) for found in detections] == ["missed", "found", "wrong"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [14, 24])
+def test_finds_near_boards_whose_outer_squares_a_frame_covers(number: int) -> None:
+    """The plain detector of OpenCV misses these boards, and no ring of squares surrounds their corners."""
+    rendered = render_near_board(1, number)
+    assert classify_detection(DETECTORS["omnid"](rendered.image, rendered.board), rendered) == "found"
+    assert DETECTORS["omnid"](rendered.empty, rendered.board) is None
+    assert DETECTORS["findChessboardCorners"](rendered.image, rendered.board) is None

@@ -21,6 +21,8 @@ from tests.simulation.textures import value_noise
 SQUARE_PX = 24
 # Width of the light margin around the squares.
 MARGIN_SQUARES = 1.0
+# Paints over the edge of a print (H, W).
+Frame = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -89,10 +91,15 @@ class BoardRenderer:
 
     def render_board(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
                    contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0,
-                   walls: Sequence[Rectangle] | None = None) -> BoardImage:
-        """Render the board among walls (noisy ones if None); shadow: brightness factor of a part of the board."""
+                   walls: Sequence[Rectangle] | None = None, frame: Frame | None = None) -> BoardImage:
+        """Render the board among walls (noisy ones if None).
+
+        shadow: brightness factor of a part of the board; frame: paints what covers the edge of the print.
+        """
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
+        if frame is not None:
+            texture = frame(texture)
         texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
         board_poses_around_camera = clutter(rng) if walls is None else walls
         scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *board_poses_around_camera))

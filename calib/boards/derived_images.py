@@ -1,0 +1,89 @@
+"""Images derived from a mirror image in which a board is easier to find, with the way back to its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.models.camera import Array
+
+Image = NDArray[np.uint8]
+# Larger images are not enlarged: their boards have enough pixels.
+MAX_ENLARGED_PIXELS = 1_600_000
+# Largest width of one turn of a log-polar strip, and its width in turns: boards across its ends are seen whole.
+MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
+# Inner and outer radius of a log-polar strip, in parts of the image's smaller and larger side.
+STRIP_INNER_PART, STRIP_OUTER_PART = 1 / 16, 1 / 2
+# CLAHE (contrast limited adaptive histogram equalisation): clip limit and number of tiles per axis.
+CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
+
+
+@dataclass(frozen=True, slots=True)
+class DerivedImage:
+    """An image derived from the source image; to_source maps its pixels (N, 2) to source pixels (N, 2)."""
+
+    image: Image
+    to_source: Callable[[Array], Array]
+
+
+def derived_images(image: Image) -> Iterator[DerivedImage]:
+    """Yield the image and its derived images, the cheapest first."""
+    yield DerivedImage(image, lambda pixels: pixels)
+    yield DerivedImage(contrasted(image), lambda pixels: pixels)
+    if image.size <= MAX_ENLARGED_PIXELS:
+        yield enlarged(image)
+    yield unrolled(image)
+
+
+def contrasted(image: Image) -> Image:
+    """Return the image with raised local contrast."""
+    return cv2.createCLAHE(CLAHE_CLIP_LIMIT, (CLAHE_TILES,) * 2).apply(image).astype(np.uint8, copy=False)
+
+
+def enlarged(image: Image) -> DerivedImage:
+    """Return the image at twice its size."""
+    double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
+    return DerivedImage(double, lambda pixels: (pixels + 0.5) / 2 - 0.5)
+
+
+def unrolled(image: Image) -> DerivedImage:
+    """Return the log-polar strip about the image's middle: azimuth to the right, logarithm of the radius upwards.
+
+    It is conformal: squares stay square, and boards near the hub become larger and lose their fan shape.
+    """
+    height, width = image.shape
+    strip = cv2.remap(image, *_strip_maps((height, width)), cv2.INTER_CUBIC)
+    return DerivedImage(strip.astype(np.uint8, copy=False), partial(_strip_to_source, (height, width)))
+
+
+def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
+    """Return inner and outer radius [px] of a strip, and its pixels per radian."""
+    inner, outer = min(shape) * STRIP_INNER_PART, max(shape) * STRIP_OUTER_PART
+    return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
+
+
+def _strip_to_source(shape: tuple[int, int], pixels: Array) -> Array:
+    """Return the pixels (N, 2) of an image of that shape for pixels (N, 2) of its strip."""
+    _, outer, scale = _strip_scale(shape)
+    azimuth, radius = pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
+    return np.asarray(_middle(shape) + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
+
+
+def _middle(shape: tuple[int, int]) -> Array:
+    return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+
+
+@lru_cache(maxsize=2)
+def _strip_maps(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the tables of a strip for cv2.remap; the images of a camera have one shape."""
+    inner, outer, scale = _strip_scale(shape)
+    azimuth = np.arange(int(STRIP_TURNS * 2 * np.pi * scale)) / scale
+    radius = outer * np.exp(-np.arange(int(np.log(outer / inner) * scale)) / scale)
+    u, v = (middle + np.outer(radius, way(azimuth)) for middle, way in zip(_middle(shape), (np.cos, np.sin),
+                                                                          strict=True))
+    return u.astype(np.float32), v.astype(np.float32)
