@@ -12,6 +12,8 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated"),
     "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --map map.ply --plan plan.png",
                "replay drive.mcap --record out.mcap --method paper"),
+    "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
+              "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786"),
     "demo": ("demo", "demo --output /tmp/demo --quiet"),
     "eval": ("eval est.txt truth.txt",),
     "calibrate camera": ("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),

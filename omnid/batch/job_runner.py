@@ -1,0 +1,220 @@
+"""One job: `omnid replay` and `omnid eval` in programs of their own, so that nothing that a log does stops the others.
+
+The results are written into a folder of the attempt, which takes its place at the end: a program that was killed
+leaves nothing that looks like a result.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from omnid.batch.jobs import Job, file_system, is_url, one_line
+
+RESULT_FILE: Final = "result.json"
+LOG_FILE: Final = "messages.txt"
+_ATTEMPT: Final = ".attempt-"
+_END_S: Final = 10.0  # for a program to end after SIGTERM
+_MAX_MESSAGES: Final = 64 * 1024  # bytes of a program's messages that are kept
+# One thread for each program: as many programs run as there are cores.
+_ENVIRONMENT: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+
+_RUNNING: set[subprocess.Popen[str]] = set()  # programs that run now: at most one for each worker
+OK, NO_POSE, FAILED, KILLED, TIMED_OUT = "ok", "no pose", "failed", "killed", "timed out"
+
+
+class BatchInterrupted(Exception):  # noqa: N818 - no error of the job
+    """The batch ends before the program of a job has ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobResult:
+    """A row of the table. Numbers of a log that failed are NaN or 0."""
+
+    name: str
+    log: str
+    status: str = FAILED  # one of the constants above
+    error: str = ""
+    seconds: float = 0.0
+    attempts: int = 1
+    pairs: int = 0
+    poses: int = 0
+    length_m: float = math.nan
+    tracking: int = 0
+    degraded: int = 0
+    lost: int = 0
+    resets: int = 0
+    dropped: int = 0
+    warnings: int = 0
+    length_error_ratio: float = math.nan  # of the truth, as the next three
+    ate_rmse_m: float = math.nan
+    end_error_m: float = math.nan
+    heading_max_rad: float = math.nan
+    key: str = field(default="", repr=False)  # of the job
+
+
+def run_job(job: Job) -> JobResult:
+    """Run a job and return its result, which is also in its folder; never raises for what a log contains.
+
+    Raise BatchInterrupted after `end_programs`: then there is no result.
+    """
+    started_s = time.monotonic()
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    attempt = Path(tempfile.mkdtemp(prefix=f"{_ATTEMPT}{job.folder.name}-", dir=job.folder.parent))
+    try:
+        values = _attempt(job, attempt)
+        result = JobResult(name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=job.key(),
+                           **values)
+        (attempt / RESULT_FILE).write_text(json.dumps(plain(result), indent=1) + "\n")
+        _replace(attempt, job.folder)
+        return result
+    finally:
+        shutil.rmtree(attempt, ignore_errors=True)
+
+
+def stored_result(job: Job) -> JobResult | None:
+    """Return the result of an earlier run of the same job, None without one or where it failed."""
+    try:
+        stored: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
+        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in stored.items()}
+        result = JobResult(**values)
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
+    return result if result.key == job.key() and result.status in (OK, NO_POSE) else None
+
+
+def plain(result: JobResult) -> dict[str, Any]:
+    """Return a row by names, with None in place of NaN."""
+    values = {name: getattr(result, name) for name in JobResult.__slots__}
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in values.items()}
+
+
+def _attempt(job: Job, folder: Path) -> dict[str, Any]:
+    """Return the values of a row beside name, log, time and key."""
+    try:
+        log = _local(job.log, folder)
+    except Exception as error:  # any of the many that the file systems raise
+        return {"status": FAILED, "error": one_line(error)}
+    outputs = ["--tum", "est.txt", "--map", "map.ply", "--plan", "plan.png"]
+    if job.options.record:
+        outputs += ["--record", "recording.mcap"]
+    code, text = _omnid(["replay", str(log), *job.options.arguments, *outputs, "--inline", "--quiet", "--json"], folder,
+                        job.options.timeout_s)
+    values = _failure(code, folder) | _counters(text)
+    if code == 0 and (truth := _truth(job, log)) is not None:
+        values |= _compared(folder, truth, job.options.timeout_s)
+    if code in (0, 1) and job.options.record:
+        _omnid(["report", "recording.mcap", "-o", "report.html"], folder, job.options.timeout_s)
+    if is_url(job.log):
+        log.unlink(missing_ok=True)
+    return values
+
+
+def _local(log: str, folder: Path) -> Path:
+    """Return the path of a log; one at an address is fetched into the folder."""
+    if not is_url(log):
+        return Path(log)
+    path = folder / log.rpartition("/")[2]
+    file_system(log).get_file(log, str(path))
+    return path
+
+
+def _omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | None, str]:
+    """Run omnid in a folder; return its exit code, None after the time, and what it printed."""
+    command = [sys.executable, "-m", "omnid", *words]
+    with (folder / LOG_FILE).open("ab") as messages:
+        process = subprocess.Popen(command, cwd=folder, env={**os.environ, **_ENVIRONMENT}, stdin=subprocess.DEVNULL,
+                                   stdout=subprocess.PIPE, stderr=messages, text=True)
+        _RUNNING.add(process)
+        try:
+            text, _ = process.communicate(timeout=timeout_s)
+            if process not in _RUNNING:
+                raise BatchInterrupted
+            return process.returncode, text
+        except subprocess.TimeoutExpired:
+            return None, ""
+        finally:
+            _end(process)
+            _RUNNING.discard(process)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a program that still runs: it is asked first, so that it leaves no wheel turning and no file half written."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def end_programs() -> None:
+    """End the programs of the jobs that run now, so that an interrupted batch leaves none; their results are lost."""
+    while _RUNNING:
+        _RUNNING.pop().terminate()
+
+
+def remove_attempts(out: Path) -> None:
+    """Remove what programs that were killed have left in the folder of a batch."""
+    for left in out.glob(f"{_ATTEMPT}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _failure(code: int | None, folder: Path) -> dict[str, Any]:
+    status = {0: OK, 1: NO_POSE, None: TIMED_OUT}.get(code, FAILED if code is None or code > 0 else KILLED)
+    lines = (folder / LOG_FILE).read_bytes()[-_MAX_MESSAGES:].decode("utf-8", "replace").strip().splitlines()
+    problem = one_line(lines[-1]).removeprefix("omnid: ") if lines and status not in (OK, NO_POSE) else ""
+    if status == KILLED:
+        problem = f"the program ended by signal {-(code or 0)}"
+    return {"status": status, "error": problem, "warnings": sum(": warning: " in line for line in lines)}
+
+
+def _counters(text: str) -> dict[str, Any]:
+    """Return the values of the summary that a replay prints as JSON; none of one that printed no summary."""
+    try:
+        counters = json.loads(text)["counters"]
+        return {"pairs": counters["pairs"], "poses": counters["poses"], "length_m": _number(counters["length_m"]),
+                **counters["states"], "resets": counters["resets"], "dropped": sum(counters["drops"].values())}
+    except (ValueError, KeyError, TypeError):
+        return {}
+
+
+def _truth(job: Job, log: Path) -> Path | None:
+    """Return the truth beside a log, if there is one."""
+    path = (log if log.is_dir() else log.parent) / job.options.truth
+    return path if job.options.truth and not is_url(job.log) and path.is_file() else None
+
+
+def _compared(folder: Path, truth: Path, timeout_s: float) -> dict[str, Any]:
+    """Return the errors against the truth; where they cannot be computed, the messages say why."""
+    _, text = _omnid(["eval", "est.txt", str(truth), "--json"], folder, timeout_s)
+    with suppress(ValueError, KeyError, TypeError):
+        found = json.loads(text)
+        return {name: _number(found[name])
+                for name in ("length_error_ratio", "ate_rmse_m", "end_error_m", "heading_max_rad")}
+    return {}
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _replace(new: Path, folder: Path) -> None:
+    """Put a folder in the place of another one."""
+    if folder.exists():
+        old = Path(tempfile.mkdtemp(prefix=f"{_ATTEMPT}old-", dir=folder.parent))
+        os.replace(folder, old / "folder")
+        shutil.rmtree(old, ignore_errors=True)
+    os.replace(new, folder)
+    folder.chmod(0o755)  # that of a temporary folder is for its owner only

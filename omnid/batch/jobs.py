@@ -1,0 +1,149 @@
+"""The logs of a batch: found by names, folders, patterns and addresses, each with a folder for its results."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from drivers.logs.log_formats import LOG_SUFFIXES, parts_in_order
+from omnid.errors import OmnidError
+from omnid.version import __version__
+
+MAX_LOGS: Final = 100_000
+_WILDCARDS: Final = ("*", "?", "[")
+_URL: Final = re.compile(r"[a-z][a-z0-9+.-]*://")
+_UNSAFE: Final = re.compile(r"[^\w.-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOptions:
+    """The same for all logs. Paths are absolute, because a worker may run elsewhere."""
+
+    arguments: tuple[str, ...] = ()  # of `omnid replay`, beside log and outputs
+    truth: str = "truth.txt"  # name of a trajectory beside a log, which is compared where it exists; "": none
+    record: bool = False  # keep a recording and a report of each log
+    timeout_s: float = 3600.0  # for one log
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One log and its folder."""
+
+    name: str  # of the folder below that of the batch
+    log: str  # path or address
+    folder: Path
+    options: BatchOptions
+
+    def key(self) -> str:
+        """Return a number that changes with the log, the options or the version of omnid: results of another are old.
+        """
+        state: list[Any] = [__version__, asdict(self.options), self.log]
+        if not is_url(self.log):
+            state += [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in _files(Path(self.log))]
+        return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:16]
+
+
+def is_url(name: str) -> bool:
+    """True if a name is an address such as s3://bucket/log.mcap."""
+    return _URL.match(name) is not None
+
+
+def find_logs(names: Sequence[str]) -> list[str]:
+    """Return the logs of names, folders, patterns and addresses, sorted, each once; raise OmnidError without one.
+
+    A folder that is a log itself counts as one; of others all logs below it are taken.
+    """
+    found = sorted({log for name in names for log in (_of_url(name) if is_url(name) else _of_name(name))})
+    if len(found) > MAX_LOGS:
+        raise OmnidError(f"batch: {len(found)} logs; expected {MAX_LOGS} at most; give a part of them")
+    return found
+
+
+def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
+    """Return the jobs of logs; their folders have the names of the logs below their common folder."""
+    paths = [PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
+             for log in logs]
+    common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path("/")
+    names = _distinct(_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))) for path in paths)
+    return [Job(name, log, out / name, options) for name, log in zip(names, logs, strict=True)]
+
+
+def _distinct(names: Iterable[str]) -> list[str]:
+    """Return names of which none stands twice: a.mcap and a.db3 are two logs."""
+    seen: dict[str, int] = {}
+    found = []
+    for name in names:
+        count = seen[name] = seen.get(name, 0) + 1
+        found.append(name if count == 1 else f"{name}-{count}")
+    return found
+
+
+def _of_name(name: str) -> list[str]:
+    path = Path(name)
+    if path.exists():
+        paths = list(_of_path(path))
+    elif any(sign in name for sign in _WILDCARDS):
+        paths = [log for match in glob.glob(name, recursive=True) for log in _of_path(Path(match))]
+    else:
+        raise OmnidError(f"batch: no log {name!r}; give files, folders, patterns in quotes, or addresses")
+    if not paths:
+        raise OmnidError(f"batch: no log ({' '.join(LOG_SUFFIXES)}) in {name!r}; give files, folders or patterns")
+    return [str(log.absolute()) for log in paths]
+
+
+def _of_path(path: Path) -> Iterator[Path]:
+    """Yield a file, a folder with the parts of one log, or the logs below a folder."""
+    if not path.is_dir():
+        yield path
+        return
+    inside = sorted(file for file in path.iterdir() if file.suffix in LOG_SUFFIXES and file.is_file())
+    if len(inside) > 1 and parts_in_order(inside):
+        yield path
+        return
+    yield from inside
+    for folder in sorted(folder for folder in path.iterdir() if folder.is_dir()):
+        yield from _of_path(folder)
+
+
+def _of_url(name: str) -> list[str]:
+    """Return the logs of an address, which may be a pattern, through fsspec."""
+    files = file_system(name)
+    try:
+        found = files.glob(name) if any(sign in name for sign in _WILDCARDS) else [name] * files.exists(name)
+        logs = [files.unstrip_protocol(path) for path in found]
+    except Exception as error:  # any of the many that the file systems raise
+        raise OmnidError(f"batch: {name!r} cannot be listed: {one_line(error)}") from error
+    if not logs:
+        raise OmnidError(f"batch: nothing at {name!r}; give files, or a pattern such as s3://bucket/2026-*/*.mcap")
+    return sorted(logs)
+
+
+def file_system(name: str) -> Any:
+    """Return fsspec's file system of an address; raise OmnidError where it is not installed."""
+    try:
+        import fsspec
+    except ImportError as error:
+        raise OmnidError(f"batch: {name!r} needs fsspec, and for s3:// s3fs: install the extra `fleet` of omnid") \
+            from error
+    try:
+        return fsspec.core.url_to_fs(name)[0]
+    except (ValueError, ImportError) as error:
+        raise OmnidError(f"batch: {name!r}: {one_line(error)}") from error
+
+
+def one_line(error: object) -> str:
+    """Return a message without line breaks, of at most 300 characters."""
+    return " ".join(str(error).split())[:300]
+
+
+def _files(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_file():
+            yield file, file.stat()

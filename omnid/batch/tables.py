@@ -1,0 +1,94 @@
+"""The results of a batch as CSV, Parquet and a page that links to each."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from omnid.batch.job_runner import OK, JobResult, plain
+from omnid.report.page import page, table
+
+CSV_FILE: Final = "results.csv"
+PARQUET_FILE: Final = "results.parquet"
+INDEX_FILE: Final = "index.html"
+COLUMNS: Final = tuple(name for name in JobResult.__slots__ if name != "key")
+_STYLE: Final = "body{max-width:none}.bad{color:#a40}"
+_HEAD: Final = ("log", "", "status", "pairs", "length", "tracking", "degraded", "lost", "resets", "ATE", "length error",
+                "time")
+_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # first characters that spreadsheets execute
+
+
+def write_tables(results: Sequence[JobResult], out: Path) -> list[Path]:
+    """Write the tables into a folder, Parquet only where pyarrow is installed; return their paths."""
+    ordered = sorted(results, key=lambda result: result.name)
+    written = [out / CSV_FILE, out / INDEX_FILE]
+    _write(written[0], _csv(ordered))
+    _write(written[1], page("omnid batch", _index(ordered, out), _STYLE))
+    try:
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+    except ImportError:
+        return written
+    rows = [{name: plain(result)[name] for name in COLUMNS} for result in ordered]
+    parquet.write_table(arrow.Table.from_pylist(rows), out / PARQUET_FILE)
+    return [*written, out / PARQUET_FILE]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that is complete at any time."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(text, "utf-8", newline="")
+    os.replace(part, path)
+
+
+def _csv(results: Sequence[JobResult]) -> str:
+    from io import StringIO
+
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for result in results:
+        values = plain(result)
+        writer.writerow(["" if values[name] is None else _safe(values[name]) for name in COLUMNS])
+    return text.getvalue()
+
+
+def _safe(value: object) -> object:
+    """Return a cell that a spreadsheet does not execute: names of logs may come from anywhere."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def _index(results: Sequence[JobResult], out: Path) -> list[str]:
+    counts = Counter(result.status for result in results)
+    total_s = sum(result.seconds for result in results)
+    summary = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    head = f"<h1>omnid batch</h1><p>{len(results)} logs: {escape(summary or 'none')}; {total_s:.0f} s of work.</p>"
+    return [head, table(_HEAD, [_row(result, out) for result in results])]
+
+
+def _row(result: JobResult, out: Path) -> tuple[str, ...]:
+    folder = quote(result.name)
+    name = escape(result.name)
+    links = " ".join(f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES
+                     if (out / result.name / file).is_file())
+    said = escape(f"{result.status}: {result.error}" if result.error else result.status)
+    status = said if result.status == OK else f"<span class='bad'>{said}</span>"
+    return (name, links, status, str(result.pairs), _metres(result.length_m), str(result.tracking),
+            str(result.degraded), str(result.lost), str(result.resets), _metres(result.ate_rmse_m, 4),
+            "" if math.isnan(result.length_error_ratio) else f"{result.length_error_ratio:+.3%}",
+            f"{result.seconds:.1f} s")
+
+
+_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"), ("map.ply", "map"),
+                 ("messages.txt", "messages"))
+
+
+def _metres(value: float, digits: int = 2) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f} m"

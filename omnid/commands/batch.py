@@ -1,0 +1,124 @@
+"""`omnid batch`: replay many logs, on this machine or on a dask cluster, into one folder with one table."""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from omnid.batch.jobs import BatchOptions
+    from omnid.batch.workers import Workers
+
+MAX_JOBS = 256
+LOCK_FILE = ".lock"
+TABLES_S = 5.0  # shortest time from one writing of the tables to the next, before the end
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `batch` to the command line."""
+    parser = subparsers.add_parser("batch", help="replay many logs into one table; goes on where it was interrupted")
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="files, folders, patterns in quotes, or addresses such "
+                        "as s3://bucket/*.mcap (extra `fleet`)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder for each log, results.csv, "
+                        "index.html, and results.parquet where pyarrow is installed")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
+    parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
+    parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (TOML) of all replays")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE",
+                        help="change one setting; may be repeated")
+    parser.add_argument("--truth", default="truth.txt", metavar="NAME", help="trajectory beside each log, which is "
+                        "compared where it exists; default %(default)s")
+    parser.add_argument("--record", action="store_true", help="keep a recording and a report of each log")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
+                        help="logs at a time on this machine; default: the number of cores, %(default)s")
+    parser.add_argument("--dask", metavar="ADDRESS", help="run on the workers of this dask scheduler, such as "
+                        "tcp://HOST:8786; they need the same paths (extra `fleet`)")
+    parser.add_argument("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the jobs that have no result yet; return 1 where a log failed."""
+    from omnid.batch.job_runner import OK, remove_attempts, stored_result
+    from omnid.batch.jobs import find_logs, jobs
+    from omnid.batch.tables import write_tables
+    from omnid.errors import OmnidError
+
+    if not 1 <= args.jobs <= MAX_JOBS or not args.timeout_s > 0:
+        raise OmnidError(f"batch: --jobs {args.jobs} --timeout-s {args.timeout_s:g}: expected 1 to {MAX_JOBS} jobs and "
+                         "a time above 0")
+    all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
+    workers = _workers(args)
+    signal.signal(signal.SIGTERM, _interrupt)
+    with _locked(args.out):
+        remove_attempts(args.out)
+        stored = {job.name: result for job in all_jobs if (result := stored_result(job)) is not None}
+        if stored:
+            print(f"{len(stored)} of {len(all_jobs)} logs have their results already", file=sys.stderr)
+        results, next_s = dict(stored), 0.0
+        for result in workers([job for job in all_jobs if job.name not in stored]):
+            results[result.name] = result
+            said = result.error if result.status != OK else f"{result.length_m:.3f} m"
+            print(f"{len(results)}/{len(all_jobs)}  {result.name}: {result.status}, {said}, {result.seconds:.1f} s",
+                  file=sys.stderr)
+            if time.monotonic() > next_s:
+                write_tables(list(results.values()), args.out)
+                next_s = time.monotonic() + TABLES_S
+        written = write_tables(list(results.values()), args.out)
+    counts = Counter(result.status for result in results.values())
+    print(", ".join(f"{count} {status}" for status, count in counts.most_common()))
+    print("\n".join(map(str, written)))
+    return int(set(counts) != {OK})
+
+
+def _options(args: argparse.Namespace) -> BatchOptions:
+    from omnid.batch.jobs import BatchOptions
+    from omnid.config import load_config
+
+    load_config(args.config, args.overrides)  # a mistake is told now, and not by each log
+    arguments: list[str] = []
+    for option, path in (("--rig", args.rig), ("--config", args.config)):
+        if path is not None:
+            arguments += [option, str(path.absolute())]
+    for option, topic in (("--lower", args.lower), ("--upper", args.upper)):
+        arguments += [] if topic is None else [option, topic]
+    for override in args.overrides:
+        arguments += ["--set", override]
+    return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s)
+
+
+def _workers(args: argparse.Namespace) -> Workers:
+    from omnid.batch.workers import dask_workers, local_workers
+
+    return dask_workers(args.dask) if args.dask else local_workers(args.jobs)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    """End as after Ctrl-C: the programs of the jobs end, too."""
+    raise KeyboardInterrupt
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Keep other batches out of a folder, which is created."""
+    from omnid.errors import OmnidError
+
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / LOCK_FILE).open("wb") as file:
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OmnidError(f"batch: another batch writes into {str(out)!r}; wait for it, or give another --out") \
+                from error
+        yield

@@ -1,0 +1,216 @@
+"""`omnid batch` on short real logs: results, resumption, killed programs, interruption, tables, addresses."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from omnid.batch.job_runner import FAILED, KILLED, OK, JobResult, run_job, stored_result
+from omnid.batch.jobs import BatchOptions, find_logs, jobs
+from omnid.batch.tables import write_tables
+from omnid.batch.workers import dask_workers
+from omnid.errors import OmnidError
+
+SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
+BYTES = 450_000  # of the sample: some pairs and the rig that is attached
+DEADLINE_S = 60.0
+
+
+def short_log(path: Path, count: int = BYTES) -> Path:
+    """The start of the sample: a recording that was cut, but one with poses."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with SAMPLE.open("rb") as sample:
+        path.write_bytes(sample.read(count))
+    return path
+
+
+def omnid(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "omnid", *map(str, words)], capture_output=True, text=True,
+                          timeout=4 * DEADLINE_S)
+
+
+def rows(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "results.csv").open(newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def wait_until(done: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + DEADLINE_S
+    while not done():
+        assert time.monotonic() < end_s, "nothing happened in time"
+        time.sleep(0.02)
+
+
+def replays_of(log: Path) -> list[int]:
+    """The processes that replay a log."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"replay" in words and os.fsencode(log) in words:
+            found.append(int(folder.name))
+    return found
+
+
+def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: Path) -> None:
+    good, out = short_log(tmp_path / "logs" / "day1" / "log.mcap"), tmp_path / "out"
+    short_log(tmp_path / "logs" / "day2" / "log.mcap", BYTES + 60_000)
+    (tmp_path / "logs" / "broken.mcap").write_text("no log")
+    single = omnid("replay", good, "--tum", tmp_path / "est.txt", "--map", tmp_path / "map.ply", "--plan",
+                   tmp_path / "plan.png", "--quiet")
+    assert single.returncode == 0
+    done = omnid("batch", tmp_path / "logs", "--out", out, "--jobs", 2)
+    assert done.returncode == 1 and "2 ok, 1 failed" in done.stdout, done.stderr
+    for name in ("est.txt", "map.ply", "plan.png"):
+        assert (out / "day1-log" / name).read_bytes() == (tmp_path / name).read_bytes()
+    found = rows(out)
+    assert [found[name]["status"] for name in ("broken", "day1-log", "day2-log")] == ["failed", "ok", "ok"]
+    assert "is not an MCAP log" in found["broken"]["error"] and int(found["day1-log"]["pairs"]) >= 3
+    assert "day1-log/plan.png" in (out / "index.html").read_text()
+
+    # What is done is not done again; what failed is; a changed option changes all results.
+    before = (out / "day1-log" / "result.json").stat().st_mtime_ns
+    short_log(tmp_path / "logs" / "broken.mcap")
+    again = omnid("batch", tmp_path / "logs", "--out", out)
+    assert again.returncode == 0 and "2 of 3 logs have their results already" in again.stderr, again.stderr
+    assert (out / "day1-log" / "result.json").stat().st_mtime_ns == before
+    assert rows(out)["broken"]["status"] == "ok"
+    (changed,) = [job for job in jobs(find_logs([str(tmp_path / "logs")]), out,
+                                      BatchOptions(("--set", "odometry.limits.features=300"))) if job.log == str(good)]
+    assert stored_result(changed) is None
+
+
+def test_a_truth_beside_the_log_is_compared(tmp_path: Path) -> None:
+    log = short_log(tmp_path / "logs" / "log.mcap")
+    assert omnid("replay", log, "--tum", log.parent / "truth.txt", "--quiet").returncode == 0
+    (job,) = jobs(find_logs([str(log)]), tmp_path / "out", BatchOptions())
+    result = run_job(job)
+    assert result.status == OK and result.ate_rmse_m == 0.0 and result.length_error_ratio == 0.0
+
+
+def test_a_job_whose_program_is_killed_is_run_again(tmp_path: Path) -> None:
+    log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
+    with subprocess.Popen([sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)], text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
+        wait_until(lambda: bool(replays_of(log)))
+        os.kill(replays_of(log)[0], signal.SIGKILL)
+        text, messages = batch.communicate(timeout=DEADLINE_S)
+    assert batch.returncode == 0 and "1 ok" in text, messages
+    assert rows(out)["log"]["attempts"] == "2"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_an_interrupted_batch_leaves_no_program_and_goes_on_later(
+    tmp_path: Path, number: signal.Signals, default_signals: None
+) -> None:
+    log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
+    with subprocess.Popen([sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)],
+                          stderr=subprocess.PIPE, stdout=subprocess.PIPE) as batch:
+        wait_until(lambda: bool(replays_of(log)))
+        second = omnid("batch", log, "--out", out)
+        assert second.returncode == 2 and "another batch writes into" in second.stderr
+        batch.send_signal(number)
+        batch.communicate(timeout=DEADLINE_S)
+    assert batch.returncode == 130
+    wait_until(lambda: not replays_of(log))
+    assert not (out / "log").exists()
+    assert omnid("batch", log, "--out", out).returncode == 0
+    assert sorted(path.name for path in out.iterdir()) == [".lock", "index.html", "log", "results.csv"] or (
+        out / "results.parquet").exists()
+
+
+def test_a_log_that_takes_too_long_is_ended(tmp_path: Path) -> None:
+    (job,) = jobs(find_logs([str(SAMPLE)]), tmp_path, BatchOptions(timeout_s=0.3))
+    assert run_job(job).status == "timed out"
+
+
+def test_finds_logs(tmp_path: Path) -> None:
+    for name in ("a/1.mcap", "a/2.mcap", "a/notes.txt", "b/bag_0.db3", "b/bag_1.db3", "b/metadata.yaml", "c/x.bag"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    everything = [str(tmp_path / name) for name in ("a/1.mcap", "a/2.mcap", "b", "c/x.bag")]
+    assert find_logs([str(tmp_path)]) == everything
+    assert find_logs([str(tmp_path / "*/*.mcap"), str(tmp_path / "a/1.mcap")]) == everything[:2]
+    assert [job.name for job in jobs(everything, tmp_path, BatchOptions())] == ["a-1", "a-2", "b", "c-x"]
+    assert [job.name for job in jobs(["/x/a.mcap", "/x/a.db3"], tmp_path, BatchOptions())] == ["a", "a-2"]
+    for missing in ("nowhere.mcap", "nowhere/*.mcap"):
+        with pytest.raises(OmnidError, match="batch: no log"):
+            find_logs([str(tmp_path / missing)])
+
+
+def test_reads_logs_at_addresses(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    log = short_log(tmp_path / "logs" / "log.mcap")
+    assert find_logs([f"file://{tmp_path}/logs/*.mcap"]) == [f"file://{log}"]
+    (job,) = jobs([f"file://{log}"], tmp_path / "out", BatchOptions())
+    result = run_job(job)
+    assert result.status == OK and not list(job.folder.glob("*.mcap"))
+    with pytest.raises(OmnidError, match="nothing at"):
+        find_logs([f"file://{tmp_path}/logs/*.bag"])
+
+
+def test_tables_hold_names_that_are_no_formulas_and_no_html(tmp_path: Path) -> None:
+    write_tables([JobResult("=1+1", "/logs/<b>.mcap", FAILED, "<script>alert(1)</script>"), JobResult("a", "/a", OK)],
+                 tmp_path)
+    assert "'=1+1" in rows(tmp_path)
+    text = (tmp_path / "index.html").read_text()
+    assert "<script>" not in text and "&lt;script&gt;" in text
+
+
+def test_a_stored_result_of_another_version_or_with_damage_is_none(tmp_path: Path) -> None:
+    log = short_log(tmp_path / "log.mcap", 1000)
+    (job,) = jobs(find_logs([str(log)]), tmp_path / "out", BatchOptions())
+    job.folder.mkdir(parents=True)
+    path = job.folder / "result.json"
+    for text in ("", "{", "[]", json.dumps({"name": 1}), json.dumps({"name": "log", "log": "x", "status": OK})):
+        path.write_text(text)
+        assert stored_result(job) is None
+    path.write_text(json.dumps({"name": "log", "log": "x", "status": OK, "key": job.key()}))
+    assert stored_result(job) is not None
+    os.utime(log, (1, 1))
+    assert stored_result(job) is None
+
+
+def test_wrong_options_are_one_line(tmp_path: Path) -> None:
+    for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1")):
+        done = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
+        assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+@pytest.mark.slow
+def test_a_dask_worker_that_is_killed_costs_nothing_but_repetition(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    logs = [short_log(tmp_path / "logs" / f"{number}.mcap", BYTES + 1000 * number) for number in range(8)]
+    scheduler = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
+                                  "--port", "0", "--no-dashboard", "--scheduler-file", str(tmp_path / "scheduler")])
+    workers = []
+    try:
+        wait_until((tmp_path / "scheduler").exists)
+        address = json.loads((tmp_path / "scheduler").read_text())["address"]
+        workers = [subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1",
+                                     "--no-dashboard", "--no-nanny", "--local-directory", str(tmp_path)])
+                   for _ in range(2)]
+        results = []
+        for result in dask_workers(address)(jobs([str(log) for log in logs], tmp_path / "out", BatchOptions())):
+            results.append(result)
+            if len(results) == 1:
+                workers[0].kill()
+        assert sorted(result.name for result in results) == sorted(log.stem for log in logs)
+        assert {result.status for result in results} == {OK} and KILLED not in results
+    finally:
+        for process in (*workers, scheduler):
+            process.kill()
+            process.wait()
