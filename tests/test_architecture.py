@@ -58,6 +58,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.api":
         "calib.errors calib.models calib.rig calib.rig_file drivers.errors drivers.frame omnid.config "
         "omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
+    "omnid.batch": "drivers.logs omnid.errors omnid.report omnid.version",
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
         "calib.rig_covariance calib.se3 drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig "
@@ -67,7 +68,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.commands":
         "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "
         "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
-        "drivers.errors drivers.frame drivers.logs omnid.calibration omnid.config omnid.core.places omnid.core.rig "
+        "drivers.errors drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config omnid.core.places "
+        "omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
         "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
         "omnid.viewer omnid.web",

@@ -78,8 +78,8 @@ def _row(result: JobResult, out: Path) -> tuple[str, ...]:
     name = escape(result.name)
     links = " ".join(f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES
                      if (out / result.name / file).is_file())
-    said = escape(f"{result.status}: {result.error}" if result.error else result.status)
-    status = said if result.status == OK else f"<span class='bad'>{said}</span>"
+    outcome = escape(f"{result.status}: {result.error}" if result.error else result.status)
+    status = outcome if result.status == OK else f"<span class='bad'>{outcome}</span>"
     return (name, links, status, str(result.pairs), _metres(result.length_m), str(result.tracking),
             str(result.degraded), str(result.lost), str(result.resets), _metres(result.ate_rmse_m, 4),
             "" if math.isnan(result.length_error_ratio) else f"{result.length_error_ratio:+.3%}",

@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
         results, next_s = dict(stored), 0.0
         for result in workers([job for job in all_jobs if job.name not in stored]):
             results[result.name] = result
-            said = result.error if result.status != OK else f"{result.length_m:.3f} m"
-            print(f"{len(results)}/{len(all_jobs)}  {result.name}: {result.status}, {said}, {result.seconds:.1f} s",
+            outcome = result.error if result.status != OK else f"{result.length_m:.3f} m"
+            print(f"{len(results)}/{len(all_jobs)}  {result.name}: {result.status}, {outcome}, {result.seconds:.1f} s",
                   file=sys.stderr)
             if time.monotonic() > next_s:
                 write_tables(list(results.values()), args.out)
