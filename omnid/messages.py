@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.odometry.exposure_times import ExposureTimes
+from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light
@@ -58,22 +58,41 @@ class StereoDepth:
     Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map.
     Any thread may read. Two threads that read at the same time may both compute it, with the same result.
     rig_fits is False if the images contradict the rig, so that no result of them is better than degraded.
+
+    Where the images were exposed at several times, the depth depends on the motion in between, which the odometry
+    finds: it settles the depth before it passes it on.
     """
 
-    __slots__ = ("_compute", "_dense", "panoramas", "rig_fits", "seq", "stamp_ns")
+    __slots__ = ("_compute", "_dense", "_exposure", "_settled", "panoramas", "rig_fits", "seq", "stamp_ns")
 
-    def __init__(self, panoramas: Panoramas, compute: Callable[[Panoramas], DensePoints], *, rig_fits: bool = True
-                 ) -> None:
+    def __init__(self, panoramas: Panoramas, compute: Callable[[Panoramas, Exposure | None], DensePoints], *,
+                 rig_fits: bool = True) -> None:
         self.seq, self.stamp_ns, self.panoramas = panoramas.seq, panoramas.stamp_ns, panoramas
         self.rig_fits = rig_fits
         self._compute = compute
         self._dense: DensePoints | None = None
+        self._exposure: Exposure | None = None
+        self._settled = False
 
     def dense(self) -> DensePoints:
         """Return the dense depth; compute it the first time."""
         if self._dense is None:
-            self._dense = self._compute(self.panoramas)
+            self._dense = self._compute(self.panoramas, self._exposure)
         return self._dense
+
+    def settle(self, exposure: Exposure | None) -> None:
+        """Set the motion during the exposures, unless the depth was already computed for one."""
+        if self._dense is None:
+            self._exposure = exposure
+        self._settled = True
+
+    def disparity_at(self, exposure: Exposure | None) -> NDArray[np.float32]:
+        """Return the disparities for a motion during the exposures, and keep them if the depth is not settled."""
+        if self._settled and exposure is not None:
+            return self._compute(self.panoramas, exposure).disparity
+        if not self._settled and exposure is not self._exposure:
+            self._exposure, self._dense = exposure, None
+        return self.disparity
 
     @property
     def disparity(self) -> NDArray[np.float32]:

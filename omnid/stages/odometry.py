@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import OdometryConfig
 from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.odometry import VisualOdometry
+from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.messages import OdometryUpdate, StereoDepth
@@ -39,7 +41,8 @@ class OdometryStage:
     def __init__(self, geometry: Geometry, config: OdometryConfig, features: Callable[[], float] = all_features
                  ) -> None:
         """features: called for each keyframe, the share of the landmarks that it is to have."""
-        self._method = _method(geometry, config, features)
+        self._model = geometry.model(config.noise_px)
+        self._method = _method(self._model, config, features)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
@@ -50,8 +53,10 @@ class OdometryStage:
         self._last_ns = depth.stamp_ns
         pair = depth.panoramas
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
-        frame = StereoFrame(depth.seq, pair.lower, pair.upper, lambda: depth.disparity, usable, pair.times)
+        frame = StereoFrame(depth.seq, pair.lower, pair.upper, depth.disparity_at, usable, pair.times)
         estimate = self._method.process(frame, dt_s)
+        motion = RigVelocity(estimate.velocity, estimate.velocity_covariance)
+        depth.settle(None if pair.times is None else Exposure(pair.times, motion, self._model))
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         covariance = in_axes(T_odom_rig, self._in_rig(estimate.covariance))
         velocity = self._to_rig @ estimate.velocity
@@ -96,8 +101,7 @@ def base_pose(T_odom_rig: Array, covariance: Array, T_base_rig: Array) -> tuple[
     return T_odom_base, in_axes(T_odom_base, A @ in_axes(se3.inverse(T_odom_rig), covariance) @ A.T)
 
 
-def _method(geometry: Geometry, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:
-    model = geometry.model(config.noise_px)
+def _method(model: StereoModel, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:
     if config.method == "default":
         return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), features)
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
+from omnid.core.odometry.dense_correction import DenseCorrection
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
@@ -41,40 +43,51 @@ class Stereo:
             gate.process(panoramas)
         return StereoDepth(panoramas, self.dense, rig_fits=gate is None or not gate.doubtful)
 
-    def dense(self, panoramas: Panoramas) -> DensePoints:
-        """Return disparities and their points in the rig frame. May be called in several threads at the same time."""
-        columns, rows, found = self._match(panoramas)
+    def dense(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
+        """Return disparities and their points in the rig frame, at the stamp of the pair.
+
+        exposure: the motion during the exposures; None: unknown, or there is none. May be called in several threads at
+        the same time.
+        """
+        correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)
+        columns, rows, found = self._match(panoramas, correction)
+        views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
+        if correction is not None:
+            views, by_motion = correction.corrected(columns, rows, found)
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
-        disparity[rows, columns] = found
-        views = np.column_stack([columns, rows, rows + found]).astype(float)
+        disparity[rows, columns] = views[:, 2] - views[:, 1]
         points = triangulate(views, self._geometry.cylinder, self._geometry.rig.baseline_m)
         kept = np.isfinite(points).all(axis=1)
-        variance_m2 = self._variance_m2(points[kept])
-        points = se3.apply(self._T_rig_rect, points[kept])
-        return DensePoints(disparity, views[kept, :2], points, variance_m2)
+        variance_m2 = self._variance_m2(points[kept], by_motion[kept])
+        points, pixels = se3.apply(self._T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
+        return DensePoints(disparity, pixels.astype(float), points, variance_m2)
 
-    def _match(self, panoramas: Panoramas) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-        """Return columns (N,), rows (N,) and disparities (N,) [px] of the matched pixels."""
+    def _match(self, panoramas: Panoramas, correction: DenseCorrection | None
+               ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+        """Return columns (N,), rows (N,) and disparities (N,) [px] as seen of the matched pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
         valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
         try:
             matcher = self._idle.pop()
         except IndexError:
             matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
-        pixels, disparity = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey)
+        pixels, disparity = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey,
+                                          None if correction is None else correction.column_shift(pad))
         self._idle.append(matcher)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
 
-    def _variance_m2(self, points: Array) -> Array:
+    def _variance_m2(self, points: Array, by_motion: Array) -> Array:
         """Return variances (N,) along the rays to points (N, 3) in the rectified frame.
+
+        by_motion: variances (N,) [px^2] of their disparities by the uncertain motion between the exposures.
 
         The distance from the axis is r = f t / d, so sigma_r = r^2 / (f t) * sigma_d; along the ray it is
         sqrt(1 + z^2 / r^2) times as large.
         """
         r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
         per_px = r2 / (self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m)
-        return np.asarray((1 + z2 / r2) * (per_px * self._config.noise_px) ** 2)
+        return np.asarray((1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion))
 
     def _matching(self, height: int) -> MatchingSettings:
         """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""

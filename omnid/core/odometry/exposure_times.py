@@ -106,6 +106,20 @@ class Exposure:
         columns[known], spread_px[known] = views[known, 0] - shift.upper[:, 0], 2 * shift.column_sigma(self.motion)
         return columns, spread_px
 
+    def upper_pixels(self, pixels: Array, disparity: Array) -> tuple[Array, Array]:
+        """Return where the upper panorama shows pixels (N, 2) whose disparities (N,) at the stamp are known: (N, 2).
+
+        Also the spread (N,) of the columns, as `upper_columns`. NaN where the disparity is none.
+        """
+        known = np.flatnonzero(disparity > 0)
+        views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]
+        shift = self.shift(triangulate(views, self.model.cylinder, self.model.baseline_m))
+        # The lower pixel is known as seen: its view at the stamp differs by shift.lower.
+        upper, spread_px = np.full((len(pixels), 2), np.nan), np.full(len(pixels), np.nan)
+        upper[known] = views[:, [0, 2]] + shift.lower - shift.upper
+        spread_px[known] = 2 * shift.column_sigma(self.motion)
+        return upper, spread_px
+
     def corrected(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
         """Return views (N, 3) at the stamp of pixels (N, 2) and upper rows (N,) as seen, and their noise (N, 3, 3).
 

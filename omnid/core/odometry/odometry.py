@@ -17,6 +17,7 @@ from calib import se3
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.odometry.exposure_velocity import ExposureVelocity
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
@@ -72,6 +73,7 @@ class VisualOdometry:
         self._map = LocalMap(model, klt, limits.keyframes)
         self._frame_to_map = FrameToMap(self._map, model, klt)
         self._filter = MotionFilter()
+        self._velocity = ExposureVelocity(self._filter)
         self._static_mask = StaticMask()
         self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
@@ -93,7 +95,7 @@ class VisualOdometry:
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10).
         T_predicted = self._T_odom_rect @ self._filter.predict(min(dt_s, self._limits.max_gap_s))
 
-        exposure = self._exposure(frame, RigVelocity(*self._filter.motion(dt_s)))
+        exposure = self._exposure(frame, self._velocity.predicted(dt_s))
 
         # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
         after_refusal = self._status.refused_frames > 0
@@ -125,7 +127,7 @@ class VisualOdometry:
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
-        new = self._update_map(frame, usable, estimate, self._exposure(frame, RigVelocity(*self._filter.motion(dt_s))))
+        new = self._update_map(frame, usable, estimate, self._exposure(frame, self._velocity.predicted(dt_s)))
         features = Features(estimate.pixels, estimate.rejected, new)
         return self._result(estimate.tracked, estimate.inliers, features)
 
@@ -144,7 +146,7 @@ class VisualOdometry:
         T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
         if self._is_sudden(T_prev_curr, dt_s):
             return refined
-        motion = RigVelocity(*self._filter.after(T_prev_curr, refined.covariance, dt_s))
+        motion = self._velocity.after(T_prev_curr, refined.covariance, dt_s)
         exposure = self._exposure(frame, motion)
         coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
         return self._frame_to_map.refine(frame, coarse, exposure)
@@ -164,7 +166,7 @@ class VisualOdometry:
         for _ in range(START_ROUNDS if first is not None and 0 < dt_s <= self._limits.max_gap_s else 0):
             assert first is not None
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            motion = RigVelocity(*self._filter.after(T_prev_curr, estimate.covariance, dt_s))
+            motion = self._velocity.after(T_prev_curr, estimate.covariance, dt_s)
             self._map.clear()
             self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
             exposure = self._exposure(frame, motion)
@@ -216,17 +218,22 @@ class VisualOdometry:
     def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float) -> None:
         """Update the filter and set the pose; after a break the filter starts from standstill."""
         if self._status.refused_frames or not 0 < dt_s <= self._limits.max_gap_s:
-            self._filter.reset()
+            self._reset_motion()
         else:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             is_sudden = frame.times is not None and self._is_sudden(T_prev_curr, dt_s)
             self._filter.update(T_prev_curr, estimate.covariance, dt_s)
+            self._velocity.accept(T_prev_curr, dt_s)
             if is_sudden:
-                self._filter.reset()
+                self._reset_motion()
         self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
+
+    def _reset_motion(self) -> None:
+        self._filter.reset()
+        self._velocity.reset()
 
     def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> OdometryEstimate:
         """Continue with the predicted pose, slowing down, with a growing covariance; restart the map if need be."""
@@ -239,7 +246,7 @@ class VisualOdometry:
         self._map.clear()
         self._previous = None
         self._relocaliser.clear()
-        self._filter.reset()
+        self._reset_motion()
         self._resets += 1
         return self._start_map(frame, usable, 0.0)
 
@@ -289,21 +296,22 @@ class VisualOdometry:
         """
         free = clear_around(usable, known, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._wanted() - len(known))
-        guess = np.column_stack([points[:, 0], points[:, 1] + nearby_disparity(frame.disparity, points)])
+        dense = frame.disparity_at(exposure)
+        guess = np.column_stack([points[:, 0], points[:, 1] + nearby_disparity(dense, points)])
         spread_px: Array | float = 0.0
         if exposure:
-            guess[:, 0], spread_px = exposure.upper_columns(points, guess[:, 1])
+            guess, spread_px = exposure.upper_pixels(points, guess[:, 1] - points[:, 1])
         pair = frame.lower, frame.upper
         near = pixels_in_upper(pair, points, guess, self._stereo_klt, spread_px)
         rows, variance = align_rows(pair, points, near)
         located = np.isfinite(rows)
         keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._covariance)
-        slopes = disparity_slopes(frame.disparity, points[located], (rows - points[:, 1])[located])
         points, rows, noise = points[located], rows[located], view_noise(np.zeros((2, 2)), variance[located])
         views = np.column_stack([points, rows])
         if exposure:
             views, by_motion = exposure.corrected(points, rows)
             noise += by_motion
+        slopes = disparity_slopes(dense, points, views[:, 2] - views[:, 1])
         self._map.add_keyframe(keyframe, views, slopes, noise, points)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)

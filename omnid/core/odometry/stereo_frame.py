@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.exposure_times import ExposureTimes
+from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
 from omnid.core.odometry.tracking import PaddedPanorama
 
 
@@ -19,14 +19,19 @@ class StereoFrame:
     seq: int
     lower: PaddedPanorama
     upper: PaddedPanorama
-    disparities: NDArray[np.float32] | Callable[[], NDArray[np.float32]]  # the image, or the function that returns it
+    # The image, or the function that returns it for a motion during the exposures; None: unknown, or exposed at once.
+    disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
     times: ExposureTimes | None = None  # None: all pixels are exposed at the stamp
 
     @property
     def disparity(self) -> NDArray[np.float32]:
         """Disparities (H, W) [px] of the lower panorama, NaN: unknown."""
-        return self.disparities() if callable(self.disparities) else self.disparities
+        return self.disparity_at(None)
+
+    def disparity_at(self, exposure: Exposure | None) -> NDArray[np.float32]:
+        """Return the disparities (H, W) [px] at the stamp of the lower panorama's pixels, NaN: unknown."""
+        return self.disparities(exposure) if callable(self.disparities) else self.disparities
 
 
 def _no_pixels() -> NDArray[np.float64]:

@@ -7,6 +7,8 @@ SAD at full resolution then searches near this prior only.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,13 @@ STEP_ROWS = 16  # StereoSGBM searches a multiple of so many disparities
 SCALE = 2  # the prior is computed at half the resolution: at a quarter the courses of a brick wall are one grey
 FILL_PX = 5  # at the prior's resolution: unknown pixels take the largest disparity so near: no holes
 REACH_PX = 2  # searched about the prior
+
+
+class ColumnShift(NamedTuple):
+    """Columns by which pixels appear aside in the upper panorama: the rig moved between the exposures."""
+
+    at_infinity: Floats  # (H, W) px
+    per_disparity: Floats  # (H, W) px/px
 
 
 class SemiGlobalPrior:
@@ -74,10 +83,13 @@ class WarpedSad:
         self._window = (window_px, window_px)
         self._columns, self._rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1]))
 
-    def costs(self, lower: Image, upper: Image, prior: Floats, pixels: Indices) -> Costs:
+    def costs(self, lower: Image, upper: Image, prior: Floats, pixels: Indices, aside: ColumnShift | None = None
+              ) -> Costs:
         """Return the costs (2 REACH_PX + 1, N) of pixels (flat indices) of the lower panorama, by shift."""
-        height = len(lower)
-        warped = cv2.remap(upper, self._columns, self._rows + prior, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        height, columns = len(lower), self._columns
+        if aside is not None:
+            columns = columns + aside.at_infinity + aside.per_disparity * prior
+        warped = cv2.remap(upper, columns, self._rows + prior, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         padded = cv2.copyMakeBorder(warped, REACH_PX, REACH_PX, 0, 0, cv2.BORDER_REPLICATE)
         costs = np.empty((2 * REACH_PX + 1, len(pixels)), np.uint16)
         for shift, row in enumerate(costs):

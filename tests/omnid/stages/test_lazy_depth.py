@@ -7,6 +7,7 @@ import pytest
 
 from calib import se3
 from omnid.config import MappingConfig
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.engine.flow import Chain
 from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.mapping import Mapping
@@ -23,7 +24,7 @@ class Counted:
     def __init__(self) -> None:
         self.computed: list[int] = []
 
-    def __call__(self, panoramas: Panoramas) -> DensePoints:
+    def __call__(self, panoramas: Panoramas, _: Exposure | None = None) -> DensePoints:
         self.computed.append(panoramas.seq)
         points = np.array([[1.0, 2.0, 0.5]])
         return DensePoints(np.full((4, 100), np.nan, np.float32), np.zeros((1, 2)), points, np.full(1, 1e-4))

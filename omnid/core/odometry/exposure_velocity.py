@@ -1,0 +1,71 @@
+"""Velocity of the rig during the exposures of a pair, before the pair itself tells it.
+
+A vehicle drives and turns smoothly, which the motion filter extrapolates. It also vibrates: heave, roll and pitch
+change from pair to pair, and an extrapolation of them is worse than their mean. Which component is which depends on the
+vehicle and the floor. So both are predicted, the next pair shows how well each did, and of each component the better
+prediction is taken. The errors of the mean are its standard deviation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.motion_filter import MotionFilter
+
+Array = NDArray[np.float64]
+
+MEMORY = 12.0  # steps over which means are taken
+MIN_STEPS = 4  # of fewer the errors are not known: the filter is believed
+LEAST_SIGMA = np.repeat([1e-3, 1e-3], 3)  # m/s, rad/s: of the mean
+
+
+class ExposureVelocity:
+    """Prediction of the velocity at the stamp of each pair, in the rectified frame."""
+
+    def __init__(self, motion_filter: MotionFilter) -> None:
+        self._filter = motion_filter
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the means and errors, as after a break."""
+        self._steps = 0
+        self._mean, self._mean_squared, self._filter_squared = np.zeros(6), np.zeros(6), np.zeros(6)
+        self._previous: tuple[Array, Array, Array] | None = None  # rate, and what filter and mean predicted then
+
+    def predicted(self, dt_s: float) -> RigVelocity:
+        """Return the velocity dt_s after the last pair, whose step the filter has just predicted."""
+        return self._chosen(*self._filter.motion(dt_s), self._mean)
+
+    def after(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> RigVelocity:
+        """Return the velocity at a pair with that step from the previous one and its covariance (6, 6)."""
+        mean = self._with(se3.log(T_prev_curr) / dt_s)
+        return self._chosen(*self._filter.after(T_prev_curr, covariance, dt_s), mean)
+
+    def accept(self, T_prev_curr: Array, dt_s: float) -> None:
+        """Take note of the step that the filter was updated with; it shows the velocity at the pair before."""
+        rate = se3.log(T_prev_curr) / dt_s
+        if self._previous is not None:
+            before, of_filter, of_mean = self._previous
+            at_previous = (before + rate) / 2
+            self._steps += 1
+            gain = max(1 / MEMORY, 1 / self._steps)
+            self._filter_squared += gain * ((at_previous - of_filter) ** 2 - self._filter_squared)
+            self._mean_squared += gain * ((at_previous - of_mean) ** 2 - self._mean_squared)
+        self._mean = self._with(rate)
+        self._previous = rate, self._filter.motion(dt_s)[0], self._mean
+
+    def _with(self, rate: Array) -> Array:
+        """Return the mean with one more step."""
+        if self._previous is None:
+            return rate
+        return self._mean + max(1 / MEMORY, 1 / (self._steps + 2)) * (rate - self._mean)
+
+    def _chosen(self, of_filter: Array, covariance: Array, mean: Array) -> RigVelocity:
+        """Return the better prediction of each component."""
+        steady = (self._mean_squared < self._filter_squared) & (self._steps >= MIN_STEPS)
+        chosen = np.where(steady, mean, of_filter)
+        both = np.where(steady[:, None] | steady, 0.0, covariance)
+        return RigVelocity(chosen, both + np.diag(np.where(steady, self._mean_squared + LEAST_SIGMA**2, 0.0)))
