@@ -43,7 +43,7 @@ class DenseCorrection:
     @staticmethod
     def of(exposure: Exposure, shape: tuple[int, int]) -> DenseCorrection:
         """Return the correction of panoramas (H, W)."""
-        rows, columns = (np.arange(GRID_PX / 2 - 0.5, size, GRID_PX) for size in shape)
+        rows, columns = (GRID_PX * (np.arange(-(-size // GRID_PX)) + 0.5) - 0.5 for size in shape)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         found = [_exact(exposure, grid, disparity) for disparity in DISPARITIES_PX]
         slope = (found[1] - found[0]) / (DISPARITIES_PX[1] - DISPARITIES_PX[0])

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.motion_filter import START_VELOCITY_VARIANCE, MotionFilter
 
 Array = NDArray[np.float64]
 
 MEMORY = 12.0  # steps over which means are taken
 MIN_STEPS = 4  # of fewer the errors are not known: the filter is believed
 LEAST_SIGMA = np.repeat([1e-3, 1e-3], 3)  # m/s, rad/s: of the mean
+
+# After a start or a sudden turn.
+UNKNOWN_VELOCITY = RigVelocity(np.zeros(6), START_VELOCITY_VARIANCE * np.eye(6))
 
 
 class ExposureVelocity:

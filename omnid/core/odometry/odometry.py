@@ -17,7 +17,7 @@ from calib import se3
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.exposure_velocity import ExposureVelocity
+from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY, ExposureVelocity
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
@@ -139,14 +139,15 @@ class VisualOdometry:
 
     def _refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None, dt_s: float
                 ) -> PoseEstimate | None:
-        """Refine a pose; where the velocity matters, once more with the velocity that the pose implies."""
+        """Refine a pose; where the velocity matters, once more with that which the pose implies, or with none."""
         refined = self._frame_to_map.refine(frame, coarse, exposure)
         if refined is None or exposure is None or not 0 < dt_s <= self._limits.max_gap_s:
             return refined
         T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
         if self._is_sudden(T_prev_curr, dt_s):
-            return refined
-        motion = self._velocity.after(T_prev_curr, refined.covariance, dt_s)
+            motion = UNKNOWN_VELOCITY
+        else:
+            motion = self._velocity.after(T_prev_curr, refined.covariance, dt_s)
         exposure = self._exposure(frame, motion)
         coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
         return self._frame_to_map.refine(frame, coarse, exposure)
