@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from calib import se3
+from calib.panorama import Cylinder
 from omnid.config import MappingConfig
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
+from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.engine.flow import Chain
 from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.mapping import Mapping
@@ -23,9 +25,11 @@ class Counted:
 
     def __init__(self) -> None:
         self.computed: list[int] = []
+        self.exposures: list[Exposure | None] = []
 
-    def __call__(self, panoramas: Panoramas, _: Exposure | None = None) -> DensePoints:
+    def __call__(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
         self.computed.append(panoramas.seq)
+        self.exposures.append(exposure)
         points = np.array([[1.0, 2.0, 0.5]])
         return DensePoints(np.full((4, 100), np.nan, np.float32), np.zeros((1, 2)), points, np.full(1, 1e-4))
 
@@ -70,3 +74,20 @@ class Half:
 def test_a_chain_passes_results_on_and_nothing_without_one() -> None:
     chain = Chain(Half(), Half())
     assert [chain.process(number) for number in (8, 6, 5)] == [2, None, None]
+
+
+def test_depth_follows_the_motion_until_it_is_settled() -> None:
+    counted = Counted()
+    depth = counted.depth(3, 5 * MS)
+    model = StereoModel(Cylinder(100, 4, 2.0), 0.2)
+    slow, fast = (Exposure(ExposureTimes(0.015), RigVelocity(v * np.ones(6), np.eye(6)), model) for v in (0.0, 1.0))
+    depth.disparity_at(slow)
+    depth.disparity_at(fast)
+    assert counted.exposures == [slow, fast]
+    depth.settle(slow)
+    assert len(depth.points) == 1 and counted.exposures == [slow, fast], "it was computed, and stays"
+    depth.disparity_at(slow)  # for the odometry alone
+    assert counted.exposures == [slow, fast, slow]
+    unread = counted.depth(4, 6 * MS)
+    unread.settle(fast)
+    assert len(unread.points) == 1 and counted.exposures[-1] is fast
