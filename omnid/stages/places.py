@@ -58,7 +58,7 @@ class Places:
         """Return the frame in terms of the rectified frame."""
         depth, pair = odometry.depth, odometry.depth.panoramas
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
-        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, lambda: depth.disparity, usable, pair.times)
+        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, depth.disparity_at, usable, pair.times)
         T_odom_rect = self._T_rect_rig @ odometry.T_odom_rig @ self._T_rig_rect
         of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
         return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, self._to_rect @ of_rig @ self._to_rect.T,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from calib import se3
@@ -19,7 +21,7 @@ def driven(pairs: int, heave_m: float, tilt_rad: float) -> tuple[np.ndarray, np.
     shaken = rng.standard_normal((pairs + 1, 3)) * [heave_m, tilt_rad, tilt_rad]
     poses = [se3.transform(se3.rotation_exp(np.array([x, y, 0])), np.array([0.2 * t + 0.02 * t**2, 0, z]))
              for t, (z, x, y) in zip(time_s, shaken, strict=True)]
-    steps = [se3.inverse(a) @ b for a, b in zip(poses, poses[1:], strict=False)]
+    steps = [se3.inverse(a) @ b for a, b in pairwise(poses)]
     motion_filter, errors, said = MotionFilter(), [], []
     velocity = ExposureVelocity(motion_filter)
     for k, step in enumerate(steps[:-1]):
