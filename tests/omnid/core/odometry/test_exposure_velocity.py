@@ -15,14 +15,14 @@ NOISE = np.diag([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5]) ** 2
 
 
 def driven(pairs: int, heave_m: float, tilt_rad: float) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (N, 6) of the predictions after each step, and what they say: a vehicle that speeds up and vibrates."""
+    """Errors (N, 6) of the predictions after each step, and their sigmas: a vehicle that speeds up and vibrates."""
     rng = np.random.default_rng(5)
     time_s = DT_S * np.arange(pairs + 1)
     shaken = rng.standard_normal((pairs + 1, 3)) * [heave_m, tilt_rad, tilt_rad]
     poses = [se3.transform(se3.rotation_exp(np.array([x, y, 0])), np.array([0.2 * t + 0.02 * t**2, 0, z]))
              for t, (z, x, y) in zip(time_s, shaken, strict=True)]
     steps = [se3.inverse(a) @ b for a, b in pairwise(poses)]
-    motion_filter, errors, said = MotionFilter(), [], []
+    motion_filter, errors, sigmas = MotionFilter(), [], []
     velocity = ExposureVelocity(motion_filter)
     for k, step in enumerate(steps[:-1]):
         motion_filter.predict(DT_S)
@@ -30,15 +30,15 @@ def driven(pairs: int, heave_m: float, tilt_rad: float) -> tuple[np.ndarray, np.
         motion_filter.update(step, NOISE, DT_S)
         velocity.accept(step, DT_S)
         errors.append(found.twist - (se3.log(step) + se3.log(steps[k + 1])) / (2 * DT_S))
-        said.append(np.sqrt(np.diag(found.covariance)))
-    return np.array(errors)[10:], np.array(said)[10:]
+        sigmas.append(np.sqrt(np.diag(found.covariance)))
+    return np.array(errors)[10:], np.array(sigmas)[10:]
 
 
 def test_vibration_is_predicted_by_its_mean_and_the_drive_by_the_filter() -> None:
-    errors, said = driven(80, heave_m=1e-3, tilt_rad=3e-3)
+    errors, sigmas = driven(80, heave_m=1e-3, tilt_rad=3e-3)
     rms = np.sqrt((errors**2).mean(axis=0))
     assert rms[0] < 0.01 and (rms[[2]] < 0.015).all() and (rms[3:5] < 0.04).all()
-    z = np.sqrt(((errors / said) ** 2).mean(axis=0))
+    z = np.sqrt(((errors / sigmas) ** 2).mean(axis=0))
     assert ((z[2:5] > 0.6) & (z[2:5] < 1.5)).all()  # a standard deviation that is that of the errors
 
 

@@ -230,12 +230,12 @@ def test_noise_is_no_edge() -> None:
 
 
 def test_the_search_follows_columns_that_have_moved() -> None:
-    """A pair that was not exposed at once: near points appear aside in the upper panorama, by what is told."""
+    """A pair that was not exposed at once: near points appear aside in the upper panorama, by a known shift."""
     lower, aside_px = texture(21, SHAPE, 1.2), 2.0
     upper = np.roll(turned(lower, aside_px), SHIFT_PX, axis=0)
-    told = ColumnShift(np.full(SHAPE, aside_px / 2, np.float32),
+    expected = ColumnShift(np.full(SHAPE, aside_px / 2, np.float32),
                        np.full(SHAPE, aside_px / 2 / SHIFT_PX, np.float32))
     matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES))
-    errors = [np.abs(matcher.match(lower, upper, middle(), aside=aside)[1] - SHIFT_PX) for aside in (told, None)]
+    errors = [np.abs(matcher.match(lower, upper, middle(), aside=aside)[1] - SHIFT_PX) for aside in (expected, None)]
     assert len(errors[0]) > 500 and np.mean(errors[0] < 0.2) > 0.85
     assert np.mean(errors[1] < 0.2) < 0.6  # without it
