@@ -26,10 +26,9 @@ class DriveModelScore:
 
     distortion: tuple[str, ...]
     held_out_px: float
-    waves: bool = False  # with wavefronts: rays that do not meet in one point
 
     def __str__(self) -> str:
-        name = (" ".join(self.distortion) or "the file's terms") + (" and wavefronts" if self.waves else "")
+        name = " ".join(self.distortion) or "the file's terms"
         return f"model with {name}: {self.held_out_px:.4f} px at landmarks held out"
 
 

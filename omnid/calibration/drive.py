@@ -86,20 +86,19 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     config = Config()
     before = _with_masks(logs[0], rig, topics)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
-    # Boards have shown whether the rays of the cameras meet in one point; else it is tried at the end.
+    # Boards have shown whether the rays of the cameras meet in one point. A drive alone could tell as well, but the
+    # central cameras that remain measured the lengths of other drives less well.
     known = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, distortion, TIMES, waves=known)
     steps = _straightened(logs[0], parameters, topics, config, report)
     require_same_rig(parameters, steps, tracked=False)
     found, drives = _in_rounds(logs, (parameters, steps), topics, config, report)
     scores = [_score(found, drives, terms, known) for terms in candidate_distortions(before)]
-    if not known:
-        scores.append(_score(found, drives, best_model(scores).distortion, True))
     for score in scores if len(scores) > 1 else ():
         report(str(score))
-    best, times = best_model(scores), significant_times(found)
-    if (best.distortion, best.waves, times) != (distortion, known, TIMES):
-        parameters = RigParameters.about(_with_times(before, times), best.distortion, times, waves=best.waves)
+    terms, times = best_model(scores).distortion, significant_times(found)
+    if (terms, times) != (distortion, TIMES):
+        parameters = RigParameters.about(_with_times(before, times), terms, times, waves=known)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
     require_same_rig(parameters, found.state.steps)
     first_sigma = observation_sigma(before, found, drives.fixed)
@@ -137,7 +136,7 @@ def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
 def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...], waves: bool) -> DriveModelScore:
     parameters = RigParameters.about(found.parameters.rig, terms, TIMES, waves=waves)
     prior = prior_information(parameters, parameters.rig)
-    return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed), waves)
+    return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed))
 
 
 def _calibration(before: Rig, found: DriveAdjustment, known: tuple[tuple[DriveModelScore, ...], float],

@@ -3,7 +3,8 @@
 `python -m tests.benchmark.boards_chain --seeds 1 2 --folder DIR`: for every seed another rig (tests/simulation/rigs.py:
 cameras tilted by 0.7 degrees below ray-traced mirrors, up to 1.5 % off shape), 24 pairs of images of a board, `omnid
 calibrate rig` with all defaults, and a drive of 5 m with a large turn. Images and logs that are in DIR already are used
-again.
+again. --drives: the rig of the boards is also self-calibrated, on a round through a room, with the covariance of the
+boards as prior, and tried on the same drive.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ import omnid
 from calib import se3
 from calib.boards.board import Board
 from calib.rig import Rig
-from calib.rig_file import read_rig
+from calib.rig_file import read_rig, write_rig
+from omnid.calibration.drive import calibrate_drive
 from omnid.cli import main as omnid_main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -35,7 +37,7 @@ from tests.simulation.sensor import Exposure, Sensor
 
 BOARD = Board(9, 6, 0.05)
 SENSOR = Sensor(noise_sigma=2.0)
-SIZE, PAIRS, DRIVE = 768, 24, "two_walls"
+SIZE, PAIRS, DRIVE, ROOM = 768, 24, "two_walls", "rooms"
 DISTANCE_M = (0.3, 0.7)
 
 
@@ -63,10 +65,10 @@ def render_boards(seed: int, amount: float, folder: Path) -> None:
     np.save(folder / "corners.npy", np.array(corners))
 
 
-def render_drive(seed: int, amount: float, folder: Path) -> None:
-    """Write the log of a drive of the rig."""
+def render_drive(name: str, seed: int, amount: float, folder: Path) -> None:
+    """Write the log of a drive of the rig, by the recipe of that name."""
     if not (folder / "log.mcap").exists():
-        run = build(DRIVE, seed, SIZE)
+        run = build(name, seed, SIZE)
         write_log(folder, board_rig(seed, amount)[0], run.poses, run.scene, sensor=run.sensor, seed=seed)
 
 
@@ -110,6 +112,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[3, 4])
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--amount", type=float, default=1.0, help="part of tilt and shape; 0: perfect mirrors")
+    parser.add_argument("--drives", action="store_true", help="self-calibrate as well")
     parser.add_argument("--only", choices=("boards", "drive"), help="render and stop")
     parser.add_argument("--options", nargs="*", default=[], help="further words for `calibrate rig`, like model=omni")
     args = parser.parse_args(arguments)
@@ -118,7 +121,7 @@ def main(arguments: Sequence[str]) -> int:
         if args.only != "drive":
             render_boards(seed, args.amount, boards)
         if args.only != "boards":
-            render_drive(seed, args.amount, log)
+            render_drive(DRIVE, seed, args.amount, log)
         if args.only:
             continue
         options = [part for word in args.options for part in ("--" + word).split("=")]
@@ -126,6 +129,14 @@ def main(arguments: Sequence[str]) -> int:
         truth = board_rig(seed, args.amount)[0]
         found = in_true_frame(read_rig(boards / "rig.toml"), truth)
         print(f"seed {seed}, baseline {1e3 * truth.baseline_m:.2f} mm: {line}\n    {drive(log, found)}", flush=True)
+        if args.drives:
+            room = args.folder / f"{ROOM}_a{args.amount:g}_s{seed}"
+            render_drive(ROOM, seed, args.amount, room)
+            again = calibrate_drive([room / "log.mcap"], read_rig(boards / "rig.toml"))
+            write_rig(boards / "rig_drive.toml", again.rig)
+            errors = f"{again.first_sigma_px:.3f} -> {again.adjustment.sigma_px:.3f} px"
+            print(f"    self-calibrated on a drive ({errors}, lengths "
+                  f"{100 * again.scale_change:+.3f} %): {drive(log, in_true_frame(again.rig, truth))}", flush=True)
     return 0
 
 

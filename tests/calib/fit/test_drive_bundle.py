@@ -195,7 +195,7 @@ def ray_gaps_px(rig: Rig, observed: DriveObservations) -> Array:
     return np.abs(sines) * 138.0
 
 
-def test_rays_that_do_not_meet_in_one_point_are_found_and_chosen_by_landmarks_held_out(truth: Rig) -> None:
+def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
     """Wavefronts of a millimetre, which near and far landmarks show; the cameras are exact at 1.5 m."""
     state, observations = drive(truth, 8)
     waves = np.array([[4e-4, 8e-4, -1.2e-3, -1.4e-3, 6e-4], [-3e-4, 1e-3, -4e-4, -1e-3, 5e-4]])
@@ -209,20 +209,12 @@ def test_rays_that_do_not_meet_in_one_point_are_found_and_chosen_by_landmarks_he
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
     np.testing.assert_allclose(parameters.wavefronts_at(found.state.steps), waves, atol=3e-4)
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
-    errors = [held_out_error(one, found, np.eye(len(one.names)) * PRIOR[0, 0]) for one in
-              (parameters, RigParameters.about(truth))]
-    assert errors[0] < 0.95 * errors[1]
 
 
 @pytest.mark.parametrize(("held_out", "expected"), [
-    ((0.2, 0.05, 0.0499, 0.0498), ("p1", "p2")), ((0.2, 0.05, 0.0499, 0.045), ("p1", "p2")),
-    ((0.2, 0.199, 0.1985, 0.1999), ()), ((0.2, 0.1, 0.05, 0.07), ("k1", "p1", "p2")),
+    ((0.2, 0.05, 0.0499), ("p1", "p2")), ((0.2, 0.199, 0.1985), ()), ((0.2, 0.1, 0.05), ("k1", "p1", "p2")),
 ])
 def test_the_fewest_terms_that_no_more_improve_are_chosen(held_out: tuple[float, ...], expected: tuple[str, ...]
                                                           ) -> None:
-    scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=False)]
-    scores.append(DriveModelScore(best_model(scores).distortion, held_out[3], waves=True))
-    best = best_model(scores)
-    assert best.distortion == expected
-    assert best.waves == (held_out[3] == 0.045)
-    assert str(scores[-1]).split(":")[0].endswith("and wavefronts")
+    scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=True)]
+    assert best_model(scores).distortion == expected
