@@ -1,12 +1,23 @@
-"""`omnid cameras`: list the cameras, their modes, and a udev rule that gives them persistent names."""
+"""`omnid cameras`: list the cameras, with a udev rule that gives them persistent names, or show their images."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # the list loads none of these
+    from drivers.frame import Camera, Frame
+    from omnid.calibration.snapshot import CameraView, Image
 
 ROOT = Path("/")  # folder of sys and dev
+CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
+SETTLE = 10  # images of a camera that are skipped: its exposure adapts in the first ones
 _ADVICE = """
 To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
 (exchange lower and upper if they are the other way round), then run
@@ -16,12 +27,31 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `cameras` to the command line."""
-    parser = subparsers.add_parser("cameras", help="list cameras, their modes and the udev rule to copy")
+    parser = subparsers.add_parser("cameras", help="list cameras and the udev rule to copy, or show what they see",
+                                   description="List cameras, their modes and the udev rule to copy. With --snapshot "
+                                   "write an image of each configured camera with the mirror's rim, and print a "
+                                   "measure of its focus, which is highest where the lens is set best.")
+    parser.add_argument("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png")
+    parser.add_argument("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log")
+    parser.add_argument("--lower", metavar="TOPIC", help="of --log: images of the lower camera; default: by name")
+    parser.add_argument("--upper", metavar="TOPIC", help="of --log: images of the upper camera; default: by name")
+    add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the list; return 1 if there is no camera."""
+    """Print the list, or write the snapshots; return 1 if there is no camera, or something to correct."""
+    from omnid.errors import OmnidError
+
+    if args.snapshot is not None:
+        return _snapshot(args)
+    for option in ("log", "lower", "upper"):
+        if getattr(args, option) is not None:
+            raise OmnidError(f"--{option} belongs to --snapshot DIR: name the folder for the images as well")
+    return _list()
+
+
+def _list() -> int:
     from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, describe_device, udev_rules
 
     devices = capture_devices(ROOT)
@@ -33,3 +63,67 @@ def run(args: argparse.Namespace) -> int:
     if rules := list(udev_rules(devices)):
         print(_ADVICE.format(file=RULES_FILE), *rules, sep="\n")
     return 0
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    import cv2
+
+    from calib.rig_file import write_file
+    from omnid.calibration.snapshot import annotated, described, view_of, warnings
+    from omnid.errors import OmnidError
+
+    try:
+        args.snapshot.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OmnidError(f"--snapshot {args.snapshot}: {error.strerror}; name a folder that can be made") from error
+    views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
+    for name, view in views.items():
+        path = args.snapshot / f"{name}.png"
+        write_file(path, cv2.imencode(".png", annotated(name, view))[1].tobytes())
+        print(f"{path}: {described(view)}")
+    problems = list(warnings(views))
+    for problem in problems:
+        print(f"omnid: {problem}", file=sys.stderr)
+    return int(bool(problems))
+
+
+def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
+    """Yield the first images of each camera. Raise OmnidError or DriverError for one that gives none."""
+    from itertools import islice
+
+    from drivers.frame import gray
+    from omnid.calibration.snapshot import IMAGES
+    from omnid.errors import OmnidError
+
+    for camera in CAMERAS:
+        frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
+        with closing(frames):
+            found = [gray(frame) for frame in islice(frames, IMAGES)]
+        if not found:
+            raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
+        yield camera, found
+
+
+def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+    from drivers.logs.log_reader import LogReader
+
+    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        yield from (frame for frame in reader.frames() if frame.camera == camera)
+
+
+def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+    """Yield frames once the exposure has adapted; they end when the camera gives none within cameras.timeout_s."""
+    from itertools import islice
+
+    from drivers.cameras.v4l2_camera import V4l2Camera
+    from omnid.config import load_config
+
+    settings = load_config(args.config, args.overrides).cameras.settings(camera)
+
+    def end_when_lost(_: int, __: str) -> None:
+        if source.state.status == "lost":
+            source.close()
+
+    source = V4l2Camera(settings, camera, on_event=end_when_lost)
+    with closing(source):
+        yield from islice(source.frames(), SETTLE, None)

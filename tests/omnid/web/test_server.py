@@ -10,6 +10,8 @@ import socket
 import ssl
 import time
 import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
@@ -20,6 +22,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from drivers.frame import Frame
+from omnid.core.control.safety_rules import ASKED
 from omnid.transport import codec
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus
@@ -157,6 +160,38 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
         assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
         assert (received["cell_m"], received["x_m"], received["y_m"]) == (pytest.approx(0.1), -1.0, -2.0)
+
+
+def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> None:
+    def path_of(seqs: Sequence[int]) -> list[list[float]]:
+        for seq in seqs:
+            publish(bus, seq)
+        with server.live(server.bearer) as live:
+            shown = Shown(live)
+            shown.until("state", holds=lambda found: found["pose"]["x_m"] == 0.25 * seqs[-1])
+            return [point for point in shown.until("path")["points"] if point]
+
+    assert max(x for x, _ in path_of(range(2000, 2040))) > 500
+    assert max(x for x, _ in path_of(range(5))) <= 1.0
+
+
+def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus: Bus) -> None:
+    received: list[str] = []
+    bus.subscribe_commands(lambda key, *_: received.append(key), {})
+    status = DiagnosticStatus(WHEELS, 0, "driving", {"armed": "1"})
+    with ThreadPoolExecutor(2) as threads:
+        answers = [threads.submit(server.post, "/stop") for _ in range(2)]
+        end_s = time.monotonic() + PATIENCE_S
+        while received.count("cmd/stop") < 5:
+            assert time.monotonic() < end_s
+            bus.publish("status", codec.diagnostics_cdr(10**18, [status]))
+            time.sleep(0.02)
+        assert not any(answer.done() for answer in answers) and not server.post("/arm")["done"]
+        stopped = DiagnosticStatus(WHEELS, 0, ASKED, {"armed": "0", "disarmed_by": ASKED})
+        while not all(answer.done() for answer in answers):
+            bus.publish("status", codec.diagnostics_cdr(10**18, [stopped]))
+            time.sleep(0.02)
+        assert all(answer.result()["done"] for answer in answers) and "cmd/arm" not in received
 
 
 def test_a_panorama_is_sent_to_a_browser_that_asks(server: WebServer, bus: Bus) -> None:

@@ -1,0 +1,117 @@
+"""Images of the cameras as they are, with the mirror's rim and measures of focus and light: for the mounting."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.masks.rim import find_rim
+from calib.models.camera import Mask
+
+IMAGES: Final = 10  # of each camera: the rim is searched in their maximum
+SATURATED: Final = 250
+DARK_GREY, BRIGHT_SHARE = 25.0, 0.05
+NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus
+LESS_SHARP: Final = 0.5  # share of the other camera's focus measure
+NEAR_BORDER_PX: Final = 3.0
+_GREEN, _RED = (80, 220, 80), (60, 60, 230)
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """View of one camera, with its measures."""
+
+    image: Image  # (H, W) the newest
+    rim: Mask | None  # None: no rim was found with certainty
+    focus: float  # variance of the Laplacian (Pech-Pacheco et al. 2000), as a share of that of the grey levels
+    level_grey: float  # mean grey level of the world
+    saturated: float  # share of its pixels that are too bright
+
+
+def view_of(images: Sequence[Image]) -> CameraView:
+    """Return the measures of one camera's images (H, W), of one size; at least one."""
+    newest = images[-1]
+    height, width = newest.shape
+    rim = find_rim(np.maximum.reduce(images), ((width - 1) / 2, (height - 1) / 2))
+    world = _world(newest, rim)
+    smooth = cv2.GaussianBlur(newest, (3, 3), 0).astype(np.float32)  # the Laplacian sees noise first
+    laplacian = cv2.Laplacian(smooth, cv2.CV_32F)
+    grey = newest[world]
+    focus = float(laplacian[world].var() / (grey.var() + NOISE_GREY2)) if grey.size else math.nan
+    return CameraView(newest, rim, focus, float(grey.mean()) if grey.size else math.nan,
+                      float((grey >= SATURATED).mean()) if grey.size else math.nan)
+
+
+def _world(image: Image, rim: Mask | None) -> NDArray[np.bool_]:
+    """Return which pixels (H, W) show the world, away from the edges of rim and hub; all of them without a rim."""
+    if rim is None:
+        return np.ones(image.shape, bool)
+    v, u = np.indices(image.shape)
+    distance = np.hypot(u - rim.center[0], v - rim.center[1])
+    return np.asarray((distance > rim.inner_px + 4) & (distance < rim.outer_px - 4))
+
+
+def described(view: CameraView) -> str:
+    """Return the measures in one line."""
+    height, width = view.image.shape
+    if view.rim is None:
+        rim = "no rim found"
+    else:
+        (u, v), radius = view.rim.center, view.rim.outer_px
+        rim = (f"rim: centre ({u:.0f}, {v:.0f}) px, {u - (width - 1) / 2:+.0f} and {v - (height - 1) / 2:+.0f} px from "
+               f"the middle, radius {radius:.0f} px")
+    return (f"{width}x{height}, {rim}; focus {1e3 * view.focus:.1f}; brightness {view.level_grey:.0f}, "
+            f"{100 * view.saturated:.1f} % too bright")
+
+
+def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
+    """Yield what should be corrected before the cameras are calibrated."""
+    for name, view in views.items():
+        if view.rim is None:
+            yield (f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
+                   "without a rim the mask must be given in the rig")
+        elif _reach_px(view) < NEAR_BORDER_PX:
+            yield f"{name}: the rim leaves the image: move the camera towards the middle of the mirror, or farther away"
+        if view.level_grey < DARK_GREY:
+            yield f"{name}: it is dark: more light, a longer exposure (cameras.exposure_us) or more gain"
+        if view.saturated > BRIGHT_SHARE:
+            yield f"{name}: {100 * view.saturated:.0f} % of the image are too bright: a shorter exposure, or less gain"
+    sharpest = max(views, key=lambda name: views[name].focus)
+    for name, view in views.items():
+        if view.focus < LESS_SHARP * views[sharpest].focus:
+            yield (f"{name}: less sharp than the {sharpest} camera: turn its lens until `focus` is highest; both see "
+                   "the same world")
+
+
+def _reach_px(view: CameraView) -> float:
+    """Return the distance from the rim to the nearest border of the image, px; negative where it leaves it."""
+    assert view.rim is not None
+    height, width = view.image.shape
+    (u, v), radius = view.rim.center, view.rim.outer_px
+    return float(min(u, v, width - 1 - u, height - 1 - v) - radius)
+
+
+def annotated(name: str, view: CameraView) -> Image:
+    """Return the image (H, W, 3) BGR with rim, hub, the middle of the image, and the measures below it."""
+    image = cv2.cvtColor(view.image, cv2.COLOR_GRAY2BGR)
+    height, width = view.image.shape
+    if view.rim is not None:
+        center = tuple(round(value) for value in view.rim.center)
+        for radius in (view.rim.outer_px, view.rim.inner_px):
+            if radius > 0:
+                cv2.circle(image, center, round(radius), _GREEN, 1, cv2.LINE_AA)
+        cv2.drawMarker(image, center, _GREEN, cv2.MARKER_CROSS, 15)
+    cv2.drawMarker(image, (width // 2, height // 2), _RED, cv2.MARKER_TILTED_CROSS, 15)
+    strip = np.zeros((24, width, 3), np.uint8)
+    text = f"{name}: focus {1e3 * view.focus:.1f}, brightness {view.level_grey:.0f}, " + (
+        "no rim" if view.rim is None else f"radius {view.rim.outer_px:.0f} px")
+    cv2.putText(strip, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    return np.vstack((image, strip))
