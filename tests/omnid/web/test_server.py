@@ -167,9 +167,9 @@ def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> N
         for seq in seqs:
             publish(bus, seq)
         with server.live(server.bearer) as live:
-            shown = Shown(live)
-            shown.until("state", holds=lambda found: found["pose"]["x_m"] == 0.25 * seqs[-1])
-            return [point for point in shown.until("path")["points"] if point]
+            Shown(live).until("state", holds=lambda found: found["pose"]["x_m"] == 0.25 * seqs[-1])
+        with server.live(server.bearer) as live:
+            return [point for point in Shown(live).until("path")["points"] if point]
 
     assert max(x for x, _ in path_of(range(2000, 2040))) > 500
     assert max(x for x, _ in path_of(range(5))) <= 1.0
