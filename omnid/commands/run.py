@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import sys
 from collections import Counter, defaultdict
 from contextlib import closing
 from dataclasses import replace
@@ -41,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config import load_config, unused_settings
-    from omnid.engine.logging_setup import log
+    from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
@@ -49,11 +50,12 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config, [*args.overrides, *shortcuts])
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
+    show = HANDLER.show if sys.stderr.isatty() else None
     if args.log is None:
         _require_no_log_options(args)
-        return LiveRun(config, _devices(config), log).run()
+        return LiveRun(config, _devices(config), log, show=show).run()
     config = replace(config, controller=config.controller.of_log)  # the log's images do not follow the wheels
-    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log)).run()
+    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log), show).run()
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:

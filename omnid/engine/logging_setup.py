@@ -26,6 +26,8 @@ _DEBUG_PRIORITY: Final = 7
 _BURST: Final = 5  # lines of a kind that are written within a period
 _PERIOD_S: Final = 60.0
 _MAX_KINDS: Final = 256  # whose counts are kept
+_COLUMNS: Final = 80  # of a terminal that does not report its size
+_ERASE: Final = "\r\x1b[K"  # the line of a terminal that the cursor is in
 _MAX_LENGTH: Final = 4000  # characters of a line
 _NUMBER = re.compile(r"\d+")
 
@@ -65,6 +67,7 @@ class StderrHandler(logging.Handler):
         super().__init__()
         self._stream, self._clock_s = stream, clock_s
         self._kinds: dict[str, _Kind] = {}  # the most recent one is the last
+        self._shown = ""  # below the lines of a terminal
         self.suppressed = 0  # lines in all
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -77,6 +80,19 @@ class StderrHandler(logging.Handler):
             self._write(record.levelno, line)
         else:
             self._write_limited(record.levelno, line)
+
+    def show(self, line: str) -> None:
+        """Keep a line below the others of a terminal until it is replaced; "" removes it."""
+        self.acquire()
+        try:
+            stream = self._stream or sys.stderr
+            with suppress(OSError, ValueError):
+                columns = os.get_terminal_size(stream.fileno()).columns or _COLUMNS
+                self._shown = _single_line(line)[: max(0, columns - 1)]  # a wrapped line could not be erased
+                stream.write(f"{_ERASE}{self._shown}")
+                stream.flush()
+        finally:
+            self.release()
 
     def flush(self) -> None:
         """Report how many lines of each kind were suppressed; `logging` calls this at the end of the program."""
@@ -111,7 +127,8 @@ class StderrHandler(logging.Handler):
         stream = self._stream or sys.stderr
         prefix = f"<{priority(level)}>" if _is_journal(stream) else f"omnid: {_label(level)}"
         with suppress(OSError, ValueError):  # a closed stream or a full disk must not end the program
-            stream.write(f"{prefix}{line}\n")
+            erase = _ERASE if self._shown else ""
+            stream.write(f"{erase}{prefix}{line}\n{self._shown}")
             stream.flush()
 
 

@@ -19,11 +19,13 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
+from omnid.core.control.arming import MANUAL
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.rig_monitor import RigMonitor, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
+from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.realtime import ThreadStart, prepare, priorities
@@ -61,9 +63,12 @@ OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]  # called a second time a
 
 
 class LiveRun:
-    """One run of the daemon; rig: None for that of the configuration."""
+    """One run of the daemon."""
 
-    def __init__(self, config: Config, open_camera: OpenCamera, report: Report, rig: Rig | None = None) -> None:
+    def __init__(self, config: Config, open_camera: OpenCamera, report: Report, rig: Rig | None = None,
+                 show: Callable[[str], None] | None = None) -> None:
+        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
+        self._show = show
         self._config, self._open_camera, self._report, self._rig = config, open_camera, report, rig
         on_thread = ThreadStart(priorities(config.realtime, *CAMERAS), report)
         self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
@@ -162,6 +167,11 @@ class LiveRun:
         status_line = StatusLine(session.statistics, telemetry, TICKERS)
         service = Service(telemetry, status_line, self._config.service.stall_timeout_s)
         self._graph.ticker("watchdog", service.period_s, service)
+        if self._show is not None:
+            line = StatusLine(session.statistics, telemetry, TICKERS)
+            terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), session.statistics,
+                                      _ready(self._config))
+            self._graph.ticker("terminal", terminal.period_s, terminal)
 
     def _recorder(self, session: Session, rig: Rig) -> Recorder:
         encode = session.encoder(rig, self._config.record.cloud_points)
@@ -184,6 +194,14 @@ class LiveRun:
 
         bus.subscribe_commands(receive, topics)
         return commands
+
+
+def _ready(config: Config) -> str:
+    """Return what to do now that the run is ready."""
+    endpoints = ", ".join(config.bus.connect if config.bus.mode == "client" else config.bus.listen)
+    wheels = "; no motor" if not config.motor.port else \
+        "; the wheels turn after `omnid arm`" if config.controller.arming == MANUAL else ""
+    return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
 
 
 def _broken(monitor: RigMonitor | None) -> Callable[[], bool]:

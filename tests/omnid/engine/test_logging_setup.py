@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import pty
 import subprocess
 import sys
 import threading
@@ -177,3 +178,25 @@ def test_a_library_user_gets_warnings_without_configuration(pipe: tuple[int, int
     script = "import logging; from omnid.engine.logging_setup import log; log(logging.WARNING, 'one'); log(20, 'two')"
     assert run({}, pipe[1], script) == 0
     assert os.read(pipe[0], 1000) == b"one\n"
+
+
+def test_a_line_of_the_terminal_stays_below_the_others() -> None:
+    master, slave = pty.openpty()
+    with os.fdopen(slave, "w") as stream:
+        handler = StderrHandler(stream)
+        handler.show("one\nof " + 100 * "x")
+        handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": "hello"}))
+        handler.show("two")
+        handler.show("")
+        handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": "end"}))
+        shown = os.read(master, 4096).decode()
+    os.close(master)
+    first = ("one of " + 100 * "x")[:79]  # of 80 columns: a wrapped line could not be erased
+    assert shown == (f"\r\x1b[K{first}\r\x1b[Komnid: hello\r\n{first}\r\x1b[Ktwo\r\x1b[Komnid: end\r\n")
+
+
+def test_nothing_is_shown_where_there_is_no_terminal() -> None:
+    log = Log()
+    log.handler.show("one")
+    log(logging.INFO, "hello")
+    assert log.stream.getvalue() == "omnid: hello\n"
