@@ -113,9 +113,9 @@ ARROWS: Mapping[str, str] = {
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
     "omnid.runs":
         "calib.rig calib.rig_file drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
-        "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics "
-        "omnid.engine omnid.errors omnid.formats omnid.messages omnid.settings_dump omnid.sinks omnid.stages "
-        "omnid.tracking_state omnid.transport",
+        "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.places "
+        "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.messages omnid.settings_dump omnid.sinks "
+        "omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
     "omnid.settings": "calib.bounded_toml omnid.errors",
