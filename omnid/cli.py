@@ -48,14 +48,24 @@ def _parser(words: Sequence[str]) -> Parser:
     parser.add_argument("--version", action="version", version=f"omnid {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="command", parser_class=Parser)
     named = next((word for word in words if not word.startswith("-")), "")
-    if named in COMMANDS:
+    if named in COMMANDS and not _completes():
         names: Sequence[str] = (named,)
     else:
         names = () if "--version" in words else COMMANDS
     for name in names:
         import_module(f"omnid.commands.{MODULES.get(name, name)}").add_parser(subparsers)
     add_examples(parser)
+    if _completes():
+        with suppress(ImportError):  # the extra `completion`
+            import argcomplete
+
+            argcomplete.autocomplete(parser)  # prints what fits and ends the program
     return parser
+
+
+def _completes() -> bool:
+    """True if the shell asks for completions of what is typed (argcomplete)."""
+    return "_ARGCOMPLETE" in os.environ
 
 
 def _guarded(args: argparse.Namespace) -> int:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -34,3 +38,16 @@ def test_every_command_has_a_description_and_an_example() -> None:
 def test_every_example_is_accepted(example: str) -> None:
     words = shlex.split(example.partition(" > ")[0])
     assert _parser(words).parse_args(words).run
+
+
+def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
+    def completions(line: str) -> set[str]:
+        found = tmp_path / "found"
+        environment = {**os.environ, "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line,
+                       "COMP_POINT": str(len(line)), "COMP_TYPE": "9", "_ARGCOMPLETE_STDOUT_FILENAME": str(found)}
+        subprocess.run([sys.executable, "-m", "omnid"], env=environment, check=True)
+        return {word.strip() for word in found.read_text().splitlines()}
+
+    assert completions("omnid re") >= {"replay", "report", "record"}
+    assert {"--rig", "--tum", "--plan"} <= completions("omnid replay --")
+    assert completions("omnid calibrate dr") == {"drive"}
