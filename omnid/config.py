@@ -136,6 +136,9 @@ class PlacesConfig:
     """Recognition of places: loops, and the pose in the map."""
 
     enabled: bool = knob(True, "recognise places and correct the pose in the map; off: it is that of odometry")
+    map: str = knob("", "map of places (.omap) to localise in, made by `omnid map build`; a run that recognises it "
+                    "extends it")
+    localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
     limits: PlaceLimits = field(default_factory=PlaceLimits)
 
 

@@ -10,7 +10,7 @@ from typing import Final
 # Words after `omnid` of a command without subcommands -> its examples, without `omnid`.
 EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated"),
-    "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --map map.ply --plan plan.png",
+    "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
                "replay drive.mcap --record out.mcap --method paper"),
     "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
               "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786"),
@@ -35,6 +35,10 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "report": ("report out.mcap -o report.html",),
     "log info": ("log info recordings/*.mcap",),
     "log recover": ("log recover robot_20260131T235900Z_001.mcap.part",),
+    "map build": ("map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
+                  "map build wednesday.mcap -o place.omap --extend"),
+    "map info": ("map info place.omap",),
+    "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
     "diff": ("diff yesterday.mcap today.mcap",),
     "doctor": ("doctor --config /etc/omnid/omnid.toml",),
     "config": ("config --minimal > omnid.toml", "config check omnid.toml", "config migrate old.toml > new.toml"),

@@ -1,4 +1,4 @@
-"""`omnid map`: show and export maps of places."""
+"""`omnid map`: build, show, merge and export maps of places."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 
 if TYPE_CHECKING:
@@ -20,13 +21,25 @@ CELL_M = 0.05
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `map` to the command line."""
-    parser = subparsers.add_parser("map", help="show and export maps of places (.omap)")
+    parser = subparsers.add_parser("map", help="build, show, merge and export maps of places (.omap)")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
+    _add_build(actions)
     info = actions.add_parser("info", help="keyframes, sessions, loops, size, and the rig that made the map")
     info.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap")
     add_json(info)
     info.set_defaults(run=run_info)
     _add_export(actions)
+
+
+def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    build = actions.add_parser("build", help="build a map from logs, of one drive or of several in the same place")
+    build.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first")
+    build.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
+    build.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
+    build.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+    build.add_argument("--quiet", action="store_true", help="do not show the progress")
+    add_settings(build)
+    build.set_defaults(run=run_build)
 
 
 def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,6 +51,42 @@ def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
                         "image beside it is FILE.pgm")
     export.add_argument("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m")
     export.set_defaults(run=run_export)
+
+
+def run_build(args: argparse.Namespace) -> int:
+    """Replay the logs one after the other, each in the map of those before, and write the map."""
+    from omnid.config import load_config, unused_settings
+    from omnid.core.places.place_views import summary
+    from omnid.diagnostics.progress import Progress
+    from omnid.errors import OmnidError
+    from omnid.formats.place_file import read_places, write_places
+    from omnid.runs.place_maps import RigPlaces, new_places
+    from omnid.runs.replay import ReplayOptions, run_log
+    from omnid.sinks.files import check_outputs
+
+    config = load_config(args.config, args.overrides)
+    warnings = unused_settings(config, "replay", args.overrides)
+    if not config.places.enabled or config.places.map:
+        raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
+    check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
+    built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
+    for log in args.logs:
+        options = ReplayOptions(rig=args.rig, settings=args.config, build=True, rig_places=built,
+                                progress=None if args.quiet else Progress)
+        result = run_log(log, config, options)
+        for warning in (*warnings, *result.warnings):
+            print(f"omnid: warning: {log}: {warning}", file=sys.stderr)
+        warnings = []
+        if result.signal:
+            print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
+            return 128 + result.signal
+        built = result.rig_places
+    if built is None or not built.places.keyframes:
+        print("omnid: no keyframe was found: no map was written", file=sys.stderr)
+        return 1
+    write_places(args.output, built.places, built.rig)
+    print(*_described(args.output, summary(built.places, built.rig), built.rig), sep="\n")
+    return 0
 
 
 def run_info(args: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
+from omnid.commands.map_option import add_map, map_settings
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -26,6 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
     _add_outputs(parser)
     _add_computation(parser)
+    add_map(parser)
     add_settings(parser)
     add_json(parser)
     parser.set_defaults(run=run)
@@ -36,7 +38,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
     group.add_argument("--map-tum", type=Path, metavar="FILE", help="trajectory in the map, T_map_rig, as it was known "
                        "at each pair: recognised places correct it")
-    group.add_argument("--map", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
+    group.add_argument("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
     group.add_argument("--publish", action="store_true", help="publish on the bus as `<robot>/odom` and so on; off by "
@@ -62,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
     from omnid.runs.replay import ReplayOptions
 
     options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map_tum=args.map_tum,
-                            map=args.map, plan=args.plan, record=args.record, publish=args.publish, inline=args.inline,
-                            realtime=args.realtime, settings=args.config)
+                            cloud=args.cloud, plan=args.plan, record=args.record, publish=args.publish,
+                            inline=args.inline, realtime=args.realtime, settings=args.config)
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
@@ -105,4 +107,4 @@ def _print_result(result: RunResult, options: ReplayOptions, as_json: bool) -> N
 def _shortcuts(args: argparse.Namespace) -> list[str]:
     """Return the settings that have an option of their own."""
     named = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
-    return [f"{key}={value}" for key, value in named.items() if value is not None]
+    return [*(f"{key}={value}" for key, value in named.items() if value is not None), *map_settings(args)]

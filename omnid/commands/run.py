@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.map_option import add_map, map_settings
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
@@ -32,6 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--pace", type=float, default=1.0,
                         help="speed of the log relative to its recording; default %(default)s")
     parser.add_argument("--once", action="store_true", help="stop at the end of the log")
+    add_map(parser)
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -47,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(args.config, [*args.overrides, *shortcuts])
+    config = load_config(args.config, [*args.overrides, *shortcuts, *map_settings(args)])
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     show = HANDLER.show if sys.stderr.isatty() else None

@@ -43,13 +43,17 @@ SCHEMA: Final = {
 
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
-    """Write a map; the file is replaced at once, never written in part. Raises OmnidError if that is impossible."""
+    """Write a map; the file is replaced at once, never written in part, by one that can be read.
+
+    Raises OmnidError if that is impossible.
+    """
     path = Path(path)
     try:
         partial = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             _remove_abandoned(path)
             _write(partial, places, rig)
+            read_places(partial)  # no map is replaced by one that would be refused
             _sync(partial)
             os.replace(partial, path)
             _sync(path.parent)
@@ -190,5 +194,6 @@ def _check(keyframes: list[tuple[PlaceKeyframe, NDArray[np.float64]]], links: li
     of_keyframes: list[Any] = [keyframe for keyframe, _ in keyframes]
     place_rows.require_rigid([T for _, T in keyframes] + [k.T_odom_rect for k in of_keyframes]
                              + [link.T_a_b for link in links])
-    place_rows.require_covariances([keyframe.covariance for keyframe in of_keyframes], 0.0)
-    place_rows.require_covariances([link.covariance for link in links], place_rows.LEAST_VARIANCE)
+    of_odometry: list[Any] = [link for link in links if not link.is_loop]
+    place_rows.require_covariances([one.covariance for one in of_keyframes + of_odometry], 0.0)
+    place_rows.require_covariances([link.covariance for link in links if link.is_loop], place_rows.LEAST_VARIANCE)

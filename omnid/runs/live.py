@@ -32,6 +32,7 @@ from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
@@ -87,11 +88,13 @@ class LiveRun:
             geometry = self._geometry(session)
             self._connected = True
             cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
-            self._wire(session, geometry, cameras)
+            run_places = RunPlaces(self._config, geometry, session.warn)
+            self._wire(session, geometry, cameras, run_places)
             cv2.setNumThreads(self._config.graph.opencv_threads)
             for refused in prepare(self._config.realtime):
                 session.warn(refused)
             self._graph.run()
+            run_places.finish()
         return 0
 
     def _on_signal(self, number: int, again: bool) -> None:
@@ -120,7 +123,8 @@ class LiveRun:
             for pair in zip(*streams, strict=False):
                 yield from pair
 
-    def _wire(self, session: Session, geometry: Geometry, cameras: Mapping[Camera, LiveCamera]) -> None:
+    def _wire(self, session: Session, geometry: Geometry, cameras: Mapping[Camera, LiveCamera],
+              run_places: RunPlaces) -> None:
         config, graph, rig = self._config, self._graph, geometry.rig
         controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
@@ -138,6 +142,7 @@ class LiveRun:
                       features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
+        sinks = run_places.known_to(sinks)
         stages = wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
         if config.live.shed_load:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))

@@ -32,7 +32,7 @@ class Sinks:
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
-    known_places: PlaceMap | None = None  # the map to begin with
+    known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
     localize_only: bool = False  # it stays as it is
     recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
@@ -74,7 +74,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         for name, map_sink in sinks.maps.items():
             graph.sink(name, map_sink, maps)
     places: Places | None = None
-    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus):
+    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus or sinks.known_places is not None):
         places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only)
         updates: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
         outgoing["bus-places"] = updates

@@ -27,6 +27,7 @@ from omnid.errors import OmnidError
 from omnid.messages import MapUpdate
 from omnid.runs.log_rig import attached_rig
 from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import Session
@@ -64,7 +65,7 @@ class ReplayOptions:
     topics: Topics = (None, None)  # of the images; None: those of the rig, else by their names
     tum: Path | None = None
     map_tum: Path | None = None
-    map: Path | None = None
+    cloud: Path | None = None
     plan: Path | None = None
     record: Path | None = None
     collect: bool = False  # keep poses and map in memory for the result: see PoseCollector for how much that is
@@ -77,12 +78,14 @@ class ReplayOptions:
     observer: Callable[[Geometry, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     places: PlaceMap | None = None  # the map to begin with; it is extended
     localize_only: bool = False  # ... it stays as it is
+    rig_places: RigPlaces | None = None  # the same with its rig, which is compared with that of the log
+    build: bool = False  # give the result a map with its rig, from nothing where there is no other
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
     def files(self) -> list[tuple[str, Path]]:
         """The files that are written, each with its option."""
-        named = (("--tum", self.tum), ("--map-tum", self.map_tum), ("--map", self.map),
+        named = (("--tum", self.tum), ("--map-tum", self.map_tum), ("--cloud", self.cloud),
                  ("--plan", self.plan), ("--record", self.record))
         return [(name, path) for name, path in named if path is not None]
 
@@ -117,7 +120,9 @@ class _Replay:
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
-            sinks = self._sinks(session, geometry)
+            run_places = RunPlaces(self._config, geometry, session.warn, self._options.rig_places,
+                                   build=self._options.build)
+            sinks = run_places.known_to(self._sinks(session, geometry))
             pairing = Synchronise(geometry.rig, self._config.pair)
             pairs = graph.stage("pair", pairing, self._frames(graph, reader))
             stages = wire(graph, pairs, geometry, self._config, sinks)
@@ -132,7 +137,8 @@ class _Replay:
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
                 raise RunFailedError(str(error), self._result(session, result)) from error
-            return self._result(session, result)
+            extended = run_places.finish()  # first: it may warn
+            return replace(self._result(session, result), rig_places=extended)
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
@@ -187,8 +193,8 @@ class _Replay:
             sinks.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map_tum:
             sinks.places["map-trajectory"] = MapTrajectoryFile(options.map_tum)
-        if options.map:
-            sinks.maps["map"] = MapFile(options.map)
+        if options.cloud:
+            sinks.maps["map"] = MapFile(options.cloud)
         if options.plan:
             sinks.maps["plan"] = PlanFile(options.plan)
         return sinks

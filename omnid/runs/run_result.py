@@ -17,6 +17,7 @@ from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
+from omnid.runs.place_maps import RigPlaces
 from omnid.tracking_state import MapState, TrackingState
 
 
@@ -43,6 +44,7 @@ class RunResult:
     T_map_rig: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
     map_states: tuple[MapState, ...] = ()  # (N,)
     places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
+    rig_places: RigPlaces | None = None  # the map of places that the run was given, extended
 
     def save_tum(self, path: str | PathLike[str]) -> None:
         """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).

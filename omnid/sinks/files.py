@@ -21,7 +21,7 @@ from omnid.formats.tum import tum_row
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
-REPLACED: Final = ("--map", "--plan", "--ply", "--grid")  # options of files that are replaced at once
+REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:

@@ -76,7 +76,7 @@ def test_the_packages_are_typed(package: str) -> None:
 def test_replay_gives_what_the_command_writes(
     omnid_command: Command, tmp_path: Path, scene: Path, result: omnid.RunResult
 ) -> None:
-    files = ("--tum", tmp_path / "a.tum", "--map", tmp_path / "a.ply")
+    files = ("--tum", tmp_path / "a.tum", "--cloud", tmp_path / "a.ply")
     assert omnid_command.replay(scene / "log.mcap", *files, rig=scene / "rig.toml").code == 0
     result.save_tum(tmp_path / "b.tum")
     result.save_ply(str(tmp_path / "b.ply"))

@@ -101,7 +101,7 @@ def test_skips_and_counts_broken_jpegs(omnid: Command, tmp_path: Path, scene: Pa
 
 def test_warns_if_all_jpegs_are_broken(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", [replace(p, jpeg=b"\xff\xd8\xff?") for p in images(scene / "log.mcap")])
-    result = omnid.replay(log, "--tum", tmp_path / "t", "--map", tmp_path / "m", rig=scene / "rig.toml")
+    result = omnid.replay(log, "--tum", tmp_path / "t", "--cloud", tmp_path / "m", rig=scene / "rig.toml")
     assert result.code == 1 and result.count("broken") == 2 * PAIRS and result.count("pairs") == 0
     assert "no pair of images" in result.err
 
@@ -126,11 +126,11 @@ def test_counts_late_and_duplicate_images(omnid: Command, tmp_path: Path, scene:
     assert (result.count("late"), result.count("duplicate"), result.count("pairs")) == (1, 1, PAIRS - 1)
 
 
-@pytest.mark.parametrize("option", ["--tum", "--map", "--plan", "--record"])
+@pytest.mark.parametrize("option", ["--tum", "--cloud", "--plan", "--record"])
 def test_refuses_an_unwritable_output_before_the_run(omnid: Command, tmp_path: Path, scene: Path, option: str) -> None:
     kept = tmp_path / "kept.txt"
     kept.write_text("previous result")
-    other = "--tum" if option != "--tum" else "--map"
+    other = "--tum" if option != "--tum" else "--cloud"
     for path, reason in ((tmp_path / "absent" / "x", "no folder"), (tmp_path, "folder"), (Path("/proc/x"), "/proc/x")):
         error = omnid.refused("replay", tmp_path / "absent.mcap", other, kept, option, path)
         assert reason in error and option in error
@@ -146,7 +146,7 @@ def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tm
     log = scene / "log.mcap"
     before = log.read_bytes()
     assert "the log that is read" in omnid.refused("replay", log, "--record", scene / ".." / scene.name / "log.mcap")
-    assert "--tum" in omnid.refused("replay", log, "--tum", tmp_path / "x", "--map", tmp_path / "x")
+    assert "--tum" in omnid.refused("replay", log, "--tum", tmp_path / "x", "--cloud", tmp_path / "x")
     assert log.read_bytes() == before
 
 
@@ -169,7 +169,7 @@ def test_a_run_without_a_pair_keeps_existing_files(omnid: Command, tmp_path: Pat
     """It is refused at the first image, or it ends without one."""
     rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")
     (tmp_path / "other.toml").write_text(rig)
-    kept = {option: tmp_path / option for option in ("--tum", "--map", "--plan", "--record")}
+    kept = {option: tmp_path / option for option in ("--tum", "--cloud", "--plan", "--record")}
     for path in kept.values():
         path.write_text("previous result")
     files = [word for option, path in kept.items() for word in (option, path)]
@@ -197,7 +197,7 @@ def test_an_output_through_a_link_keeps_the_link(omnid: Command, tmp_path: Path,
 
 
 def test_does_not_replace_a_device_by_a_map(omnid: Command, scene: Path) -> None:
-    assert "device" in omnid.refused("replay", scene / "log.mcap", "--map", "/dev/null")
+    assert "device" in omnid.refused("replay", scene / "log.mcap", "--cloud", "/dev/null")
     assert Path("/dev/null").is_char_device()
 
 

@@ -35,7 +35,7 @@ def test_inline_and_threaded_give_the_same_bytes(
     omnid: Command, tmp_path: Path, scene: Path, method: list[str]
 ) -> None:
     for name, more in (("a", []), ("b", []), ("c", ["--inline"])):
-        outputs = ("--tum", tmp_path / f"{name}.txt", "--map", tmp_path / f"{name}.ply", "--plan", tmp_path / name)
+        outputs = ("--tum", tmp_path / f"{name}.txt", "--cloud", tmp_path / f"{name}.ply", "--plan", tmp_path / name)
         assert omnid.replay(scene / "log.mcap", *outputs, *method, *more, rig=scene / "rig.toml").code == 0
     for suffix in (".txt", ".ply", ""):
         first, *others = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "abc")
@@ -45,7 +45,7 @@ def test_inline_and_threaded_give_the_same_bytes(
 def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Path) -> None:
     tum, ply, plan = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "plan.png"
     result = omnid.replay(
-        scene / "log.mcap", "--tum", tum, "--map", ply, "--plan", plan, rig=scene / "rig.toml"
+        scene / "log.mcap", "--tum", tum, "--cloud", ply, "--plan", plan, rig=scene / "rig.toml"
     )
     assert (result.count("pairs"), result.count("poses"), len(rows(tum))) == (PAIRS, PAIRS, PAIRS)
     estimate, truth = read_tum(tum), read_tum(scene / "truth.txt")
@@ -75,7 +75,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     T_base_rig = se3.exp([0.2, -0.1, 0.5, 0.1, -0.2, 1.0])
     write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), T_base_rig=T_base_rig))
     out, tum, ply = tmp_path / "out.mcap", tmp_path / "est.txt", tmp_path / "map.ply"
-    files = ("--record", out, "--tum", tum, "--map", ply)
+    files = ("--record", out, "--tum", tum, "--cloud", ply)
     assert omnid.replay(scene / "log.mcap", *files, rig=tmp_path / "rig.toml").code == 0
     T_odom_rig = read_tum(tum).T
     with out.open("rb") as file:

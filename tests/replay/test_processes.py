@@ -59,7 +59,7 @@ def wait_until(happens: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals_leave_whole_results(tmp_path: Path, scene: Path, manner: list[str], number: int, code: int) -> None:
     tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
-    command = replaying(scene, "--realtime", "--tum", tum, "--map", ply, "--record", log, *manner)
+    command = replaying(scene, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, *manner)
     with started(command) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         process.send_signal(number)

@@ -21,7 +21,7 @@ def measured(omnid: Command, folder: Path, name: str, *words: object) -> Metrics
         pytest.skip(f"{source} does not exist")
     rig, tum = folder / "rig.toml", folder / "est.txt"
     assert omnid("calibrate", "import", source / "camchain.yaml", "-o", rig).code == 0
-    result = omnid.replay(source / "log.mcap", "--tum", tum, "--map", folder / "map.ply", *words, rig=rig)
+    result = omnid.replay(source / "log.mcap", "--tum", tum, "--cloud", folder / "map.ply", *words, rig=rig)
     assert result.code == 0, result.err
     return evaluate(read_tum(tum), read_tum(source / "truth.txt"))
 

@@ -65,6 +65,13 @@ def parts(places: PlaceMap) -> list[list[int]]:
     return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
 
 
+def keep_only(places: PlaceMap, ids: set[int]) -> None:
+    """Remove all other keyframes from a map, and their links."""
+    places.links = [link for link in places.links if link.a in ids and link.b in ids]
+    for id in places.keyframes.keys() - ids:
+        del places.keyframes[id], places.poses[id]
+
+
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
     """Return the poses (K, 4, 4) of the base at the keyframes, in the base's axes at the start of the map."""
     T = np.array([places.poses[id] for id in sorted(places.keyframes)]).reshape(-1, 4, 4)

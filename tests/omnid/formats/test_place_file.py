@@ -153,24 +153,30 @@ def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
         ({"session": -1}, "outside its range"),
     ],
 )
-def test_values_outside_their_range_are_refused_in_spite_of_a_right_checksum(
-    tmp_path: Path, change: dict[str, object], message: str
-) -> None:
+def test_values_outside_their_range_are_not_written(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    """A map is read again before the old map is replaced, with right checksums."""
+    write_places(tmp_path / "a.omap", some_places(2), RIG)
     places = some_places(3)
     places.keyframes[1] = dataclasses.replace(places.keyframes[1], **change)
-    write_places(tmp_path / "a.omap", places, RIG)
     with pytest.raises(OmnidError, match=message):
-        read_places(tmp_path / "a.omap")
+        write_places(tmp_path / "a.omap", places, RIG)
+    assert len(read_places(tmp_path / "a.omap")[0]) == 2 and os.listdir(tmp_path) == ["a.omap"]
 
 
-def test_links_to_nowhere_and_links_without_uncertainty_are_refused(tmp_path: Path) -> None:
+def test_links_to_nowhere_and_loops_without_uncertainty_are_refused(tmp_path: Path) -> None:
     for change, message in (({"b": 99}, "joins no two keyframes"), ({"a": 2}, "joins no two keyframes"),
                             ({"covariance": np.zeros((6, 6))}, "not positive")):
         places = some_places(3)
-        places.links[1] = dataclasses.replace(places.links[1], **change)
-        write_places(tmp_path / "a.omap", places, RIG)
+        places.links[2] = dataclasses.replace(places.links[2], **change)
         with pytest.raises(OmnidError, match=message):
-            read_places(tmp_path / "a.omap")
+            write_places(tmp_path / "a.omap", places, RIG)
+
+
+def test_odometry_that_stood_still_has_no_uncertainty(tmp_path: Path) -> None:
+    places = some_places(3)
+    places.links[0] = dataclasses.replace(places.links[0], covariance=np.zeros((6, 6)))
+    write_places(tmp_path / "a.omap", places, RIG)
+    assert len(read_places(tmp_path / "a.omap")[0].links) == 3
 
 
 def test_a_map_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:

@@ -1,0 +1,25 @@
+"""The options --map and --localize-only of `omnid run` and `omnid replay`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """Add --map and --localize-only."""
+    group = parser.add_argument_group("map of places")
+    group.add_argument("--map", type=Path, metavar="FILE.omap", help="localise in a map of `omnid map build`, and "
+                       "extend it at the end; the points of the 3-D map are written by `omnid replay --cloud FILE.ply`")
+    group.add_argument("--localize-only", action="store_true", help="leave the map as it is")
+
+
+def map_settings(args: argparse.Namespace) -> list[str]:
+    """Return the settings that the options set. Raises OmnidError for a name that is no map's."""
+    from omnid.errors import OmnidError
+
+    if args.map is not None and args.map.suffix == ".ply":
+        raise OmnidError(f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "
+                         "map are written by --cloud FILE.ply")
+    settings = [] if args.map is None else [f"places.map={args.map}"]
+    return [*settings, *(["places.localize_only=true"] if args.localize_only else [])]

@@ -1,0 +1,124 @@
+"""The map of places of a run: read before it, compared with the rig, extended by it, and written after it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from calib.rig import MountedCamera
+from calib.rig_file import rig_toml
+from omnid.config import Config, PlacesConfig
+from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_rig import PlaceRig, seen_by
+from omnid.core.places.place_views import keep_only, parts
+from omnid.errors import OmnidError
+from omnid.formats.place_file import read_places, write_places
+from omnid.runs.pipeline import Sinks
+from omnid.sinks.files import check_outputs
+from omnid.stages.geometry import Geometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigPlaces:
+    """A map of places and the rig that saw them."""
+
+    places: PlaceMap
+    rig: PlaceRig
+
+
+class RunPlaces:
+    """Holds the map that a run localises in; `places` is None where the run has no map but its own."""
+
+    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None],
+                 given: RigPlaces | None = None, *, build: bool = False) -> None:
+        """given: a map in the memory, in the place of the file places.map; build: or else an empty one.
+
+        warn: takes a line for the user.
+
+        Raises OmnidError for a file that is no map, or that of another rig.
+        """
+        settings, self._warn = config.places, warn
+        _require_consistent(settings)
+        self._path = Path(settings.map) if settings.map and given is None and not build else None
+        self._writes = self._path is not None and not settings.localize_only
+        self._rig = place_rig(geometry)
+        if self._path is not None:
+            given = RigPlaces(*read_places(self._path, new_places(settings)))
+        if self._path is not None and self._writes:
+            check_outputs([("--map", self._path)], [])
+        self.places = given.places if given else new_places(settings) if build else None
+        self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
+        if given is not None and self._known:
+            self._compare(given)
+
+    def known_to(self, sinks: Sinks) -> Sinks:
+        """Return the sinks of the run with this map, if there is one."""
+        if self.places is None:
+            return sinks
+        return replace(sinks, known_places=self.places, localize_only=self._path is not None and not self._writes)
+
+    def _compare(self, given: RigPlaces) -> None:
+        """Check that the map fits the rig, and adapt it to the panoramas of this run."""
+        name = self._path or "the map"
+        difference = given.rig.difference(self._rig)
+        if difference:
+            raise OmnidError(f"{name}: this map was made with {difference}: build one with this rig, by "
+                             "`omnid map build`")
+        if given.rig.rig_hash != self._rig.rig_hash:
+            self._warn(f"{name}: the rig was calibrated again since this map was made")
+        seen_by(given.places, given.rig, self._rig)
+
+    def finish(self) -> RigPlaces | None:
+        """Return the map after the run, what is not joined to it left out; write it where it was extended.
+
+        Raises OmnidError if the file cannot be written.
+        """
+        if self.places is None:
+            return None
+        joined = self._joined()
+        new = len(joined - self._known)
+        unjoined = len(self.places.keyframes.keys() - joined - self._known)
+        keep_only(self.places, joined)
+        found = RigPlaces(self.places, self._rig)
+        name = self._path or "the map"
+        if self._known and not new and unjoined:
+            self._warn(f"{name}: no place of it was recognised: nothing was added to it")
+        elif unjoined:
+            self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
+        if self._path is not None and self._writes and new:
+            write_places(self._path, self.places, self._rig)
+        return found
+
+    def _joined(self) -> set[int]:
+        """Return the keyframes that links join to the map that was given, or else the largest part."""
+        if self.places is None or not self.places.keyframes:
+            return set()
+        found = parts(self.places)
+        return set(next((part for part in found if self._known.intersection(part)), found[0]))
+
+
+def place_rig(geometry: Geometry) -> PlaceRig:
+    """Return the part of a rig on which a map depends."""
+    rig = geometry.rig
+    text = rig_toml(replace(rig, lower=_unmasked(rig.lower), upper=_unmasked(rig.upper), covariance=None))
+    return PlaceRig(geometry.cylinder, rig.baseline_m, geometry.T_rig_rect, rig.T_base_rig,
+                    hashlib.sha256(text.encode()).hexdigest())
+
+
+def new_places(settings: PlacesConfig) -> PlaceMap:
+    """Return an empty map with the bounds of the settings."""
+    return PlaceMap(settings.limits.max_keyframes, round(settings.limits.max_mb * 1_000_000))
+
+
+def _unmasked(camera: MountedCamera) -> MountedCamera:
+    """Return a camera without its mask, which may have been found in the images of the run."""
+    return replace(camera, mask=None)
+
+
+def _require_consistent(settings: PlacesConfig) -> None:
+    if settings.map and not settings.enabled:
+        raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
+    if settings.localize_only and not settings.map:
+        raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")

@@ -1,0 +1,103 @@
+"""Maps of places by the command line: built from logs, extended, left as they are, refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig_file import read_rig, write_rig
+from omnid.formats.place_file import read_places
+from omnid.formats.tum import read_tum
+from tests.replay.command import Command
+from tests.simulation.rigs import with_upper_rotated
+
+
+@pytest.fixture(scope="module")
+def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the scene's log."""
+    from omnid.cli import main
+
+    path = tmp_path_factory.mktemp("map") / "scene.omap"
+    assert main(["map", "build", str(scene / "log.mcap"), "-o", str(path), "--rig", str(scene / "rig.toml"),
+                 "--quiet"]) == 0
+    return path
+
+
+@pytest.fixture
+def omap(built: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    (tmp_path / "place.omap").write_bytes(built.read_bytes())
+    return tmp_path / "place.omap"
+
+
+def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
+    omnid: Command, scene: Path, omap: Path, tmp_path: Path
+) -> None:
+    """Threaded and inline with the same bytes."""
+    before, twin = len(read_places(omap)[0]), tmp_path / "twin.omap"
+    twin.write_bytes(omap.read_bytes())
+    for path, more in ((omap, ["--map-tum", tmp_path / "m"]), (twin, ["--inline"])):
+        result = omnid.replay(scene / "log.mcap", "--map", path, *more, rig=scene / "rig.toml")
+        assert result.code == 0 and result.count("loops") >= 2 and "warning" not in result.err
+    assert omap.read_bytes() == twin.read_bytes()
+    places, _ = read_places(omap)
+    assert len(places) == 2 * before and {k.session for k in places.keyframes.values()} == {0, 1}
+    in_map, truth = read_tum(tmp_path / "m"), read_tum(scene / "truth.txt")
+    T = np.linalg.inv(truth.T[0]) @ truth.T[-1]
+    np.testing.assert_allclose(in_map.T[-1][:3, 3], T[:3, 3], atol=0.02)
+
+
+def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_again_warns(
+    omnid: Command, scene: Path, omap: Path, tmp_path: Path
+) -> None:
+    write_rig(tmp_path / "better.toml", with_upper_rotated(read_rig(scene / "rig.toml"), (0.02, 0.0, 0.0)))
+    before = omap.read_bytes()
+    result = omnid.replay(scene / "log.mcap", "--map", omap, "--localize-only", rig=tmp_path / "better.toml")
+    assert result.code == 0 and result.count("loops") >= 2
+    assert "calibrated again" in result.err and omap.read_bytes() == before
+
+
+def test_what_is_not_recognised_is_left_out_with_a_warning(
+    omnid: Command, scene: Path, elsewhere: Path, omap: Path
+) -> None:
+    before = omap.read_bytes()
+    result = omnid.replay(elsewhere / "log.mcap", "--map", omap, rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("loops") == 0
+    assert f"{omap}: no place of it was recognised" in result.err and omap.read_bytes() == before
+
+
+def test_build_extends_a_map(omnid: Command, scene: Path, omap: Path) -> None:
+    before = len(read_places(omap)[0])
+    result = omnid("map", "build", scene / "log.mcap", "-o", omap, "--extend", "--rig", scene / "rig.toml", "--quiet")
+    assert result.code == 0 and f"keyframes    {2 * before}, " in result.out and "sessions     2" in result.out
+
+
+def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Path) -> None:
+    error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--map", omap, "--set",
+                          "panorama.width_px=400")
+    assert "panoramas of 432 columns, not 400" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--map", "{}/none.omap"], "cannot read the map"),
+        (["--map", "{}/a.ply"], "--cloud FILE.ply"),
+        (["--map", "{}/log.mcap"], "expected a map of places"),
+        (["--localize-only"], "needs a map"),
+        (["--map", "{}/none.omap", "--set", "places.enabled=false"], "places.enabled = true"),
+    ],
+)
+def test_wrong_maps_are_one_line(omnid: Command, scene: Path, words: list[str], message: str) -> None:
+    given = [word.format(scene) for word in words]
+    assert message in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", *given)
+
+
+def test_build_refuses_what_it_cannot_do(omnid: Command, scene: Path, tmp_path: Path) -> None:
+    build = ("map", "build", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "-o")
+    assert "there is no folder" in omnid.refused(*build, tmp_path / "none" / "a.omap")
+    assert "this is the log" in omnid.refused(*build, scene / "log.mcap")
+    assert "cannot read the map" in omnid.refused(*build, tmp_path / "a.omap", "--extend")
+    assert "places.enabled" in omnid.refused(*build, tmp_path / "a.omap", "--set", "places.enabled=false")
