@@ -42,9 +42,9 @@ LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
 SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 degrees
 START_ROUNDS = 2  # of starting a map again, once the velocity is known
-# Landmarks tracked from the last panorama at most, others in the next frame: enough for the start of the refinement,
-# which aligns the patches of all landmarks.
-TRACKED = 330
+# Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
+# start of the refinement, which aligns the patches of all landmarks.
+TRACKED_SHARE = 0.6
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
@@ -103,7 +103,7 @@ class VisualOdometry:
         estimate: PoseEstimate | None = None
         for T_guess, is_near in self._guesses(frame, usable, T_predicted) if searched else ():
             # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-            tracks = self._map.track(frame.lower, T_guess, TRACKED, turn=frame.seq, near=is_near)
+            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=is_near)
 
             # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
             #    on the bearings in both panoramas (IV.C, in place of eq. 9).
@@ -171,7 +171,7 @@ class VisualOdometry:
             self._map.clear()
             self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
             exposure = self._exposure(frame, motion)
-            tracks = self._map.track(frame.lower, estimate.T_odom_rect, TRACKED, turn=frame.seq)
+            tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked(), turn=frame.seq)
             coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
             again = self._refine(frame, coarse, exposure, dt_s) if coarse else None
             estimate = again if again is not None else replace(estimate, landmarks=estimate.landmarks[:0])
@@ -323,6 +323,10 @@ class VisualOdometry:
         """Return the number of landmarks wanted in a keyframe."""
         limits = self._limits
         return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
+
+    def _tracked(self) -> int:
+        """Return the number of landmarks that are tracked at most."""
+        return max(2 * self._limits.good_inliers, round(TRACKED_SHARE * self._limits.features))
 
     def _map_covariance(self, estimate: PoseEstimate) -> Array:
         """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to the pose."""

@@ -175,7 +175,7 @@ class _ShiftedWindows:
         grid = weights.astype(np.float32).reshape(-1, self._around, self._around)
         # Weights are products of those along the columns and those along the rows, which add up to one.
         columns, rows = grid.sum(axis=1), grid.sum(axis=2)
-        strips = (columns[:, None] @ self._strips)[:, 0]
+        strips = sum(columns[:, shift, None] * self._strips[:, shift] for shift in range(self._around))
         y = sum(rows[:, shift, None] * strips[:, WINDOW_PX * shift :][:, : WINDOW_PX**2]
                 for shift in range(self._around))
         return np.asarray(np.einsum("nk,nk->n", y, y) - (weights * self._sums[:, _ONES:]).sum(axis=1) ** 2, float)
