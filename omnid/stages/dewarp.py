@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
 
 NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
+BLUR_SHARE = 0.6  # sigma of the blur by the pixels that a pixel of the panorama covers beside its own
 MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 
 
@@ -26,6 +29,7 @@ class Dewarp:
         self._pad_px = config.pad_px
         rig, cylinder = geometry.rig, geometry.cylinder
         self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
+        self._blur_px = _blur_px((self._lower, self._upper))
         both = visible(rig.lower, self._lower, config.rim_margin_px)
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
@@ -62,7 +66,8 @@ class Dewarp:
     def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool
                   ) -> tuple[PaddedPanorama, Light]:
         """Return a panorama, brightened if it is dim; measured: measure the noise of this camera again."""
-        remapped = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
+        smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
+        remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
         inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
         if measured:
             self._noise_grey[camera] = noise_sigma(inner, self._visible)
@@ -70,6 +75,16 @@ class Dewarp:
         found = light(inner, self._visible, noise_grey)
         gain = gain_of(found.level_grey)
         return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain), found
+
+
+def _blur_px(tables: tuple[Maps, ...]) -> float:
+    """Return the sigma [px] of the blur of the images, so that a coarser panorama has no aliasing; 0: none.
+
+    A pixel of a panorama that covers n pixels of the image has the blur that makes one of n.
+    """
+    steps = [np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[(u[:, 1:] >= 0) & (u[:, :-1] >= 0)] for u, v in tables]
+    covered_px = float(np.median(np.concatenate(steps)))
+    return BLUR_SHARE * math.sqrt(covered_px**2 - 1) if covered_px > 1 else 0.0
 
 
 def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
