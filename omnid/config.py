@@ -75,6 +75,16 @@ class LiveConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RigConfig:
+    """Refinement of the rig while `omnid run` drives; the rig's file is never written."""
+
+    refine: str = knob("report", "all parameters of the rig from windows of keyframes, in a process of low priority, "
+                       "told in the status with their sigmas", choices=("off", "report"))
+    refine_keyframes: int = knob(30, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
+    refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
+
+
+@dataclass(frozen=True, slots=True)
 class PairConfig:
     """Synchronisation of the cameras."""
 
@@ -205,6 +215,7 @@ class Config:
 
     log: LogConfig = field(default_factory=LogConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
+    rig: RigConfig = field(default_factory=RigConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     camera: TimingConfig = field(default_factory=TimingConfig)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
@@ -280,6 +291,7 @@ USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
     "realtime": "run",
     "record": "run",
     "record.cloud_points": "",
+    "rig": "run",
     "service": "run",
 })
 

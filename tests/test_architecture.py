@@ -111,10 +111,14 @@ ARROWS: Mapping[str, str] = {
         "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
+    "omnid.refinement":
+        "calib.errors calib.fit calib.rig omnid.calibration omnid.config omnid.messages omnid.stages "
+        "omnid.tracking_state omnid.transport",
     "omnid.runs":
         "calib.rig calib.rig_file drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
         "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.places "
-        "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.messages omnid.settings_dump omnid.sinks "
+        "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.messages omnid.refinement "
+        "omnid.settings_dump omnid.sinks "
         "omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",

@@ -14,6 +14,7 @@ from calib.rig import Rig
 XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, DISTORTION_SIGMA_PX, TANGENTIAL_SIGMA_PX = 0.02, 0.02, 3.0, 1.0, 3.0
 TURN_SIGMA_RAD, DIRECTION_SIGMA_RAD = np.deg2rad(1.5), np.deg2rad(2.0)
 RULER_SIGMA_M = 0.5e-3
+HIGHER_POWERS, POLYNOMIAL_SIGMA_PX = tuple(f"a{power}" for power in range(3, 64)), 0.5  # 0 for a paraboloid
 WAVEFRONT_SIGMA_M = 1e-3  # a ray of a mirror camera passes the viewpoint within about a millimetre
 DELAY_SIGMA_MS, LINE_TIME_SIGMA_US = 15.0, 30.0
 # Smallest part of a nominal sigma to which a board's covariance is trusted: mirrors are knocked and metal grows.
@@ -55,8 +56,10 @@ def _nominal_sigma(name: str, value: float, unit: float) -> float:
         return XI_SIGMA / unit
     if own in ("p1", "p2"):
         return TANGENTIAL_SIGMA_PX
-    if own in ("k1", "k2", "c", "d"):
+    if own in ("k1", "k2", "c", "d", "s1", "s2"):
         return DISTORTION_SIGMA_PX
+    if own in HIGHER_POWERS:
+        return float(np.hypot(POLYNOMIAL_SIGMA_PX, FOCAL_SIGMA * value / unit))
     return FOCAL_SIGMA * abs(value) / unit  # focal lengths and coefficients of a polynomial
 
 

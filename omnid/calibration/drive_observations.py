@@ -16,7 +16,7 @@ from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.log_rig_check import open_log
 from omnid.config import Config
-from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels
+from omnid.core.rig.drive_landmarks import LANDMARKS, DriveLandmarks, PanoramaObservations, View, image_pixels
 from omnid.core.rig.rig_check import match
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
@@ -102,29 +102,49 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
     """Return at most so many keyframes of one drive, its landmarks, and their pixels in the images."""
     reader = open_log(log, topics, place.rig)
     try:
-        landmarks = DriveLandmarks(place.model(NOISE_PX))
-        T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
+        collector = DriveCollector(place)
         newest = np.eye(4)
-        choice = _KeyframeChoice(_spacing(reader, most))
+        choice = KeyframeChoice(_spacing(reader, most))
         for update, twist in _with_twists(_updates(reader, place, config, log)):
             newest = update.T_odom_rig
-            if not choice.takes(update):
-                continue
-            seen = update.depth.panoramas
-            T_odom_rect = update.T_odom_rig @ place.T_rig_rect
-            landmarks.add(View(seen.lower, seen.upper, seen.visible, update.depth.disparity, T_odom_rect))
-            T_rig_odom.append(se3.inverse(update.T_odom_rig))
-            twists.append(twist)
-            delays_s.append(_stamp_delay_s(seen, place.rig))
+            if choice.takes(update):
+                collector.add(update, twist)
     finally:
         reader.close()
-    found = landmarks.observations()
-    pixels = image_pixels(found, place.rig, place.cylinder)
-    observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
-    observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-    motion = KeyframeMotion(np.array(twists), np.array(delays_s))
-    state = DriveState(np.array(T_rig_odom), found.points[used], np.zeros(0), motion)
-    return Drives(state, observations, (0,), T_rig_odom[-1] @ newest)
+    return collector.drives(newest)
+
+
+class DriveCollector:
+    """Follows the landmarks of one drive from keyframe to keyframe."""
+
+    def __init__(self, place: Geometry, landmarks: int = LANDMARKS) -> None:
+        self._place = place
+        self._landmarks = DriveLandmarks(place.model(NOISE_PX), landmarks)
+        self._T_rig_odom, self._twists, self._delays_s = list[Array](), list[Array](), list[float]()
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self._T_rig_odom)
+
+    def add(self, update: OdometryUpdate, twist: Array) -> None:
+        """Take a keyframe with its twist (6,) per second, in the rig frame."""
+        seen, place = update.depth.panoramas, self._place
+        T_odom_rect = update.T_odom_rig @ place.T_rig_rect
+        self._landmarks.add(View(seen.lower, seen.upper, seen.visible, update.depth.disparity, T_odom_rect))
+        self._T_rig_odom.append(se3.inverse(update.T_odom_rig))
+        self._twists.append(twist)
+        self._delays_s.append(_stamp_delay_s(seen, place.rig))
+
+    def drives(self, T_odom_last: Array) -> Drives:
+        """Return the observations; T_odom_last (4, 4): pose of the last pair."""
+        found, place = self._landmarks.observations(), self._place
+        pixels = image_pixels(found, place.rig, place.cylinder)
+        observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
+        observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
+        motion = KeyframeMotion(np.array(self._twists), np.array(self._delays_s))
+        state = DriveState(np.array(self._T_rig_odom), found.points[used], np.zeros(0), motion)
+        return Drives(state, observations, (0,), self._T_rig_odom[-1] @ T_odom_last)
 
 
 def _stamp_delay_s(seen: Panoramas, rig: Rig) -> float:
@@ -138,11 +158,12 @@ def _spacing(reader: LogReader, most: int) -> int:
     return max(1, -(-pairs // most))
 
 
-class _KeyframeChoice:
+class KeyframeChoice:
     """Chooses the poses that lie apart far enough to tell something new."""
 
-    def __init__(self, apart: int) -> None:
-        self._apart = apart  # pairs at least
+    def __init__(self, apart: int = 1, apart_m: float = KEYFRAME_M, apart_rad: float = KEYFRAME_RAD) -> None:
+        """apart: pairs at least; and one of metres and radians."""
+        self._apart, self._apart_m, self._apart_rad = apart, apart_m, apart_rad
         self._last: Array | None = None
         self._since = 0
 
@@ -151,7 +172,7 @@ class _KeyframeChoice:
         self._since += 1
         if self._last is not None:
             moved = se3.log(se3.inverse(self._last) @ update.T_odom_rig)
-            still = np.linalg.norm(moved[:3]) < KEYFRAME_M and np.linalg.norm(moved[3:]) < KEYFRAME_RAD
+            still = np.linalg.norm(moved[:3]) < self._apart_m and np.linalg.norm(moved[3:]) < self._apart_rad
             if still or self._since < self._apart or update.state is TrackingState.LOST:
                 return False
         self._last, self._since = update.T_odom_rig, 0

@@ -31,6 +31,7 @@ from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
+from omnid.refinement.rig_refinement import RigRefinement
 from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
@@ -136,6 +137,9 @@ class LiveRun:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         ladder = LoadLadder()
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
+        refinement = self._refinement(session, geometry, ladder) if config.rig.refine != "off" else None
+        if refinement is not None:
+            poses["refine"] = refinement
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       rig_monitor=rig_monitor, rig_broken=_broken(rig_monitor),
@@ -159,9 +163,14 @@ class LiveRun:
             TICKERS,
             (ladder.status, partial(start_status, stages.rig_gate),
              *([partial(places_status, stages.places)] if stages.places else ()),
-             *(part.status for part in (bus, recorder, rig_monitor) if part)),
+             *(part.status for part in (bus, recorder, rig_monitor, refinement) if part)),
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
+
+    def _refinement(self, session: Session, geometry: Geometry, ladder: LoadLadder) -> RigRefinement:
+        refinement = RigRefinement(geometry, self._config.rig, lambda: ladder.level.features >= 1)
+        session.outputs.callback(refinement.close)
+        return refinement
 
     def _add_tickers(self, session: Session, report: StatusCollector, bus: Bus, recorder: Recorder | None) -> None:
         publishers = [_status_on_bus(bus)]

@@ -24,6 +24,7 @@ RIG: Final = f"{PREFIX}rig"
 PLACES: Final = f"{PREFIX}places"
 LOAD: Final = f"{PREFIX}load"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
+RIG_REFINEMENT: Final = f"{PREFIX}rig refinement"
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
 

@@ -62,8 +62,9 @@ class PanoramaObservations:
 class DriveLandmarks:
     """Tracks landmarks from keyframe to keyframe; keeps the images of the newest MAX_KEYFRAMES keyframes only."""
 
-    def __init__(self, model: StereoModel) -> None:
-        self._model = model
+    def __init__(self, model: StereoModel, most: int = LANDMARKS) -> None:
+        """most: landmarks in view of a keyframe."""
+        self._model, self._most = model, most
         self._keyframes: dict[int, View] = {}  # the newest ones
         self._number = -1  # of the newest keyframe
         self._points = np.zeros((0, 3))  # (L, 3) m in odom
@@ -115,7 +116,7 @@ class DriveLandmarks:
         """Begin new landmarks in the gaps, where both panoramas show the same patch."""
         model = self._model
         free = clear_around(current.visible, self._pixels, APART_PX)
-        pixels = corners(current.lower, free, LANDMARKS - len(self._pixels))
+        pixels = corners(current.lower, free, self._most - len(self._pixels))
         disparity = nearby_disparity(current.disparity, pixels)
         pixels, disparity = pixels[np.isfinite(disparity)], disparity[np.isfinite(disparity)]
         guess = pixels + np.column_stack([np.zeros(len(pixels)), disparity])

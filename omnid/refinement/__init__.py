@@ -1,0 +1,1 @@
+"""Refinement of the rig while the daemon runs."""
