@@ -80,7 +80,7 @@ class RigConfig:
 
     refine: str = knob("report", "all parameters of the rig from windows of keyframes, in a process of low priority, "
                        "told in the status with their sigmas", choices=("off", "report"))
-    refine_keyframes: int = knob(30, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
+    refine_keyframes: int = knob(20, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
     refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
 
 

@@ -76,7 +76,7 @@ def test_a_disturbed_rig_is_reported_with_its_sigmas(rooms: Path) -> None:
     assert float(status.values["refined_error_px"]) < 0.5 * float(status.values["error_px"])
     assert abs(float(status.values["lengths_percent"])) > 4 * float(status.values["lengths_sigma_percent"]) > 0
     before, after = (float(status.values[f"lower_pu_{when}"]) for when in ("before", "after"))
-    assert 0.2 < before - after < 0.7 and 0 < float(status.values["lower_pu_sigma"]) < 0.05
+    assert 0.2 < before - after < 0.7 and 0 < float(status.values["lower_pu_sigma"]) < 0.1
     assert status.values["windows"] == "1" and status.values["windows_without_result"] == "0"
 
 
