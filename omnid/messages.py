@@ -80,6 +80,11 @@ class StereoDepth:
             self._dense = self._compute(self.panoramas, self._exposure)
         return self._dense
 
+    @property
+    def exposure(self) -> Exposure | None:
+        """The motion during the exposures that the depth is corrected for."""
+        return self._exposure
+
     def settle(self, exposure: Exposure | None) -> None:
         """Set the motion during the exposures, unless the depth was already computed for one."""
         if self._dense is None:

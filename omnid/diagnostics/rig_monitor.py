@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.rig_check import BROKEN_DEG, Matches, RigCondition, RigFinding, judge, match, together
-from omnid.messages import Panoramas
+from omnid.messages import OdometryUpdate, Panoramas
 from omnid.stages.rig_gate import RigGate
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import RIG, RIG_AT_START
@@ -70,20 +71,25 @@ class RigMonitor:
         """True if the newest finding is that the rig is broken."""
         return self.finding is not None and self.finding.condition == "broken"
 
-    def process(self, panoramas: Panoramas) -> None:
-        """Use a pair if it is due, and check the rig when there are enough new views."""
+    def process(self, panoramas: Panoramas, exposure: Exposure | None = None) -> None:
+        """Use a pair if it is due, and check the rig when there are enough new views.
+
+        exposure: the motion between the exposures of a pair that is not synchronised, which is used only with it.
+        """
         self._newest_ns = panoramas.stamp_ns
+        if panoramas.times is not None and (exposure is None or not exposure.is_known):
+            return
         if self._used_ns <= panoramas.stamp_ns < self._used_ns + self._every_ns:
             return
         self._used_ns = panoramas.stamp_ns
-        if self._add_view(panoramas):
+        if self._add_view(panoramas, exposure):
             self._new += 1
             self._look_at_recent(panoramas.stamp_ns)
         if self._new >= VIEWS and len(self._views) >= MIN_PLACES:
             self._found = judge(together(view.matches for view in self._views), self._cylinder), panoramas.stamp_ns
             self._new = 0
 
-    def _add_view(self, panoramas: Panoramas) -> bool:
+    def _add_view(self, panoramas: Panoramas, exposure: Exposure | None) -> bool:
         """Keep the view unless it is of the same place as the last one; return True if it was kept."""
         thumbnail = _thumbnail(panoramas)
         same_place = [float(thumbnail @ view.thumbnail) > MIN_CORRELATION for view in self._views]
@@ -91,7 +97,8 @@ class RigMonitor:
             return False
         if any(same_place):  # an older view of this place
             del self._views[same_place.index(True)]
-        self._views.append(_View(thumbnail, match(panoramas.lower, panoramas.upper, panoramas.visible)))
+        self._views.append(_View(thumbnail, match(panoramas.lower, panoramas.upper, panoramas.visible,
+                                              exposure)))
         return True
 
     def _look_at_recent(self, stamp_ns: int) -> None:
@@ -113,6 +120,17 @@ class RigMonitor:
                    "matches": str(finding.matches), "tried": str(finding.tried),
                    "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
         return DiagnosticStatus(RIG, LEVELS[finding.condition], ADVICE[finding.condition], values)
+
+
+class RigMonitorSink:
+    """Passes the pairs of the odometry on to a monitor, with the motion during their exposures."""
+
+    def __init__(self, monitor: RigMonitor) -> None:
+        self._monitor = monitor
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Pass a pair on."""
+        self._monitor.process(odometry.depth.panoramas, odometry.depth.exposure)
 
 
 def start_status(gate: RigGate) -> DiagnosticStatus:

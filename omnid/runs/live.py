@@ -23,7 +23,7 @@ from omnid.core.control.arming import MANUAL
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.places_status import places_status
-from omnid.diagnostics.rig_monitor import RigMonitor, start_status
+from omnid.diagnostics.rig_monitor import RigMonitor, RigMonitorSink, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.flow import nothing
@@ -142,7 +142,7 @@ class LiveRun:
             poses["refine"] = refinement
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
-                      rig_monitor=rig_monitor, rig_broken=_broken(rig_monitor),
+                      rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
                       features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)

@@ -12,7 +12,7 @@ from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, PlaceUpdate
+from omnid.messages import FramePair, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
@@ -38,7 +38,7 @@ class Sinks:
     bus: Sink[Outgoing] | None = None
     live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
     replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
-    rig_monitor: Sink[Panoramas] | None = None
+    rig_monitor: Sink[OdometryUpdate] | None = None
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
     features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
     map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
@@ -60,10 +60,10 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     rig_gate = RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
     stereo = Stereo(geometry, config.stereo_settings(), rig_gate)
     panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama, config.camera), pairs, direct=True)
-    if sinks.rig_monitor:
-        graph.sink("rig", sinks.rig_monitor, panoramas, policy=NEWEST, depth=1)
     poses = Chain(stereo, OdometryStage(geometry, config.odometry, sinks.features))
     odometry = graph.stage("odometry", poses, panoramas)
+    if sinks.rig_monitor:
+        graph.sink("rig", sinks.rig_monitor, odometry, policy=NEWEST, depth=1)
     outgoing: dict[str, Stream[Outgoing]] = {
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
     mapping: Mapping | None = None

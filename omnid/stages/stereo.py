@@ -35,13 +35,19 @@ class Stereo:
         self._T_rig_rect = geometry.T_rig_rect
         self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
         self._rig_gate = rig_gate
+        self._previous: StereoDepth | None = None  # the last pair, if it is still to be checked
 
     def process(self, panoramas: Panoramas) -> StereoDepth:
         """Return the depth of a pair, which is computed when it is first read."""
         gate = self._rig_gate
-        if gate is not None:
+        if gate is not None and panoramas.times is None:
             gate.process(panoramas)
-        return StereoDepth(panoramas, self.dense, rig_fits=gate is None or not gate.doubtful)
+        elif gate is not None and self._previous is not None:
+            # The odometry finds the motion between the exposures of a pair before the next pair comes.
+            gate.process(self._previous.panoramas, self._previous.exposure)
+        depth = StereoDepth(panoramas, self.dense, rig_fits=gate is None or not gate.doubtful)
+        self._previous = depth if gate is not None and gate.is_active and panoramas.times is not None else None
+        return depth
 
     def dense(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, at the stamp of the pair.

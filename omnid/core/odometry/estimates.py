@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,12 @@ class PoseEstimate:
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
+
+    @property
+    def without_landmarks(self) -> PoseEstimate:
+        """The pose alone, where its landmarks are no longer in the map."""
+        return replace(self, landmarks=self.landmarks[:0], views=self.views[:0], pixels=self.pixels[:0],
+                       variance=self.variance[:0])
 
     @property
     def inlier_ratio(self) -> float:

@@ -174,7 +174,7 @@ class VisualOdometry:
             tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked(), turn=frame.seq)
             coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
             again = self._refine(frame, coarse, exposure, dt_s) if coarse else None
-            estimate = again if again is not None else replace(estimate, landmarks=estimate.landmarks[:0])
+            estimate = again if again is not None else estimate.without_landmarks
         return estimate
 
     def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[tuple[Array, bool]]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calib.fit.rig_drift import RigDrift, estimate_rig_drift
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 
 Array = NDArray[np.float64]
@@ -117,15 +118,29 @@ def together(found: Iterable[Matches]) -> Matches:
     return Matches(lower, upper, sum(part.tried for part in parts), sum(part.clear for part in parts))
 
 
-def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> Matches:
-    """Return the corners of the lower panorama found in the upper one, by coarse search and tracking."""
+def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure: Exposure | None = None) -> Matches:
+    """Return the corners of the lower panorama found in the upper one, by coarse search and tracking.
+
+    exposure: the motion between the exposures of the pair, for which the pixels are corrected; None: none.
+    """
     points = corners(lower, visible, POINTS)
     guess, likely, clear = _coarse(lower, upper, points)
     there, good = track(lower, upper, points, guess, KLT)
     step = there - guess
     step[:, 0] = (step[:, 0] + lower.width / 2) % lower.width - lower.width / 2
     good &= likely & (np.abs(step).max(axis=1) < MAX_STEP_PX) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
-    return Matches(points[good], there[good], len(points), clear)
+    found = Matches(points[good], there[good], len(points), clear)
+    return found if exposure is None else _at_stamp(found, exposure)
+
+
+def _at_stamp(found: Matches, exposure: Exposure) -> Matches:
+    """Return matches as they would be seen if both images were exposed at the stamp of the pair."""
+    views, _ = exposure.corrected(found.lower, found.upper[:, 1])
+    columns, _ = exposure.upper_columns(found.lower, found.upper[:, 1])
+    known = np.isfinite(columns)
+    upper = found.upper[known]
+    aside = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
+    return Matches(views[known, :2], np.column_stack([upper[:, 0] + aside, views[known, 2]]), found.tried, found.clear)
 
 
 def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tuple[Array, Flags, int]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from calib.panorama import Cylinder
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.rig.rig_check import (
     BROKEN_DEG,
@@ -73,9 +74,10 @@ class RigStartCheck:
         """True if no more pairs are needed."""
         return self.decided or self._rounds >= MOST_ROUNDS
 
-    def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> None:
-        """Add a pair; visible (H, W): where both cameras see the world."""
-        self._straight.append(match(lower, upper, visible))
+    def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure: Exposure | None = None
+            ) -> None:
+        """Add a pair; visible (H, W): where both cameras see the world; exposure: see `match`."""
+        self._straight.append(match(lower, upper, visible, exposure))
         self._exchanged.append(match(upper, lower, visible))
         pairs = len(self._straight)
         matches = sum(len(found.lower) for found in (*self._straight, *self._exchanged))
