@@ -13,7 +13,7 @@ from omnid.messages import Panoramas
 
 RETRY_S: Final = 1.0  # between two rounds while the images show too little
 S_PER_NS: Final = 1e-9
-PATIENT_PAIRS: Final = 20  # without a known motion, before pairs are used as if the rig stood
+PATIENT_PAIRS: Final = 5  # without a known motion, before pairs are used as if the rig stood
 EXCHANGE: Final = ("exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
                    "is that of other cameras")
 CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"

@@ -1,0 +1,38 @@
+"""Check of the rig by the first pairs where the cameras are not synchronised: motion is no wrong rig, and hides none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import omnid
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from omnid.stages.rig_gate import RigContradictedError
+from tests.simulation import build, write_log
+from tests.simulation.readout import Readout
+from tests.simulation.rigs import with_upper_rotated
+
+
+@pytest.fixture(scope="module")
+def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Rig]:
+    """Write a log of fast driving whose upper images are 25 ms later; return it and its rig."""
+    folder = tmp_path_factory.mktemp("skewed")
+    run = build("two_walls", seed=32, size=256, pairs=14)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=32,
+              readout=Readout(speed=2.0, skew_ms=(25.0, 25.0)))
+    return folder / "log.mcap", read_rig(folder / "rig.toml")
+
+
+@pytest.mark.parametrize(("turn_deg", "warned"), [(0.0, False), (0.7, True)])
+def test_a_drifted_rig_is_reported_and_motion_is_not(skewed: tuple[Path, Rig], turn_deg: float, warned: bool) -> None:
+    log, rig = skewed
+    warnings = omnid.replay(log, with_upper_rotated(rig, (0.0, turn_deg, 0.0))).warnings
+    assert any("do not quite fit the rig" in text for text in warnings) == warned, warnings
+
+
+def test_exchanged_cameras_are_refused(skewed: tuple[Path, Rig]) -> None:
+    log, rig = skewed
+    with pytest.raises(RigContradictedError, match="other way round"):
+        omnid.replay(log, rig, lower=rig.topics[1], upper=rig.topics[0])
