@@ -1,4 +1,4 @@
-"""Check of the rig by the first pairs where the cameras are not synchronised: motion is no wrong rig, and hides none."""
+"""Check of the rig by the first pairs of skewed cameras: motion is no wrong rig, and hides none."""
 
 from __future__ import annotations
 
