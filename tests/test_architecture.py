@@ -92,7 +92,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":
         "calib.panorama drivers.cameras drivers.frame omnid.config omnid.controller omnid.core.control "
-        "omnid.core.odometry omnid.core.rig omnid.engine omnid.messages omnid.stages omnid.tracking_state omnid.transport",
+        "omnid.core.odometry omnid.core.rig omnid.engine "
+        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.doctor":
         "calib.errors calib.rig_file drivers.cameras drivers.errors omnid.config omnid.controller "
         "omnid.engine omnid.errors omnid.transport",
