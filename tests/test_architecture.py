@@ -66,10 +66,9 @@ ARROWS: Mapping[str, str] = {
     "omnid.cli": "calib.errors drivers.errors omnid.commands omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
-        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "
-        "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
-        "drivers.errors drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config omnid.core.places "
-        "omnid.core.rig "
+        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file calib.rig "
+        "calib.rig_file calib.rig_frame calib.se calib.transform_file drivers.cameras drivers.errors drivers.frame "
+        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller omnid.core.places omnid.core.rig "
         "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
         "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
         "omnid.viewer omnid.web",
@@ -95,8 +94,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.core.odometry omnid.core.rig omnid.engine "
         "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.doctor":
-        "calib.errors calib.rig_file drivers.cameras drivers.errors omnid.config omnid.controller "
-        "omnid.engine omnid.errors omnid.transport",
+        "calib.errors calib.rig_file drivers.cameras drivers.errors drivers.motor drivers.motors omnid.config "
+        "omnid.controller omnid.engine omnid.errors omnid.transport",
     "omnid.engine": "drivers.frame omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",

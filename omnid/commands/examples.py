@@ -41,6 +41,8 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
     "diff": ("diff yesterday.mcap today.mcap",),
     "doctor": ("doctor --config /etc/omnid/omnid.toml",),
+    "motor test": ("motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
+                   "motor test --motor simulated --set motor.protocol=roboteq --write omnid.toml"),
     "config": ("config --minimal > omnid.toml", "config check omnid.toml", "config migrate old.toml > new.toml"),
     "install-service": ("install-service --dry-run",),
 })

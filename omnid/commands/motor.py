@@ -1,0 +1,121 @@
+"""`omnid motor test`: find out how the motors are wired, wheel by wheel, and write the settings for that."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from omnid.controller.motor_settings import DriveSettings
+
+SECTION = "motor.drive"
+_BEFORE = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair away
+from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to begin: """
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `motor` to the command line."""
+    parser = subparsers.add_parser("motor", help="test the wiring of the motors: sides, directions, scale")
+    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
+    test = actions.add_parser("test", help="turn each wheel, ask what moved, print the settings for that",
+                              description="Turn each motor forwards and back, ask which wheel moved and which way, "
+                              "then turn both wheels a number of times and ask for the true number. It prints the "
+                              "lines of the configuration that make the wheels turn as commanded.")
+    test.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'; default: "
+                      "motor.port of the settings")
+    test.add_argument("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s")
+    test.add_argument("--turns", type=float, default=3.0, metavar="N", help="of the wheels for the scale, 0: do not "
+                      "test it; default %(default)s")
+    test.add_argument("--write", type=Path, metavar="FILE", help="set the lines in this configuration file; its other "
+                      "lines stay as they are")
+    add_settings(test)
+    test.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Test the wiring and print the settings."""
+    from omnid.config import load_config
+    from omnid.doctor.wheel_wiring import WiringTest
+    from omnid.errors import OmnidError
+
+    named = [] if args.motor is None else [f"motor.port={args.motor}"]
+    config = load_config(args.config, [*args.overrides, *named]).motor
+    if not config.port:
+        raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
+    text = _text_of(args.write)
+    test = WiringTest(config, ask, speed_mps=args.speed, turns=args.turns)
+    if ask(_BEFORE).lower() != "yes":
+        raise OmnidError("not begun: only `yes` starts the motors")
+    drive = test.run()
+    values = _lines(config.drive, drive)
+    print(f"\n[{SECTION}]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
+    print("as it was set" if drive == config.drive else "different from the settings so far")
+    if args.write is not None:
+        _write(args.write, text, values, drive)
+    return 0
+
+
+def ask(question: str) -> str:
+    """Print a question and return the answer; OmnidError at the end of the input."""
+    from omnid.errors import OmnidError
+
+    sys.stdout.write(question)
+    sys.stdout.flush()
+    line = sys.stdin.readline()
+    if not line:
+        raise OmnidError("no answer: the wheels stand, nothing was written")
+    return line.strip()
+
+
+def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
+    """Return key and value in TOML of the wiring, and of the scale where it is another one."""
+    wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
+    scale = {name: repr(getattr(drive, name)) for name in ("gear", "ticks_per_turn", "max_wheel_mps")
+             if getattr(drive, name) != getattr(before, name)}
+    return wiring | scale
+
+
+def _text_of(path: Path | None) -> str:
+    """Return the text of the file to write; empty where there is none. OmnidError for one that is no configuration."""
+    from omnid.config import load_config
+    from omnid.sinks.files import check_outputs
+
+    if path is None:
+        return ""
+    check_outputs([("--write", path)], [])
+    if not path.exists():
+        return ""
+    load_config(path)
+    return path.read_text("utf-8")
+
+
+def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) -> None:
+    """Set the values in the file, after a check that they are read back and nothing else is changed."""
+    import tempfile
+    from dataclasses import replace
+
+    from calib.rig_file import write_file
+    from omnid.config import load_config
+    from omnid.doctor.wheel_wiring import toml_with
+    from omnid.errors import OmnidError
+
+    after = toml_with(text, SECTION, values)
+    with tempfile.TemporaryDirectory() as folder:
+        tried, before = Path(folder) / "after.toml", Path(folder) / "before.toml"
+        tried.write_text(after, "utf-8")
+        before.write_text(text, "utf-8")
+        old = load_config(before)
+        changed = {name: getattr(drive, name) for name in values}
+        wanted = replace(old, motor=replace(old.motor, drive=replace(old.motor.drive, **changed)))
+        try:
+            same = load_config(tried) == wanted
+        except OmnidError:
+            same = False
+    if not same:
+        raise OmnidError(f"--write {path}: the section [{SECTION}] cannot be set there: put the lines above into it")
+    write_file(path, after.encode())
+    print(f"written to {path}")

@@ -1,0 +1,171 @@
+"""Test of a base's wiring: each motor turns alone, a person says which wheel moved, and the settings follow from that.
+
+The wheels must not touch the ground. Commands go straight to the motor controller, without a daemon.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+from drivers.motor import VelocityCommand, stop_command
+from drivers.motors.serial_motor import LateReplyError, SerialMotor
+from omnid.controller.motor import open_motor
+from omnid.controller.motor_settings import DriveSettings, MotorSettings
+from omnid.errors import OmnidError
+
+MOVE_S: Final = 1.0  # in each direction
+REST_S: Final = 0.3  # until the wheels stand
+RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
+LARGEST_TURNS: Final = 1000.0
+# The setting that makes the number of turns right; controllers of other protocols take m/s, and know the rest.
+SCALES: Final[Mapping[str, str]] = {"roboteq": "gear", "odrive_ascii": "gear", "vesc": "gear",
+                                    "ros_arduino_bridge": "ticks_per_turn", "roboteq_power": "max_wheel_mps",
+                                    "roboteq_mixed": "max_wheel_mps"}
+MIXES_ITSELF: Final = "line"
+_SIDES: Final = {"l": "left", "r": "right", "b": "both", "n": "none", "a": "again"}
+
+Ask = Callable[[str], str]  # prints a question, returns the answer
+
+
+class Seen(NamedTuple):
+    """The wheel that a motor turned, and in which direction a positive command turned it."""
+
+    side: str
+    forward: bool
+
+
+class WiringTest:
+    """A test of the wiring; its commands stop the wheels also where it is interrupted."""
+
+    def __init__(self, config: MotorSettings, ask: Ask, *, speed_mps: float, turns: float, move_s: float = MOVE_S,
+                 rest_s: float = REST_S) -> None:
+        """speed_mps: of a wheel, above 0. turns: of each wheel, for the scale; 0: leave that out.
+
+        move_s: time for which a motor turns alone, in each direction. rest_s: after each motion.
+        """
+        if config.protocol == MIXES_ITSELF:
+            raise OmnidError("motor.protocol is 'line': its controller divides the speed between the wheels itself, so "
+                             "the wiring is set there; see whether it is right by `omnid drive`")
+        if not 0 < speed_mps <= config.drive.max_wheel_mps:
+            raise OmnidError(f"--speed {speed_mps:g}: expected a speed above 0, up to motor.drive.max_wheel_mps = "
+                             f"{config.drive.max_wheel_mps:g} m/s")
+        if not 0 <= turns <= LARGEST_TURNS:
+            raise OmnidError(f"--turns {turns:g}: expected 0 to {LARGEST_TURNS:g}")
+        self._config, self._ask = config, ask
+        self._speed_mps, self._turns, self._move_s, self._rest_s = speed_mps, turns, move_s, rest_s
+
+    def run(self) -> DriveSettings:
+        """Return the settings of the drive as the wiring is. Raise OmnidError where the answers do not tell it."""
+        plain = replace(self._config.drive, swapped=False, reverse_left=False, reverse_right=False)
+        with ExitStack() as closing:
+            motor, _ = open_motor(replace(self._config, drive=plain), closing)
+            while True:
+                first, second = (self._observe(motor, plain.track_m, channel) for channel in (1, 2))
+                if first.side != second.side:
+                    break
+                self._ask(f"Both motors turned the {first.side} wheel, which cannot be. Press Enter to see it again: ")
+        drive = replace(plain, **wiring(first, second))
+        if not self._turns or self._config.protocol not in SCALES:
+            return drive
+        with ExitStack() as closing:
+            motor, _ = open_motor(replace(self._config, drive=drive), closing)
+            return self._scaled(motor, drive)
+
+    def _observe(self, motor: SerialMotor, track_m: float, channel: int) -> Seen:
+        """Turn one motor forwards and back, and ask what moved."""
+        turn = -1.0 if channel == 1 else 1.0  # the command of the other wheel becomes 0
+        velocity_mps, yaw_rate_radps = self._speed_mps / 2, turn * self._speed_mps / track_m
+        while True:
+            for sign in (1, -1):
+                self._move(motor, sign * velocity_mps, sign * yaw_rate_radps, self._move_s)
+            answer = self._ask(f"Motor {channel} turned one way and back. Name the wheel that moved (l left, r right, "
+                               "b both, n none, a again): ")
+            side = _SIDES.get(answer[:1].lower(), "again")
+            if side == "none":
+                raise OmnidError(f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol"
+                                 ", or try a higher --speed")
+            if side == "both":
+                raise OmnidError(f"motor {channel} moved both wheels: are they coupled, or do both controllers have "
+                                 "one address (motor.drive.can_id)?")
+            if side != "again":
+                break
+        return Seen(side, self._yes(f"Did the {side} wheel turn forwards first, as for driving forwards (y or n)? "))
+
+    def _yes(self, question: str) -> bool:
+        while (answer := self._ask(question)[:1].lower()) not in ("y", "n"):
+            pass
+        return answer == "y"
+
+    def _scaled(self, motor: SerialMotor, drive: DriveSettings) -> DriveSettings:
+        """Turn both wheels by a number of turns, ask for the true number, and correct the scale."""
+        around_m = math.tau * drive.wheel_radius_m
+        self._ask(f"Mark both tyres. The wheels will turn forwards {self._turns:g} times. Press Enter: ")
+        moved_s = self._move(motor, self._speed_mps, 0.0, self._turns * around_m / self._speed_mps)
+        commanded = moved_s * self._speed_mps / around_m
+        while True:
+            answer = self._ask(f"{commanded:.2f} turns were commanded. How many were there (Enter if as many)? ")
+            turns = _number(answer) if answer else commanded
+            if turns is not None and 0 < turns <= LARGEST_TURNS:
+                return rescaled(drive, SCALES[self._config.protocol], turns / commanded)
+
+    def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
+        """Drive for so long, then stand; return the time for which it drove, s."""
+        period_s = 1 / self._config.rate_hz
+        motor.send(stop_command(0))  # after a pause the driver sends one in place of the first command
+        begin_s = next_s = time.monotonic()
+        while time.monotonic() < begin_s + duration_s:
+            with suppress(LateReplyError):  # the wheels go on turning: the controller's watchdog is far from its end
+                motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
+            next_s += period_s
+            time.sleep(max(0.0, min(next_s, begin_s + duration_s) - time.monotonic()))
+        motor.send(stop_command(0))
+        moved_s = time.monotonic() - begin_s
+        time.sleep(self._rest_s)
+        return moved_s
+
+
+def wiring(first: Seen, second: Seen) -> dict[str, bool]:
+    """Return the settings of a base whose motors turn these wheels; they are different ones."""
+    left, right = (first, second) if first.side == "left" else (second, first)
+    return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
+
+
+def rescaled(drive: DriveSettings, name: str, ratio: float) -> DriveSettings:
+    """Return the drive with the setting `name` corrected; ratio: true by commanded turns."""
+    if abs(ratio - 1) <= RIGHT_SCALE:
+        return drive
+    corrected = getattr(drive, name) * (ratio if name == "max_wheel_mps" else 1 / ratio)
+    changed: dict[str, Any] = {name: float(f"{corrected:.4g}")}
+    return replace(drive, **changed)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None
+
+
+def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
+    """Return a TOML text with keys of a section set; all other lines stay as they are."""
+    lines = text.splitlines()
+    header = re.compile(rf"\s*\[\s*{re.escape(section)}\s*\]\s*(#.*)?")
+    begin = next((number for number, line in enumerate(lines) if header.fullmatch(line)), None)
+    if begin is None:
+        return "\n".join([*lines, *([""] if lines else []), f"[{section}]",
+                          *(f"{key} = {value}" for key, value in values.items())]) + "\n"
+    sections = (number for number in range(begin + 1, len(lines)) if lines[number].lstrip().startswith("["))
+    end = next(sections, len(lines))
+    missing = dict(values)
+    for number in range(begin + 1, end):
+        key = lines[number].partition("=")[0].strip()
+        if key in missing:
+            lines[number] = f"{key} = {missing.pop(key)}"
+    added = [f"{key} = {value}" for key, value in missing.items()]
+    return "\n".join([*lines[:begin + 1], *added, *lines[begin + 1:]]) + "\n"

@@ -1,0 +1,185 @@
+"""`omnid motor test` on simulated controllers with another wiring than that of the settings."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
+from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
+from omnid.config import load_config
+from omnid.controller.motor_settings import DriveSettings, MotorSettings
+from omnid.doctor.wheel_wiring import Seen, WiringTest, toml_with, wiring
+from omnid.errors import OmnidError
+from tests.replay.command import Command
+
+ROOT = Path(__file__).parents[3]
+RADIUS_M = 0.02
+
+
+class WatchedController:
+    """A simulated controller that keeps the speeds of its wheels after each command."""
+
+    def __init__(self, controller: SimulatedController) -> None:
+        self._controller, self.base = controller, controller.base
+        self.notes: list[tuple[float, float]] = []
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the answers of the controller."""
+        answer = self._controller.feed(data)
+        self.notes.append((self.base.commanded_mps[0], self.base.commanded_mps[1]))
+        return answer
+
+
+class Person:
+    """Looks at the wheels, and answers the questions."""
+
+    def __init__(self, base: WatchedController) -> None:
+        self._base = base
+        self._travel_m = 0.0
+        self.questions: list[str] = []
+
+    def answer(self, question: str) -> str:
+        """Return the answer to a question."""
+        self.questions.append(question)
+        if "wheel that moved" in question:
+            moved = next(note for note in self._base.notes if any(note))
+            self._first, self._base.notes[:] = moved, []
+            left, right = (abs(speed) > 1e-6 for speed in moved)
+            return "b" if left and right else "l" if left else "r"
+        if "forwards first" in question:
+            return "y" if sum(self._first) > 0 else "n"
+        if "How many" in question:
+            time.sleep(0.3)  # until the wheels stand
+            return f"{(self._base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
+        self._travel_m = self._base.base.travel_m[0]
+        return "yes"
+
+
+@contextlib.contextmanager
+def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, SimulatedMotor]]:
+    """Yield settings that do not know the wiring, a person, and the base."""
+    drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0, ticks_per_turn=400.0)
+    true = replace(drive.geometry(), **wiring)  # type: ignore[arg-type]
+    watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
+    with contextlib.closing(SimulatedMotor(watched)) as motor:
+        watchdog_ms = 2000 if protocol == "ros_arduino_bridge" else 1000
+        yield MotorSettings(motor.port, protocol, watchdog_ms=watchdog_ms, drive=drive), Person(watched), motor
+
+
+@pytest.mark.parametrize(("protocol", "true"), [
+    ("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}),
+    ("roboteq_power", {"reverse_right": True, "max_wheel_mps": 2.0}),
+    pytest.param("odrive_ascii", {"swapped": True, "gear": 40.0}, marks=pytest.mark.slow),
+    pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
+    pytest.param("waveshare_json", {"swapped": True, "reverse_right": True}, marks=pytest.mark.slow),
+    ("ros_arduino_bridge", {"reverse_left": True, "ticks_per_turn": 800.0}),
+])
+def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:
+    with simulated(protocol, **true) as (config, person, motor):
+        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=1.5, move_s=0.1, rest_s=0.05).run()
+        assert not any(motor.base.commanded_mps)
+    expected = {"swapped": False, "reverse_left": False, "reverse_right": False, **true}
+    for name, value in expected.items():
+        found = getattr(drive, name)
+        assert found == value if isinstance(value, bool) else found == pytest.approx(value, rel=0.2), (name, found)
+    assert drive.track_m == config.drive.track_m and "forwards first" in " ".join(person.questions)
+
+
+def test_wheels_that_the_settings_describe_give_the_same_settings() -> None:
+    with simulated("roboteq", swapped=True, reverse_right=True) as (config, person, _):
+        wired = replace(config, drive=replace(config.drive, swapped=True, reverse_right=True))
+        assert WiringTest(wired, person.answer, speed_mps=0.4, turns=0, move_s=0.1, rest_s=0.05).run() == wired.drive
+        assert not any("How many" in question for question in person.questions)
+
+
+@pytest.mark.parametrize(("answers", "message"), [(["n"], "did not move"), (["b"], "moved both"),
+                                                  (["l", "y", "l", "y", "", "n"], "did not move")])
+def test_answers_without_a_result(answers: list[str], message: str) -> None:
+    with simulated("roboteq") as (config, _, motor):
+        given = iter(answers)
+        with pytest.raises(OmnidError, match=message):
+            WiringTest(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
+        assert not any(motor.base.commanded_mps) and not list(given)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("reverse_left", [False, True])
+@pytest.mark.parametrize("reverse_right", [False, True])
+def test_the_found_wiring_undoes_that_of_the_base(swapped: bool, reverse_left: bool, reverse_right: bool) -> None:
+    true = DifferentialDrive(swapped=swapped, reverse_left=reverse_left, reverse_right=reverse_right)
+    seen = []
+    for channels in ((1.0, 0.0), (0.0, 1.0)):
+        left, right = true.to_sides(*channels)
+        seen.append(Seen("left" if left else "right", left + right > 0))
+    found = DifferentialDrive(**wiring(*seen))
+    assert true.to_sides(*found.to_channels(1.0, 2.0)) == (1.0, 2.0)
+
+
+def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
+    path = tmp_path / "omnid.toml"
+    path.write_text("# mine\n[motor]\nprotocol = 'roboteq'\n[motor.drive] # of the base\nswapped = false\n"
+                    f"wheel_radius_m = {RADIUS_M}\n[record]\nfile_mb = 7\n")
+    with simulated("roboteq", swapped=True, reverse_left=True, gear=1.0) as (config, person, motor):
+        command = [sys.executable, "-m", "omnid", "motor", "test", "--motor", config.port, "--config", str(path),
+                   "--write", str(path), "--turns", "1", "--speed", "0.4", "--set", "motor.watchdog_ms=1000"]
+        with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdin is not None and process.stdout is not None
+            shown = ""
+            while (letter := process.stdout.read(1)):
+                shown += letter
+                if shown.endswith(("? ", ": ")):
+                    process.stdin.write(f"{person.answer(shown)}\n")
+                    process.stdin.flush()
+                    shown = ""
+        assert process.returncode == 0 and not any(motor.base.commanded_mps)
+        assert "swapped = true" in shown and "different from the settings" in shown and f"written to {path}" in shown
+    after = path.read_text()
+    assert after.startswith("# mine\n[motor]\n") and "[motor.drive] # of the base\n" in after
+    found = load_config(path)
+    assert (found.motor.drive.swapped, found.motor.drive.reverse_left, found.motor.drive.reverse_right) == (1, 1, 0)
+    assert found.record.file_mb == 7 and found.motor.drive.wheel_radius_m == RADIUS_M
+
+
+def test_a_section_is_set_where_it_is_or_added() -> None:
+    assert toml_with("", "a.b", {"x": "1"}) == "[a.b]\nx = 1\n"
+    assert toml_with("[a]\ny = 2\n", "a.b", {"x": "1"}) == "[a]\ny = 2\n\n[a.b]\nx = 1\n"
+    assert toml_with("[a.b]\n x=3 # old\ny = 2\n[c]\nx = 4\n", "a.b", {"x": "1", "z": "5"}) == (
+        "[a.b]\nz = 5\nx = 1\ny = 2\n[c]\nx = 4\n")
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    ((), "no motor controller is configured"),
+    (("--motor", "simulated"), "set there"),
+    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--speed", "9"), "--speed"),
+    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--turns", "-1"), "--turns"),
+    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--write", "/nowhere/x"), "--write"),
+])
+def test_wrong_options_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert message in Command(capsys).refused("motor", "test", *words)
+
+
+def test_without_yes_nothing_moves(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for text, message in (("no\n", "not begun"), ("", "no answer")):
+        monkeypatch.setattr("sys.stdin", __import__("io").StringIO(text))
+        code, _, err = Command(capsys)("motor", "test", "--motor", "simulated", "--set", "motor.protocol=vesc")
+        assert code == 2 and message in err
+
+
+def test_a_file_with_an_inline_table_is_left_alone(tmp_path: Path) -> None:
+    from omnid.commands.motor import _write
+
+    path = tmp_path / "omnid.toml"
+    path.write_text(text := "[motor]\ndrive = { gear = 2.0 }\n")
+    with pytest.raises(OmnidError, match="put the lines above"):
+        _write(path, text, {"swapped": "true"}, DriveSettings(swapped=True))
+    assert path.read_text() == text
