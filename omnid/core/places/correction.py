@@ -16,7 +16,9 @@ from omnid.core.places.pose_graph import PoseEdges, optimise
 Array = NDArray[np.float64]
 
 LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
-KEYFRAMES_PER_LOOP: Final = 200  # a map of more keyframes waits for more loops until it is optimised again
+FITS_M, FITS_RAD = 0.01, 0.003  # a loop that the map fits so well needs no optimisation
+LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map
+KEYFRAMES_PER_LOOP: Final = 50  # for each so many keyframes, one loop more waits
 ACCEPTED: Final = 0.5  # least weight of a loop that counts
 RECENT: Final = 8  # loops that tell the present drift; one that is refused may count later, while it is among them
 
@@ -50,11 +52,11 @@ class MapCorrection:
 
         fixed: keyframes (ids) that stay where they are; if there is none in the part, the oldest one stays.
 
-        In a large map the optimisation waits for some loops, so that its cost does not grow with the square of the map.
+        Loops that the map fits already wait for others, so that its cost does not grow with the square of the map.
         """
         self._places.links += loops
         self._waiting += len(loops)
-        if self.optimisations and self._waiting <= len(part) // KEYFRAMES_PER_LOOP:
+        if all(map(self._fits, loops)) and self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP:
             return
         self._waiting = 0
         self.optimisations += 1
@@ -75,6 +77,12 @@ class MapCorrection:
         newest = self._places.keyframes[part[-1]]
         if np.isfinite(result.covariance).all():
             self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
+
+    def _fits(self, loop: Link) -> bool:
+        """True if the poses of a map agree with a loop."""
+        poses = self._places.poses
+        error = se3.log(se3.inverse(poses[loop.a] @ loop.T_a_b) @ poses[loop.b])
+        return bool(np.linalg.norm(error[:3]) < FITS_M and np.linalg.norm(error[3:]) < FITS_RAD)
 
     def covariance_at(self, T_odom_rect: Array, covariance: Array) -> Array:
         """Return the covariance (6, 6) in the map of a pose whose covariance in odom is given."""

@@ -15,8 +15,8 @@ from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.place_map import PlaceFeatures
 
-FEATURES: Final = 256  # kept of a frame
-CORNERS: Final = 600  # detected, as the depth of some is not known
+FEATURES: Final = 200  # kept of a frame
+CORNERS: Final = 450  # detected, as the depth of some is not known
 PATCH_BASELINES: Final = 0.5  # diameter of a feature, in baselines of the rig: disparity times this is its size in px
 SIZES_PX: Final = (4.0, 40.0)  # smallest and largest diameter
 SIFT_SIGMA_PX, SIFT_LAYERS = 1.6, 3  # of OpenCV's SIFT: blur of the first image, and images in an octave

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 WAIT_FACTOR: Final = 1.5  # of the distance between keyframes: then one is added where odometry adds none
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
 SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
+SEARCHES: Final = 10  # after which only new keyframes are searched for
 LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
 TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
 GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
@@ -92,6 +93,7 @@ class MapLocaliser:
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
         self._last_T: Array | None = None
         self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
+        self._failed = 0  # searches of this part that found nothing
 
     def process(self, frame: OdometryFrame) -> MapPose:
         """Return the pose of odom in the map after a frame."""
@@ -133,7 +135,7 @@ class MapLocaliser:
         if frame.resets != self._resets:
             self._resets = frame.resets
             self._hypotheses.clear()
-            self._newest, self._recognised_at, self._searched = None, None, None
+            self._newest, self._recognised_at, self._searched, self._failed = None, None, None, 0
             self._part = 1 + max(self._part_of.values(), default=-1)
             self.correction.forget()
 
@@ -151,7 +153,7 @@ class MapLocaliser:
         if self._searched is None:
             return True
         since_ns, moved = frame.stamp_ns - self._searched[0], se3.inverse(self._searched[1]) @ frame.T_odom_rect
-        if self._elsewhere() and self._recognised_at is None:
+        if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
             return since_ns >= SEARCH_NS
         pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
         return pending and (length_m(moved) > CHECK_M or angle_rad(moved) > CHECK_RAD)
@@ -170,6 +172,7 @@ class MapLocaliser:
         found = self.search.near(small, features, self.places, self._expected(frame))
         if found is None and (far := self._elsewhere()):
             found = self.search.far(small, features, self.places, far)
+        self._failed = 0 if found is not None else self._failed + 1
         return found
 
     def _expected(self, frame: OdometryFrame) -> Expected:
@@ -185,8 +188,9 @@ class MapLocaliser:
                 path_m = min(path_m, since_m + float(np.linalg.norm(
                     self.places.poses[id][:3, 3] - self._recognised_at[1])))
             drift_m[id] = path_m
-        return Expected(T_map_rect, {id: GATE_M + GATE_PER_M * path_m for id, path_m in drift_m.items()},
-                        {id: GATE_RAD + GATE_RAD_PER_M * path_m for id, path_m in drift_m.items()})
+        error_m = {id: GATE_M + GATE_PER_M * path_m for id, path_m in drift_m.items()}
+        error_rad = {id: GATE_RAD + GATE_RAD_PER_M * path_m for id, path_m in drift_m.items()}
+        return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
 
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
         """Add a keyframe to the map."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition, recognise
@@ -24,6 +25,8 @@ NEAR_CANDIDATES: Final = 3  # keyframes that are compared where odometry tells a
 FAR_CANDIDATES: Final = 8  # keyframes that are compared where it does not
 NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
 FAR_INLIERS, FAR_SECTORS = 30, 5  # least support where it cannot tell
+PER_PLACE, SAME_PLACE_M = 3, 1.5  # at most so many of the keyframes that are compared lie so near together
+ENOUGH_INLIERS: Final = 50  # of a place that is enough
 RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
 
@@ -35,6 +38,7 @@ class Expected:
     T_map_rect: Array  # (4, 4)
     error_m: Mapping[int, float]  # by keyframe; a keyframe that is missing is not looked for
     error_rad: Mapping[int, float]
+    recognised: bool  # places were recognised lately: one that fits well is enough
 
 
 class PlaceSearch:
@@ -52,7 +56,8 @@ class PlaceSearch:
         at = expected.T_map_rect[:3, 3]
         ids = [id for id, error_m in expected.error_m.items()
                if np.linalg.norm(places.poses[id][:3, 3] - at) < NEAR_M + error_m]
-        found = [place for place in self._compare(small, features, places, ids, NEAR_CANDIDATES)
+        enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
+        found = [place for place in self._compare(small, features, (places, ids), NEAR_CANDIDATES, enough)
                  if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS]
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
@@ -63,21 +68,31 @@ class PlaceSearch:
     def far(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int]
             ) -> Recognition | None:
         """Return the best recognition among keyframes (ids) of which odometry does not know where they are."""
-        found = [place for place in self._compare(small, features, places, ids, FAR_CANDIDATES)
+        found = [place for place in self._compare(small, features, (places, ids), FAR_CANDIDATES, FEATURES + 1)
                  if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS]
         return self._unambiguous(found, places.poses)
 
-    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int], most: int
-                 ) -> list[Recognition]:
-        """Return the recognitions among the keyframes (ids) that look most similar, at most so many."""
+    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, among: tuple[PlaceMap, list[int]], most: int,
+                 enough: int) -> list[Recognition]:
+        """Return the recognitions among the keyframes of a map (ids) that look most similar, at most so many.
+
+        The search ends at a recognition with enough inliers.
+        """
+        places, ids = among
         if not ids:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
         similar, turns_rad = similarities(signature_of(small), others)
-        chosen = np.argsort(-similar, kind="stable")[:most].tolist()
-        found = [recognise(features, places.keyframes[ids[n]].features, ids[n], float(turns_rad[n]), self._model)
-                 for n in chosen]
-        return [place for place in found if place is not None]
+        chosen = _spread(np.argsort(-similar, kind="stable"), np.array([places.poses[id][:3, 3] for id in ids]), most)
+        found: list[Recognition] = []
+        for n in chosen:
+            there = places.keyframes[ids[n]].features
+            place = recognise(features, there, ids[n], float(turns_rad[n]), self._model)
+            if place is not None:
+                found.append(place)
+                if place.inliers >= enough:
+                    break
+        return found
 
     def _signature(self, keyframe: PlaceKeyframe) -> Signature:
         if keyframe.id not in self._signatures:
@@ -101,6 +116,21 @@ class PlaceSearch:
                 self.ambiguous += 1
                 return None
         return best
+
+
+def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
+    """Return the first of ranked places (N,) at positions (N, 3), at most so many, and at most PER_PLACE near another.
+
+    So a second place that looks the same is compared as well, although all neighbours of the first look more similar.
+    """
+    chosen: list[int] = []
+    for n in ranked.tolist():
+        beside = np.linalg.norm(at[chosen] - at[n], axis=1) < SAME_PLACE_M
+        if beside.sum() < PER_PLACE:
+            chosen.append(n)
+        if len(chosen) == most:
+            break
+    return chosen
 
 
 def _is_expected(place: Recognition, poses: Mapping[int, Array], expected: Expected) -> bool:

@@ -102,9 +102,11 @@ def matches(a: PlaceFeatures, b: PlaceFeatures, turn_rad: float, model: StereoMo
 def near_matches(a: PlaceFeatures, b: PlaceFeatures, predicted: Array, model: StereoModel) -> tuple[Indices, Indices]:
     """Return indices (M,) into a and b of mutual nearest neighbours near the views (N, 3) that a pose predicts of a."""
     squared = distances(a, b)
-    error = b.views[None].astype(float) - predicted[:, None]
-    error[..., 0] = model.cylinder.wrap(error[..., 0])
-    squared[(np.abs(error) > REACH_PX).any(axis=2) | (squared > LARGEST_SQUARED)] = np.inf
+    aside = model.cylinder.wrap(b.views[None, :, 0].astype(float) - predicted[:, None, 0])
+    far = (np.abs(aside) > REACH_PX) | (squared > LARGEST_SQUARED)
+    for row in (1, 2):
+        far |= np.abs(b.views[None, :, row] - predicted[:, None, row].astype(np.float32)) > REACH_PX
+    squared[far] = np.inf
     best = squared.argmin(axis=1)
     nearest = squared[np.arange(len(squared)), best]
     mutual = squared.argmin(axis=0)[best] == np.arange(len(squared))

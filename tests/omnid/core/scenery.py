@@ -78,14 +78,15 @@ class RenderedCameras:
         mounted = (self.rig.lower, self.rig.upper)
         images = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
                     for e, m in zip(self.exposures, mounted, strict=True)]
-        return self._stereo_frame(seq, images[0], images[1])
+        return self.stereo_frame(seq, images[0], images[1])
 
     def darkness(self, seq: int) -> StereoFrame:
         """Return the frame seen with the light off."""
         black = np.zeros(self.rig.lower.camera.size[::-1], np.uint8)
-        return self._stereo_frame(seq, black, black)
+        return self.stereo_frame(seq, black, black)
 
-    def _stereo_frame(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
+    def stereo_frame(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
+        """Return the frame of two images."""
         panoramas = [np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
                      for image, maps in zip((lower, upper), self.maps, strict=True)]
         padded = np.zeros(panoramas[0].shape, bool)
