@@ -18,7 +18,7 @@ OVERHEAD_BYTES = 1500  # of a keyframe beside its large arrays: poses, covarianc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceFeatures:
-    """SIFT features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
+    """Features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
 
     A view is column, lower row, upper row.
     """

@@ -19,7 +19,7 @@ Indices = NDArray[np.intp]
 
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)
 YAW_WINDOW_RAD: Final = 1.2  # a match's azimuth differs at most so much from that of the turn between both views
-SIGMA_PX: Final = 0.7  # standard deviation of SIFT positions
+SIGMA_PX: Final = 0.7  # standard deviation of corners and of the disparities beside them
 THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set
 MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose
 REACH_PX: Final = 6.0  # of the second search, about the views that the first pose predicts

@@ -1,0 +1,47 @@
+"""Descriptors stay the same in other light and at another scale, and differ from patch to patch."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from omnid.core.places.descriptors import describe_patches
+from tests.omnid.core.scenery import texture, wrapped
+
+PIXELS = np.array([[60.0, 50], [150, 60], [240, 70], [330, 55], [2, 60]])
+SIDES = np.full(5, 32.0)
+
+
+def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distances (N, M) of descriptors."""
+    return np.asarray(np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2))
+
+
+def test_another_light_changes_nothing_and_another_patch_much() -> None:
+    image = texture(1)
+    plain = describe_patches(wrapped(image), PIXELS, SIDES)
+    dimmer = describe_patches(wrapped((0.6 * image + 30).astype(np.uint8)), PIXELS, SIDES)
+    apart = distances(plain, dimmer)
+    assert plain.shape == (5, 128) and plain.dtype == np.uint8
+    assert np.diag(apart).max() < 60 and apart[~np.eye(5, dtype=bool)].min() > 150
+
+
+def test_a_patch_twice_as_large_is_seen_at_half_the_resolution() -> None:
+    image = texture(2, sigma_px=6.0)
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    large = describe_patches(wrapped(image), PIXELS[:4], 2 * SIDES[:4])
+    small = describe_patches(wrapped(half), (PIXELS[:4] - 0.5) / 2, SIDES[:4])
+    apart = distances(large, small)
+    assert np.diag(apart).max() < 0.5 * apart[~np.eye(4, dtype=bool)].min()
+
+
+def test_patches_run_across_the_seam_and_shift_with_the_panorama() -> None:
+    image = texture(3)
+    moved = describe_patches(wrapped(np.roll(image, 100, axis=1)), PIXELS + np.array([100, 0]), SIDES)
+    assert np.array_equal(describe_patches(wrapped(image), PIXELS, SIDES), moved)
+
+
+def test_no_patches_and_no_contrast_are_no_error() -> None:
+    blank = wrapped(np.full((120, 480), 90, np.uint8))
+    assert describe_patches(blank, PIXELS[:0], SIDES[:0]).shape == (0, 128)
+    assert not describe_patches(blank, PIXELS, SIDES).any()
