@@ -38,6 +38,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "map build": ("map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
                   "map build wednesday.mcap -o place.omap --extend"),
     "map info": ("map info place.omap",),
+    "map merge": ("map merge east.omap west.omap -o place.omap",),
     "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
     "diff": ("diff yesterday.mcap today.mcap",),
     "doctor": ("doctor --config /etc/omnid/omnid.toml",),

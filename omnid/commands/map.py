@@ -28,6 +28,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     info.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap")
     add_json(info)
     info.set_defaults(run=run_info)
+    merge = actions.add_parser("merge", help="join maps of one building, made by the same rig")
+    merge.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first "
+                       "stays")
+    merge.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
+    merge.set_defaults(run=run_merge)
     _add_export(actions)
 
 
@@ -110,6 +115,33 @@ def run_info(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found)
     return code
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Join the maps, each to those before."""
+    from omnid.core.odometry.pose_estimation import StereoModel
+    from omnid.core.places.merge import merge
+    from omnid.core.places.place_rig import seen_by
+    from omnid.core.places.place_views import summary
+    from omnid.errors import OmnidError
+    from omnid.formats.place_file import read_places, write_places
+    from omnid.sinks.files import check_outputs
+
+    if len(args.maps) < 2:
+        raise OmnidError("map merge: expected two maps or more")
+    check_outputs([("-o", args.output)], [])
+    places, rig = read_places(args.maps[0])
+    for path in args.maps[1:]:
+        other, other_rig = read_places(path)
+        if difference := other_rig.difference(rig):
+            raise OmnidError(f"{path}: this map was made with {difference}: build one with the rig of {args.maps[0]}")
+        seen_by(other, other_rig, rig)
+        if not merge(places, other, StereoModel(rig.cylinder, rig.baseline_m)):
+            raise OmnidError(f"{path}: it shares no place with the maps before that is recognised: drive where both "
+                             "have been, and add that log by `omnid map build LOG --extend`")
+    write_places(args.output, places, rig)
+    print(*_described(args.output, summary(places, rig), rig), sep="\n")
+    return 0
 
 
 def run_export(args: argparse.Namespace) -> int:

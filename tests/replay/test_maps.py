@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.rig_file import read_rig, write_rig
-from omnid.formats.place_file import read_places
+from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from tests.replay.command import Command
 from tests.simulation.rigs import with_upper_rotated
@@ -72,6 +72,27 @@ def test_build_extends_a_map(omnid: Command, scene: Path, omap: Path) -> None:
     before = len(read_places(omap)[0])
     result = omnid("map", "build", scene / "log.mcap", "-o", omap, "--extend", "--rig", scene / "rig.toml", "--quiet")
     assert result.code == 0 and f"keyframes    {2 * before}, " in result.out and "sessions     2" in result.out
+
+
+def test_maps_of_one_place_are_merged_and_of_two_places_refused(
+    omnid: Command, scene: Path, elsewhere: Path, omap: Path, tmp_path: Path
+) -> None:
+    """The second map begins later, so its frame is another one."""
+    later, away = tmp_path / "later.omap", tmp_path / "away.omap"
+    places, rig = read_places(omap)
+    places.drop(0)
+    T = np.linalg.inv(next(iter(places.poses.values())))
+    places.move({id: T @ pose for id, pose in places.poses.items()})
+    places.links = [link for link in places.links if {link.a, link.b} <= places.keyframes.keys()]
+    write_places(later, places, rig)
+    assert omnid("map", "build", elsewhere / "log.mcap", "-o", away, "--rig", scene / "rig.toml", "--quiet").code == 0
+    error = omnid.refused("map", "merge", omap, away, "-o", tmp_path / "both.omap")
+    assert "shares no place" in error and not (tmp_path / "both.omap").exists()
+    before = len(read_places(omap)[0])
+    result = omnid("map", "merge", omap, later, omap, "-o", tmp_path / "both.omap")
+    assert result.code == 0 and "sessions     3" in result.out and f"keyframes    {3 * before - 1}," in result.out
+    merged, _ = read_places(tmp_path / "both.omap")
+    np.testing.assert_allclose(merged.poses[before], merged.poses[1], atol=0.005)
 
 
 def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Path) -> None:
