@@ -66,12 +66,13 @@ ARROWS: Mapping[str, str] = {
     "omnid.cli": "calib.errors drivers.errors omnid.commands omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
-        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file calib.rig "
-        "calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras drivers.errors drivers.frame "
-        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller omnid.core.places omnid.core.rig "
-        "omnid.diagnostics omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor "
-        "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks "
-        "omnid.viewer omnid.web",
+        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "
+        "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
+        "drivers.errors drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config "
+        "omnid.controller omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics "
+        "omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings "
+        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.viewer "
+        "omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
         "omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration "
