@@ -15,4 +15,6 @@ class PlaceLimits:
                              low=0.05, high=10)
     keyframe_deg: float = knob(15.0, "turn after which a keyframe is kept, deg", low=1, high=180)
     max_keyframes: int = knob(1000, "keyframes kept; more drop those that others are nearest to", low=2, high=100_000)
+    by_scan: bool = knob(False, "where no place of a saved map is recognised, localise by the shape of the room: a "
+                         "particle filter on range scans; another building of the same shape would mislead it")
     max_mb: float = knob(50.0, "memory of the keyframes, MB; the same", low=0.1, high=10_000)

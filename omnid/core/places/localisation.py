@@ -24,6 +24,7 @@ from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_search import Expected, PlaceSearch
 from omnid.core.places.recognition import Recognition
+from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.core.places.signature import Thumbnail, thumbnail
 from omnid.tracking_state import MapState
 
@@ -37,6 +38,7 @@ LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
 TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
 GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
+FAILED_SEARCHES: Final = 3  # one after the other, after which range scans are compared, if the settings say so
 RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
 
 
@@ -94,6 +96,7 @@ class MapLocaliser:
         self._last_T: Array | None = None
         self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
         self._failed = 0  # searches of this part that found nothing
+        self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
 
     def process(self, frame: OdometryFrame) -> MapPose:
         """Return the pose of odom in the map after a frame."""
@@ -112,6 +115,11 @@ class MapLocaliser:
             # 3. Correct the map where several frames agree.
             if found is not None and self._newest is not None:
                 self._close_loop(frame, found, self._newest)
+        # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
+        if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
+            by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan)
+            if by_scan is not None:
+                return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED)
         return self._pose(frame, self._state())
 
     @property
@@ -136,6 +144,8 @@ class MapLocaliser:
             self._resets = frame.resets
             self._hypotheses.clear()
             self._newest, self._recognised_at, self._searched, self._failed = None, None, None, 0
+            if self._by_scan is not None:
+                self._by_scan.restart()
             self._part = 1 + max(self._part_of.values(), default=-1)
             self.correction.forget()
 
