@@ -154,6 +154,17 @@ def test_a_dim_image_is_brightened_and_its_noise_is_known(rig_geometry: Geometry
     assert bright.lower.noise_grey < 3.0
 
 
+def test_a_coarser_panorama_is_made_of_a_blurred_image(rig_geometry: Geometry) -> None:
+    """Single pixels of noise are averaged, not picked."""
+    size = rig_geometry.rig.lower.camera.size[::-1]
+    image = np.random.default_rng(3).integers(100, 200, size).astype(np.uint8)
+    pair, spread = FramePair(0, 0, image, image), []
+    for config in (CONFIG.panorama, replace(CONFIG.panorama, scale=0.5)):
+        seen = Dewarp(geometry(rig_geometry.rig, config), config).process(pair)
+        spread.append(seen.lower.panorama[seen.visible].std())
+    assert spread[1] < 0.75 * spread[0]
+
+
 def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geometry, frames: list[Frame]) -> None:
     """Half a pixel of disparity moves a point by about its standard deviation."""
     depth = depth_of(rig_geometry, frames)

@@ -48,6 +48,24 @@ def test_tracks_a_sample_to_compare_guesses(local_map: LocalMap) -> None:
     assert len(tracks.landmarks) > 0.9 * tracks.visible
 
 
+def test_samples_of_three_turns_are_all_landmarks(local_map: LocalMap) -> None:
+    after = wrapped(turned(texture(1), TURN_PX))
+    samples = [local_map.track(after, T_TURNED, most=len(local_map) // 3 + 1, turn=turn) for turn in (4, 5, 6)]
+    assert sum(sample.visible for sample in samples) == len(local_map)
+    assert all(sample.each_counts * sample.visible == pytest.approx(len(local_map)) for sample in samples)
+    assert len(np.unique(np.concatenate([sample.landmarks for sample in samples]))) > 0.95 * len(local_map)
+
+
+def test_without_a_pyramid_landmarks_are_found_near_the_guess_only(local_map: LocalMap) -> None:
+    after, guess = wrapped(turned(texture(1), TURN_PX + 3)), T_TURNED
+    near = local_map.track(after, guess, near=True)
+    assert len(near.landmarks) > 0.95 * len(local_map)
+    error = near.pixels[:, 0] - local_map.store.table.views[near.landmarks, 0] - TURN_PX - 3
+    assert np.abs(MODEL.cylinder.wrap(error)).max() < 0.1
+    far = wrapped(turned(texture(1), TURN_PX + 12))
+    assert len(local_map.track(far, guess, near=True).landmarks) < 0.5 * len(local_map.track(far, guess).landmarks)
+
+
 def test_patches_are_aligned_to_hundredths_of_a_pixel_where_the_pose_is_known(local_map: LocalMap) -> None:
     every = np.arange(len(local_map))
     patches = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every)

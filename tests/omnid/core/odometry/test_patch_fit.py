@@ -44,6 +44,16 @@ def test_a_shift_is_found_to_hundredths_under_another_gain_and_offset() -> None:
         assert np.abs(error(fit).mean(axis=0)).max() < 0.01
 
 
+def test_a_patch_may_move_by_less_than_the_reach() -> None:
+    far = np.array([1.6, -1.3])
+    templates, cells = patches(400, far)
+    fit = fit_patches(templates, cells, ONE_IMAGE, 1.0)
+    assert fit.fits.mean() > 0.9
+    assert np.sqrt(((fit.shift - far)[fit.fits] ** 2).mean()) < 0.03
+    nearer = fit_patches(templates, cells[:, 1:-1, 1:-1], ONE_IMAGE, 1.0)
+    assert nearer.fits.mean() < 0.1
+
+
 def test_patches_of_two_images_have_two_gains() -> None:
     bright, dim = patches(400, SHIFT), patches(400, SHIFT, gain=0.5)
     templates, cells = (np.concatenate([a[:200], b[200:]]) for a, b in zip(bright, dim, strict=True))
