@@ -50,6 +50,12 @@ def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
+def slow(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return steps of 17 mm between the same walls: with --speed 3, 0.5 m/s before cameras of 30 Hz."""
+    poses = paths.spline_path(seed, pairs, 0.05 / 3)
+    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 / 3 * pairs + 3.2)))
+
+
 def misaligned(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return 15 cm steps with cameras rotated about every axis; the rig frame is neither camera's."""
     rig = make_rig(size=size, scale=0.95, baseline_m=0.16, misaligned_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
@@ -138,7 +144,7 @@ def symmetric(seed: int, size: int, pairs: int) -> SimulatedRun:
 # By name, with the default number of pairs.
 RECIPES: dict[str, tuple[Recipe, int]] = {
     "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
-    "still": (still, 30), "fast": (fast, 33), "rooms": (rooms, 100),
+    "still": (still, 30), "slow": (slow, 60), "fast": (fast, 33), "rooms": (rooms, 100),
     "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
     "two_laps": (two_laps, 384), "there_and_back": (there_and_back, 60), "twin": (twin, 72),
     "brick_corridor": (brick_corridor, 120), "symmetric": (symmetric, 110),
