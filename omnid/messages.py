@@ -149,6 +149,8 @@ class PlaceUpdate:
     T_map_rig: Array  # (4, 4)
     covariance: Array  # (6, 6) of T_map_rig, x y z rx ry rz in map axes, m^2 and rad^2
     state: MapState
+    keyframe: int = -1  # of the map, to which the pose belongs; -1: none
+    T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,8 +36,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("outputs")
     group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
-    group.add_argument("--map-tum", type=Path, metavar="FILE", help="trajectory in the map, T_map_rig, as it was known "
-                       "at each pair: recognised places correct it")
+    group.add_argument("--map-tum", type=Path, metavar="FILE", help="trajectory in the map, T_map_rig: places that are "
+                       "recognised correct all poses before them")
     group.add_argument("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")

@@ -35,7 +35,7 @@ from omnid.settings_dump import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.sinks.files import MapFile, MapTrajectoryFile, PlanFile, TrajectoryFile, check_outputs
+from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_trajectory
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.geometry import Geometry
@@ -188,11 +188,10 @@ class _Replay:
         if options.collect:
             sinks.poses["collect-poses"] = self._poses
             sinks.maps["collect-map"] = self._map
-            sinks.places["collect-places"] = self._map_poses
         if options.tum:
             sinks.poses["trajectory"] = TrajectoryFile(options.tum)
-        if options.map_tum:
-            sinks.places["map-trajectory"] = MapTrajectoryFile(options.map_tum)
+        if options.map_tum or options.collect:
+            sinks.places["collect-places"] = self._map_poses
         if options.cloud:
             sinks.maps["map"] = MapFile(options.cloud)
         if options.plan:
@@ -230,7 +229,9 @@ class _Replay:
         counters = results.counters(session.statistics)
         if self._drive is not None:
             counters = replace(counters, motor=self._drive.counts())
-        newest = self._map.get()
+        newest, in_map = self._map.get(), results.map_poses(self._map_poses)
+        if self._options.map_tum:
+            write_trajectory(self._options.map_tum, self._map_poses.stamps_ns, in_map)
         return RunResult(
             self._poses.stamps_ns,
             self._poses.T_odom_rig,
@@ -241,6 +242,7 @@ class _Replay:
             (*dict.fromkeys(self._warnings), *results.warnings()),
             None if newest is None else newest.points,
             session.signal,
+            in_map,
             self._map_poses.T_map_rig,
             self._map_poses.states,
             results.places() if self._options.collect else None,

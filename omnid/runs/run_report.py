@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.logs.log_reader import LogReader
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.input_warnings import input_warnings
@@ -14,6 +17,7 @@ from omnid.diagnostics.status import stage_status, summary_status
 from omnid.engine.telemetry import SummaryRow
 from omnid.runs.pipeline import WiredStages
 from omnid.runs.session import Session
+from omnid.sinks.pose_collector import MapPoseCollector
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import DiagnosticStatus
 
@@ -39,6 +43,12 @@ class RunReport:
     def places(self) -> PlaceMap | None:
         """Return the map of places as it can be saved; None where there is none."""
         return None if self._stages.places is None else self._stages.places.map()
+
+    def map_poses(self, poses: MapPoseCollector) -> NDArray[np.float64]:
+        """Return the collected poses in the map (N, 4, 4) as it is at the end: later loops have corrected them."""
+        places = self._stages.places
+        found = [] if places is None else [places.corrected(update) for update in poses.updates]
+        return np.array(found).reshape(-1, 4, 4)
 
     def timings(self) -> dict[str, SummaryRow]:
         """Return the times of the stages."""

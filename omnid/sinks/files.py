@@ -18,7 +18,7 @@ from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
-from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
@@ -100,19 +100,14 @@ class TrajectoryFile:
         self._file.close()
 
 
-class MapTrajectoryFile:
-    """The trajectory T_map_rig as TUM, one line a pair, as it was known at that time: later loops do not change it."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = _TumFile(path)
-
-    def process(self, update: PlaceUpdate) -> None:
-        """Write the row of a pose."""
-        self._file.write(update.stamp_ns, update.T_map_rig)
-
-    def finish(self) -> None:
-        """Close the file."""
-        self._file.close()
+def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write poses (N, 4, 4) as TUM; without poses an existing file stays as it is. Raises OmnidError."""
+    file = _TumFile(path)
+    try:
+        for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
+            file.write(stamp_ns, T)
+    finally:
+        file.close()
 
 
 class _TumFile:

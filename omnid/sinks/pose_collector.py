@@ -60,23 +60,26 @@ class PoseCollector:
 
 
 class MapPoseCollector:
-    """A sink that keeps every pose in the map with its state: 150 bytes a pose."""
+    """A sink that keeps every pose in the map: about 1 kB a pose."""
 
     def __init__(self) -> None:
-        self._poses: list[NDArray[np.float64]] = []
-        self._states: list[MapState] = []
+        self.updates: list[PlaceUpdate] = []
 
     def process(self, update: PlaceUpdate) -> None:
         """Keep a pose."""
-        self._poses.append(update.T_map_rig)
-        self._states.append(update.state)
+        self.updates.append(update)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps (N,)."""
+        return np.array([update.stamp_ns for update in self.updates], np.int64)
 
     @property
     def T_map_rig(self) -> NDArray[np.float64]:
-        """Poses (N, 4, 4)."""
-        return np.array(self._poses).reshape(-1, 4, 4)
+        """Poses (N, 4, 4) as they were known at that time."""
+        return np.array([update.T_map_rig for update in self.updates]).reshape(-1, 4, 4)
 
     @property
     def states(self) -> tuple[MapState, ...]:
         """States (N,)."""
-        return tuple(self._states)
+        return tuple(update.state for update in self.updates)

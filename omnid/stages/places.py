@@ -52,7 +52,16 @@ class Places:
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig
         covariance = in_axes(T_map_rig, self._to_rig @ pose.covariance @ self._to_rig.T)
-        return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state)
+        T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
+        return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
+                           pose.keyframe, T_keyframe_rig)
+
+    def corrected(self, update: PlaceUpdate) -> Array:
+        """Return T_map_rig (4, 4) of an earlier pose as the map knows it now; as it was where its keyframe is gone."""
+        T_map_rect = self._localiser.places.poses.get(update.keyframe)
+        if T_map_rect is None:
+            return update.T_map_rig
+        return np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig @ update.T_keyframe_rig)
 
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""

@@ -63,6 +63,8 @@ class MapPose:
     T_map_odom: Array  # (4, 4) of the rectified frame of the first pair
     covariance: Array  # (6, 6) of T_map_rect, [t; r] in the rectified frame
     state: MapState
+    keyframe: int  # id of the newest keyframe of the run, -1: none since the last gap
+    T_keyframe_rect: Array  # (4, 4) of the frame in it, by odometry
 
 
 class MapLocaliser:
@@ -255,7 +257,11 @@ class MapLocaliser:
 
     def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
         covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
-        return MapPose(self._T_map_odom, covariance, state)
+        newest = self._newest
+        if newest is None:
+            return MapPose(self._T_map_odom, covariance, state, -1, np.eye(4))
+        T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
+        return MapPose(self._T_map_odom, covariance, state, newest.id, T_keyframe_rect)
 
 
 def _by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
