@@ -35,6 +35,7 @@ CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is
 SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
 SEARCHES: Final = 10  # after which only new keyframes are searched for
 LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
+NO_KEYFRAME: Final = -1  # in place of an id
 TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
 GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
@@ -63,7 +64,7 @@ class MapPose:
     T_map_odom: Array  # (4, 4) of the rectified frame of the first pair
     covariance: Array  # (6, 6) of T_map_rect, [t; r] in the rectified frame
     state: MapState
-    keyframe: int  # id of the newest keyframe of the run, -1: none since the last gap
+    keyframe: int  # id of the newest keyframe of the run; NO_KEYFRAME: none since the last gap
     T_keyframe_rect: Array  # (4, 4) of the frame in it, by odometry
 
 
@@ -121,7 +122,7 @@ class MapLocaliser:
         if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan)
             if by_scan is not None:
-                return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED)
+                return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED, NO_KEYFRAME, np.eye(4))
         return self._pose(frame, self._state())
 
     @property
@@ -259,7 +260,7 @@ class MapLocaliser:
         covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
         newest = self._newest
         if newest is None:
-            return MapPose(self._T_map_odom, covariance, state, -1, np.eye(4))
+            return MapPose(self._T_map_odom, covariance, state, NO_KEYFRAME, np.eye(4))
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         return MapPose(self._T_map_odom, covariance, state, newest.id, T_keyframe_rect)
 
