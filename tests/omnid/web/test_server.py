@@ -326,3 +326,35 @@ def test_on_the_network_a_warning_says_that_the_token_can_be_read() -> None:
             assert server.request("/metrics", headers={**server.bearer, "Host": host}).status == status
         code, err = server.end()
         assert code == 0 and "without encryption" in err and err.count("\n") == 1
+
+
+def test_hostile_http_does_no_harm(server: WebServer) -> None:
+    host = server.host.encode()
+    requests = (b"\x16\x03\x01\x02\x00\x01\x00", b"GET / HTTP/1.1\r\n\r\n",
+                b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+                b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n", b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 50_000,
+                b"POST /login HTTP/1.1\r\nHost: " + host + b"\r\nOrigin: http://" + host
+                + b"\r\nContent-Length: 99999999999\r\n\r\ntoken=" + b"a" * 10_000,
+                b"GET /live HTTP/1.1\r\nHost: " + host + b"\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
+                b"OPTIONS * HTTP/1.1\r\nHost: " + host + b"\r\n\r\n",
+                b"GET /%00%ff%2e%2e HTTP/1.1\r\nHost: \xff\r\n\r\n")
+    for request in requests:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as connection:
+            try:
+                connection.sendall(request)
+                answer = connection.recv(65_536)
+            except ConnectionError:  # closed in the midst of the request
+                answer = b""
+        assert not answer.startswith((b"HTTP/1.1 2", b"HTTP/1.1 5")), request[:60]
+    assert server.request("/", headers=server.bearer).status == 200
+
+
+def test_a_signal_ends_it_with_pages_open() -> None:
+    with served("--connect", free_endpoint()) as server, server.live(server.bearer) as live:
+        Shown(live).until("state")
+        begin_s = time.monotonic()
+        assert server.end() == (0, "")
+        assert time.monotonic() - begin_s < PATIENCE_S
+        with pytest.raises(ConnectionClosed):
+            while True:
+                live.recv(PATIENCE_S)
