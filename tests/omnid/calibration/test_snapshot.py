@@ -50,6 +50,7 @@ def test_what_must_be_corrected_is_named(images: dict[str, list[Image]]) -> None
     lower, upper = images["lower"][:3], images["upper"][:3]
     for changed, expected in ((np.asarray(lower[0] // 8, np.uint8), "it is dark"),
                               (cv2.convertScaleAbs(lower[0], alpha=3.0), "too bright"),
+                              (np.ascontiguousarray(lower[0][:, 14:]), "the rim leaves the image"),
                               (np.ascontiguousarray(lower[0][60:200, 60:200]), "rim was not found"),
                               (np.zeros((200, 200), np.uint8), "rim was not found")):
         found = " ".join(warnings({"lower": view_of([changed]), "upper": view_of(upper)}))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from pathlib import Path
 
@@ -38,5 +39,9 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
         answer = server.request(f"/recordings/{found[name]['key']}/report", "POST", server.bearer)
         text = json.loads(answer.text)["text"]
         assert answer.status == 409 and text.startswith("omnid: ") and "Traceback" not in text
+    with ThreadPoolExecutor(2) as threads:
+        path = f"/recordings/{found['images_20261122T050000Z_001.mcap']['key']}/report"
+        answers = list(threads.map(lambda _: server.request(path, "POST", server.bearer).text, range(2)))
+    assert sum("another report is being made" in answer for answer in answers) == 1, answers
     missing = server.request("/recordings/0123/report", "POST", server.bearer)
     assert missing.status == 409 and "not there" in missing.text

@@ -263,9 +263,14 @@ def test_only_so_many_browsers(server: WebServer) -> None:
 
 @pytest.mark.slow
 def test_connections_that_send_nothing_do_not_keep_browsers_out(server: WebServer) -> None:
-    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(140)]
+    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(100)]
     try:
-        wait_until(lambda: server.request("/").status == 401)
+        with server.live(server.bearer) as live:
+            silent += [socket.create_connection(("127.0.0.1", server.port)) for _ in range(40)]
+            wait_until(lambda: Shown(live).read() and server.request("/").status == 401)
+            end_s = time.monotonic() + 6
+            while time.monotonic() < end_s:
+                assert Shown(live).read(), "a websocket stays"
     finally:
         for connection in silent:
             connection.close()
