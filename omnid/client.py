@@ -16,7 +16,7 @@ Several kinds of message, and commands, share one connection: see Robot and Driv
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, Generic, Self, TypeVar, cast
 
@@ -24,7 +24,8 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec
-from omnid.transport.bus_config import BusConfig, checked
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.client_session import HERE, open_client
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
@@ -36,14 +37,13 @@ from omnid.transport.decode import (
     decode_pose,
 )
 from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.session import Unreachable, open_session
+from omnid.transport.session import Unreachable
 from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
-__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Map", "Pose", "PoseAttachment", "Robot", "Subscription",
+__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "Pose", "PoseAttachment", "Robot", "Subscription",
            "Unreachable", "subscribe"]
 
 T = TypeVar("T")
-HERE: Final = "tcp/127.0.0.1:7447"
 _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
     Pose: ("odom", decode_pose),
     Diagnostics: ("status", decode_diagnostics),
@@ -52,7 +52,6 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 }
 _QUERY_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.002
-_MAX_RETRY_S: Final = 0.5
 _MATCH_S: Final = 2.0
 _SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 
@@ -135,7 +134,7 @@ class Robot:
         """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
         given = settings or BusConfig(robot=robot, connect=connect)
         self.name = given.robot
-        self._session = _connected(checked(_as_client(given)), timeout_s)
+        self._session = open_client(given, timeout_s)
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
@@ -207,23 +206,45 @@ class Robot:
         self.close()
 
 
-def _as_client(given: BusConfig) -> BusConfig:
-    """Return the settings in client mode: peers that only share a router exchange no messages, clients do."""
-    chosen = {name: getattr(given, name) for name in
-              ("robot", "connect", "config", "retry_s", "tls_ca", "tls_connect_key", "tls_connect_certificate", "user",
-               "password_file")}
-    return BusConfig(mode="client", listen=(), **{**chosen, "connect": given.connect or (HERE,)})
+class Fleet:
+    """A connection to all robots that a router, or a robot, reaches; settings as for Robot."""
 
+    def __init__(self, settings: BusConfig, timeout_s: float = 0.0) -> None:
+        """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
+        self._session = open_client(settings, timeout_s)
+        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
 
-def _connected(config: BusConfig, timeout_s: float) -> zenoh.Session:
-    deadline_s = time.monotonic() + timeout_s
-    while True:
-        try:
-            return open_session(config, guarded=False)
-        except Unreachable:
-            if time.monotonic() >= deadline_s:
-                raise
-        time.sleep(min(config.retry_s, _MAX_RETRY_S))
+    def on_message(self, callback: Callable[[str, bytes, bytes], None], topics: Sequence[str]) -> None:
+        """Call callback(key, payload, attachment) for each message on topics such as "odom", in a zenoh thread.
+
+        key: `<robot>/<topic>`; a robot's name may have slashes. The newest message of each robot comes first, where it
+        is kept. The callback must be quick and never raise.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            callback(str(sample.key_expr), sample.payload.to_bytes(), _attachment(sample))
+
+        for topic in topics:
+            self._declared.append(self._session.declare_subscriber(f"**/{topic}", on_sample))
+            for reply in self._session.get(f"**/{topic}", timeout=_QUERY_TIMEOUT_S):
+                if reply.ok is not None:
+                    on_sample(reply.ok)
+
+    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
+        """Call callback(robot, True) for each daemon that is there or comes, callback(robot, False) when it is gone."""
+
+        def on_token(sample: zenoh.Sample) -> None:
+            callback(str(sample.key_expr).rpartition("/")[0], sample.kind == zenoh.SampleKind.PUT)
+
+        tokens = self._session.liveliness()
+        self._declared.append(tokens.declare_subscriber("**/alive", on_token, history=True))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
 
 class Driver:

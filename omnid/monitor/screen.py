@@ -16,7 +16,7 @@ from omnid.transport.decode import Pose
 from omnid.transport.status_names import STAGE_PREFIX, short_name
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")
-_CLEAR: Final = "\x1b[H\x1b[J"
+CLEAR: Final = "\x1b[H\x1b[J"
 
 
 class Screen:
@@ -37,7 +37,7 @@ class Screen:
         if self._out.isatty():
             size = shutil.get_terminal_size()
             lines = fitted(status_table(self._robot, state, dropped), size.columns, size.lines)
-            self._out.write(_CLEAR + "\n".join(lines) + "\n")
+            self._out.write(CLEAR + "\n".join(lines) + "\n")
         else:
             self._out.write(summary_line(self._robot, state) + "\n")
         self._out.flush()

@@ -1,0 +1,146 @@
+"""All robots that a router reaches, in one table."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import IO, Final
+
+from omnid.client import Fleet
+from omnid.errors import OmnidError
+from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState, plain
+from omnid.monitor.screen import CLEAR, fitted
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import Unreachable
+from omnid.transport.status_names import short_name
+
+MAX_ROBOTS: Final = 500
+SHOW_PERIOD_S: Final = 1.0
+_NAME_COLUMNS: Final = 20
+_RETRY_S: Final = 0.5
+_TOPICS: Final = ("odom", "status")
+_HEAD: Final = (f"{'robot':{_NAME_COLUMNS}} {'state':10} {'Hz':>5} {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
+               "  worst")
+
+
+class FleetState:
+    """The robots by name, at most MAX_ROBOTS; the names of others are counted."""
+
+    def __init__(self) -> None:
+        self.robots: dict[str, RobotState] = {}
+        self.refused: set[str] = set()  # as many at most
+
+    def process(self, message: ReceivedMessage) -> None:
+        """Take a message whose topic is the whole key: the robot's name and the topic's."""
+        name, _, topic = message.topic.rpartition("/")
+        state = self.robot(name)
+        if state is not None:
+            state.process(message._replace(topic=topic))
+
+    def robot(self, name: str) -> RobotState | None:
+        """Return the state of a robot, which is new at its first message; None beyond the limit."""
+        if name not in self.robots:
+            if len(self.robots) >= MAX_ROBOTS:
+                if len(self.refused) < MAX_ROBOTS:
+                    self.refused.add(name)
+                return None
+            self.robots[name] = RobotState()
+        return self.robots[name]
+
+
+def listen_to_all(bus: BusConfig, seconds: float | None, out: IO[str] | None = None) -> int:
+    """Show all robots until Ctrl-C or for so many seconds. Return the exit code, 1 where there was none."""
+    fleet, stream = FleetState(), out or sys.stdout
+    end_s = math.inf if seconds is None else time.monotonic() + seconds
+    with suppress(KeyboardInterrupt):
+        connection = _connected(bus, end_s)
+        if connection is not None:
+            with connection:
+                _follow(connection, fleet, stream, end_s)
+    show(fleet, stream)
+    return int(not fleet.robots)
+
+
+def _connected(bus: BusConfig, end_s: float) -> Fleet | None:
+    """Return a connection as soon as the router can be reached, None where the time is over first."""
+    reason = ""
+    while time.monotonic() < end_s:
+        try:
+            return Fleet(bus)
+        except Unreachable as error:
+            if str(error) != reason:
+                print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
+            reason = str(error)
+        time.sleep(_RETRY_S)
+    return None
+
+
+def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float) -> None:
+    inbox, tokens = Inbox(), Inbox()
+    connection.on_alive(lambda robot, alive: tokens.put(robot, b"alive" if alive else b"", b""))
+    connection.on_message(inbox.put, _TOPICS)
+    next_s = time.monotonic() + SHOW_PERIOD_S
+    while (now_s := time.monotonic()) < end_s:
+        while (token := tokens.get(0.0)) is not None:
+            state = fleet.robot(token.topic)
+            if state is not None:
+                state.set_alive(bool(token.payload))
+        message = inbox.get(min(next_s, end_s) - now_s)
+        if message is not None:
+            fleet.process(message)
+        if time.monotonic() >= next_s:
+            show(fleet, stream, inbox.dropped)
+            next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())
+
+
+def show(fleet: FleetState, stream: IO[str], dropped: int = 0) -> None:
+    """Write the table, in place on a terminal; dropped: messages that the inbox could not hold."""
+    lines = list(fleet_table(fleet.robots, len(fleet.refused), dropped))
+    if stream.isatty():
+        size = shutil.get_terminal_size()
+        stream.write(CLEAR + "\n".join(fitted(lines, size.columns, size.lines)) + "\n")
+    else:
+        stream.write("\n".join(lines) + "\n")
+    stream.flush()
+
+
+def fleet_table(robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0) -> Iterator[str]:
+    """Yield a head and a line for each robot: those that are gone or have the worst state first."""
+    counts = [sum(1 for state in robots.values() if _severity(state) >= level) for level in (0, 1, 2)]
+    more = f"; {refused} more than {MAX_ROBOTS} are left out" if refused else ""
+    lost = f"; {dropped} messages dropped" if dropped else ""
+    yield f"{counts[0]} robots, {counts[1] - counts[2]} with warnings, {counts[2]} with errors or gone{more}{lost}"
+    yield _HEAD
+    for name, state in sorted(robots.items(), key=lambda entry: (-_severity(entry[1]), entry[0])):
+        yield _line(name, state)
+
+
+def _severity(state: RobotState) -> int:
+    """Return 2 for an error, a robot that is gone or without poses, 1 for a warning, else 0."""
+    levels = [status.level % 4 for status in state.statuses.values()]
+    if state.alive is False or state.rate_hz == 0.0 or any(level >= 2 for level in levels):
+        return 2
+    return int(any(levels))
+
+
+def _line(name: str, state: RobotState) -> str:
+    shown = plain(name)
+    shown = shown if len(shown) <= _NAME_COLUMNS else f"{shown[: _NAME_COLUMNS - 1]}\N{HORIZONTAL ELLIPSIS}"
+    word = "gone" if state.alive is False else "no pose" if state.rate_hz == 0.0 else state.state
+    pose, age = state.pose, f"{1e3 * state.age.p(0.5):7.0f}" if state.age.count else f"{'':7}"
+    where = f"{'':9} {'':9} {'':8}" if pose is None else \
+        f"{pose.x_m:+9.2f} {pose.y_m:+9.2f} {math.degrees(pose.yaw_rad):+8.1f}"
+    worst = max(state.statuses.values(), key=lambda status: status.level % 4, default=None)
+    problem = "" if worst is None or worst.level % 4 == 0 else f"{short_name(worst.name)}: {worst.message}"
+    return plain(f"{shown:{_NAME_COLUMNS}} {word:10.10} {state.rate_hz:5.1f} {where} {age}  {problem}")
+
+
+def check_all(robot: str | None, files: Mapping[str, object]) -> None:
+    """Raise OmnidError for options of one robot beside --all."""
+    given = [name for name, value in {"--robot": robot, **files}.items() if value is not None]
+    if given:
+        raise OmnidError(f"--all shows every robot, so {given[0]} does not go with it: leave one of them out")
