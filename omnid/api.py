@@ -31,10 +31,12 @@ from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.rig_gate import RigGate
+from omnid.stages.skew import Skew
 from omnid.stages.stereo import Stereo
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
+MAX_SKEW_S = 1.0  # between the stamps of a pair: more is a mistake of clocks or units
 InputImage: TypeAlias = NDArray[Any] | None  # what cv2.imread gives; a GreyImage is expected and checked
 
 
@@ -104,10 +106,15 @@ class Odometry:
             self._odometry = OdometryStage(place, settings.odometry)
         self.rig = place.rig  # with the masks that were found
         self._pairs = 0
+        self._skew = Skew()
         self._stamp_ns: int | None = None
 
-    def process(self, stamp_ns: int, lower: InputImage, upper: InputImage) -> OdometryUpdate:
+    def process(self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
+                ) -> OdometryUpdate:
         """Return the pose at a pair of grey images (H, W) uint8 that were taken at stamp_ns, in ns of any clock.
+
+        upper_stamp_ns: of the upper image, in the same clock, where the cameras are not synchronised; the motion in
+        between is then corrected as in a replay. None: both images were exposed at once.
 
         Of the result: `T_odom_rig` (4, 4) maps points of the rig frame into odom, which is the rig frame of the first
         pair (m); `covariance` (6, 6) of x y z rx ry rz in odom axes (m^2, rad^2); `velocity` (6,) in the rig frame;
@@ -115,21 +122,30 @@ class Odometry:
         (N,) along the ray, `depth.disparity` (H, W) in px, NaN where unknown, and the panoramas
         `depth.panoramas.lower.panorama` and `.upper.panorama` (H, W) uint8.
 
-        Raises OmnidError for an image of another type or size than the rig's, and for a stamp that is not later than
-        the previous one; such a pair changes nothing. Also raises it where one of the first pairs shows that the images
-        cannot be of this rig, unless stereo.rig_check says otherwise.
+        Raises OmnidError for an image of another type or size than the rig's, for a stamp that is not later than the
+        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Also
+        raises it where one of the first pairs shows that the images cannot be of this rig, unless stereo.rig_check says
+        otherwise.
         """
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))
-        pair = FramePair(self._pairs, stamp_ns, *images)
+        pair = FramePair(self._pairs, stamp_ns, *images, self._skew_s(stamp_ns, upper_stamp_ns))
         self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
         return self._odometry.process(self._stereo.process(self._dewarp.process(pair)))
 
+    def _skew_s(self, stamp_ns: int, upper_stamp_ns: int | None) -> float:
+        """Return the time from the lower to the upper exposure."""
+        if upper_stamp_ns is None:
+            return 0.0
+        skew_ns = _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
+        if abs(skew_ns) >= MAX_SKEW_S * 1e9:
+            raise OmnidError(f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
+                             f"found {upper_stamp_ns}: give both in nanoseconds of one clock")
+        self._skew.add(skew_ns)
+        return self._skew.exposure_ns * 1e-9
+
     def _later_stamp_ns(self, stamp_ns: int) -> int:
-        try:
-            stamp_ns = operator.index(stamp_ns)
-        except TypeError as error:
-            raise OmnidError(f"stamp_ns: expected an integer number of nanoseconds, found {stamp_ns!r}") from error
+        stamp_ns = _nanoseconds("stamp_ns", stamp_ns)
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             raise OmnidError(f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
                              f"{stamp_ns}: give the pairs in the order of time, each once")
@@ -153,6 +169,13 @@ class Odometry:
             for name, image in zip(names, pair, strict=True):
                 grey = self._checked(name, image)
                 yield Frame(seq, seq, name, "mono8", grey, width=grey.shape[1], height=grey.shape[0])
+
+
+def _nanoseconds(name: str, value: int) -> int:
+    try:
+        return operator.index(value)
+    except TypeError as error:
+        raise OmnidError(f"{name}: expected an integer number of nanoseconds, found {value!r}") from error
 
 
 def _config(config: FilePath | Config | None, overrides: Sequence[str]) -> Config:

@@ -1,14 +1,17 @@
-"""Check of the rig by the first pairs of skewed cameras: motion is no wrong rig, and hides none."""
+"""Cameras that are not synchronised: motion is no wrong rig and hides none; both stamps in the public API."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import omnid
 from calib.rig import Rig
 from calib.rig_file import read_rig
+from drivers.frame import gray
+from drivers.logs.log_reader import LogReader
 from omnid.stages.rig_gate import RigContradictedError
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
@@ -36,3 +39,21 @@ def test_exchanged_cameras_are_refused(skewed: tuple[Path, Rig]) -> None:
     log, rig = skewed
     with pytest.raises(RigContradictedError, match="other way round"):
         omnid.replay(log, rig, lower=rig.topics[1], upper=rig.topics[0])
+
+
+def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, Rig]) -> None:
+    log, rig = skewed
+    expected = omnid.replay(log, rig)
+    found = list(LogReader(log, *rig.topics).frames())
+    frames = {name: [frame for frame in found if frame.camera == name] for name in ("lower", "upper")}
+    odometry, blind = omnid.Odometry(rig), omnid.Odometry(rig)
+    for number, (lower, upper) in enumerate(zip(frames["lower"], frames["upper"], strict=True)):
+        images = gray(lower), gray(upper)
+        update = odometry.process(lower.stamp_ns, *images, upper_stamp_ns=upper.stamp_ns)
+        np.testing.assert_array_equal(update.T_odom_rig, expected.T_odom_rig[number])
+        at_once = blind.process(lower.stamp_ns, *images)
+    assert not np.array_equal(at_once.T_odom_rig, update.T_odom_rig)
+    with pytest.raises(omnid.OmnidError, match="less than 1 s from stamp_ns"):
+        odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=lower.stamp_ns // 1000)
+    with pytest.raises(omnid.OmnidError, match="upper_stamp_ns: expected an integer"):
+        odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=0.5)  # type: ignore[arg-type]
