@@ -16,6 +16,8 @@ _OF_PART: Final = {
     status_names.RECORDING: "make room on the disk, or change record.folder",
     status_names.LOAD: "close other programs on the robot, or start it with --profile small",
     status_names.RIG: "omnid calibrate check on a recording",
+    status_names.RIG_REFINEMENT: "omnid calibrate check on a recording",
+    status_names.PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
     status_names.RIG_AT_START: "name the right rig.toml, or calibrate again",
 }
 _CAMERA: Final = "check its cable and its power; on the robot: omnid doctor"

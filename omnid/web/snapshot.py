@@ -13,10 +13,11 @@ from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, plain
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.decode import Map, Pose
-from omnid.transport.status_names import STAGE_PREFIX, WHEELS, Key, short_name
+from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
 from omnid.web.remedies import remedy_of
 
+PATH_FRAME: Final = "odom"
 MOST_WARNINGS: Final = 20
 MOST_VALUES: Final = 60  # of a part
 LONGEST_VALUE: Final = 100  # characters
@@ -34,7 +35,8 @@ def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, 
         "type": "state", "robot": plain(robot), "link": plain(link), "alive": state.alive, "state": state.state,
         "fresh": state.rate_hz > 0, "rate_hz": _number(state.rate_hz), "missed": state.missed, "broken": state.broken,
         "pose": None if state.pose is None else _pose(state.pose), "age_ms": _quantiles_ms(state.age),
-        "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "warnings": _warnings(state, link),
+        "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "in_map": _in_map(state),
+        "warnings": _warnings(state, link),
         **extra,
     })
 
@@ -50,13 +52,16 @@ def parts_message(state: RobotState) -> str:
 
 
 def map_message(grid: Map) -> bytes:
-    """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated."""
-    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size:
-        return with_header({"type": "map", "width": 0, "height": 0}, b"")
+    """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated.
+
+    Without cells if the grid is not in the frame of the path, odom.
+    """
+    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame != PATH_FRAME:
+        return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(grid.frame)}, b"")
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
-    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "cell_m": step * grid.cell_m,
-              "x_m": grid.corner[0], "y_m": grid.corner[1]}
+    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "frame": PATH_FRAME,
+              "cell_m": step * grid.cell_m, "x_m": grid.corner[0], "y_m": grid.corner[1]}
     return with_header(header, zlib.compress(cells.tobytes(), 1))
 
 
@@ -89,6 +94,12 @@ def _wheels(state: RobotState) -> dict[str, Any] | None:
         return None
     return {"armed": status.values.get(Key.ARMED) == "1", "message": plain(status.message), "level": status.level % 4,
             "source": plain(status.values.get(Key.SOURCE, ""))}
+
+
+def _in_map(state: RobotState) -> str | None:
+    """Return the state of the pose in the map of places; None where the robot has none."""
+    status = state.statuses.get(PLACES)
+    return None if status is None else plain(status.message)
 
 
 def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:

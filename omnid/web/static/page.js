@@ -18,7 +18,9 @@ function onMessage(message, body) {
   switch (message.type) {
     case "state": return showState(message);
     case "path": return plan.addPath(message.from, message.points);
-    case "map": return plan.setMap(message, body);
+    case "map":
+      byId("map-note").textContent = message.frame === "odom" ? "" : `a map in the frame ${message.frame} is not drawn`;
+      return plan.setMap(message, body);
     case "parts": return showParts(message.parts);
     case "panorama": return showPanorama(body);
   }
@@ -76,6 +78,7 @@ function showPose(state) {
     ["speed", `${fixed(pose.speed_mps, 2)} m/s`],
     ["uncertainty, 1 sigma", `${fixed(pose.sigma_mm, 1)} mm, ${fixed(pose.sigma_deg, 2)}°`],
     ["landmarks", `${pose.inliers} of ${pose.tracked}`],
+    ...(state.in_map === null ? [] : [["in the map", state.in_map]]),
     ["resets", `${pose.resets}`],
     ["image to here, p50 / p99", `${fixed(state.age_ms[0], 0)} / ${fixed(state.age_ms[1], 0)} ms`],
     ["missed poses", `${state.missed}`],

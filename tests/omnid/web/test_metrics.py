@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 
 from omnid.monitor.robot_state import RobotState
+from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
+from omnid.transport.status_names import PREFIX, STAGE_PREFIX, SUMMARY, WHEELS, camera_name
 from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
 from omnid.web.remedies import remedy_of
@@ -33,7 +35,9 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
 
 
 def test_every_part_that_can_warn_has_a_remedy() -> None:
-    parts = ("odometry", "pairing", "wheels", "bus", "recording", "rig", "load", "rig at start", "lower camera")
-    assert all(remedy_of(DiagnosticStatus(f"omnid: {part}", 1, "", {})) for part in parts)
+    names = {value for value in vars(status_names).values() if isinstance(value, str) and value.startswith(PREFIX)}
+    parts = {*names - {PREFIX, STAGE_PREFIX, SUMMARY}, camera_name("lower"), camera_name("upper")}
+    assert WHEELS in parts and len(parts) > 8
+    assert [name for name in parts if not remedy_of(DiagnosticStatus(name, 1, "", {}))] == []
     assert remedy_of(DiagnosticStatus("omnid: wheels", 1, "", {"remedy": "send cmd/arm"})) == "send cmd/arm"
     assert remedy_of(DiagnosticStatus("omnid: stage pair", 0, "", {})) == ""

@@ -160,6 +160,9 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
         assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
         assert (received["cell_m"], received["x_m"], received["y_m"]) == (pytest.approx(0.1), -1.0, -2.0)
+        other = codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
+        received = shown.until("map", lambda: bus.publish("map", other), lambda found: found["frame"] == "elsewhere")
+        assert (received["width"], received["body"]) == (0, b"")
 
 
 def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> None:
