@@ -10,6 +10,7 @@ from calib.panorama import Cylinder
 from omnid.config import MappingConfig
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
 from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import Features
 from omnid.engine.flow import Chain
 from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.mapping import Mapping
@@ -62,6 +63,18 @@ def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, s
                                        50, 50, counted.depth(seq, stamp_ns)))
     assert len(counted.computed) == expected
     assert len(mapping.finish()[0].path_xy) == 61  # the path has every pose
+
+
+def test_keyframes_enter_the_map_after_half_the_time() -> None:
+    """Their dense stereo is computed in any case: with one in time, no other pair needs it."""
+    counted, mapping = Counted(), Mapping(MappingConfig(rate_hz=5.0))
+    for seq in range(60):
+        stamp_ns = round(seq * 1e9 / 30)
+        T = se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0]))
+        new = np.zeros((1 if seq % 4 == 0 else 0, 2))
+        mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
+                                       50, 50, counted.depth(seq, stamp_ns), Features(new=new)))
+    assert counted.computed == list(range(0, 60, 4))
 
 
 class Half:
