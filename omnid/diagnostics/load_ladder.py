@@ -32,8 +32,8 @@ class LoadLevel:
 LEVELS: Final = (
     LoadLevel("all is computed", 0.0, 1.0),
     LoadLevel("too slow: a pair a second enters the map", 1.0, 1.0),
-    LoadLevel("too slow: nothing enters the map", math.inf, 1.0),
-    LoadLevel("too slow: nothing enters the map, half the landmarks", math.inf, 0.5),
+    LoadLevel("too slow: nothing enters the map, no place is recognised", math.inf, 1.0),
+    LoadLevel("too slow: no map, no places, half the landmarks", math.inf, 0.5),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -75,7 +76,8 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
             graph.sink(name, map_sink, maps)
     places: Places | None = None
     if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus or sinks.known_places is not None):
-        places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only)
+        places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only,
+                        is_overloaded=lambda: sinks.map_period_s() == math.inf)
         updates: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
         outgoing["bus-places"] = updates
         for name, place_sink in sinks.places.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from omnid.core.places.place_map import PlaceMap
 from omnid.messages import OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import in_axes
+from omnid.stages.rig_gate import never
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -23,8 +26,12 @@ class Places:
     """Localise the poses of odometry in a map of places, which grows with them."""
 
     def __init__(self, geometry: Geometry, config: Config, places: PlaceMap | None = None, *,
-                 localize_only: bool = False) -> None:
-        """places: a map to be extended, None: a new one. localize_only: the map stays as it is."""
+                 localize_only: bool = False, is_overloaded: Callable[[], bool] = never) -> None:
+        """places: a map to be extended, None: a new one. localize_only: the map stays as it is.
+
+        is_overloaded: called for each pose; while it is True nothing is recognised or kept.
+        """
+        self._is_overloaded = is_overloaded
         self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places,
                                        localize_only=localize_only)
         self._T_rig_rect = geometry.T_rig_rect
@@ -47,7 +54,7 @@ class Places:
 
     def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
         """Return the pose in the map at a pair."""
-        pose = self._localiser.process(self._frame(odometry))
+        pose = self._localiser.process(self._frame(odometry), idle=self._is_overloaded())
         self.state = pose.state
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig

@@ -101,11 +101,13 @@ class MapLocaliser:
         self._failed = 0  # searches of this part that found nothing
         self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
 
-    def process(self, frame: OdometryFrame) -> MapPose:
-        """Return the pose of odom in the map after a frame."""
+    def process(self, frame: OdometryFrame, *, idle: bool = False) -> MapPose:
+        """Return the pose of odom in the map after a frame; idle: only by odometry, to save time."""
         self._advance(frame)
         if frame.lost:
             return self._pose(frame, MapState.LOST)
+        if idle:
+            return self._pose(frame, self._state())
         is_keyframe = self._keyframe_is_due(frame)
         if is_keyframe or self._search_is_due(frame):
             small = thumbnail(frame.stereo.lower.panorama)

@@ -84,6 +84,15 @@ def test_loops_halve_the_error_and_odom_never_jumps(
     assert first * STEP_M < 3.0 + OUT[-1] / 2 + 1.0 + 1.0
 
 
+def test_an_idle_localiser_follows_odometry_and_keeps_nothing(frames: list[StereoFrame], out: MapLocaliser) -> None:
+    localiser = deepcopy(out)
+    before = localiser.counts
+    for frame in odometry(frames)[len(OUT):]:
+        pose = localiser.process(frame, idle=True)
+    assert localiser.counts == before and pose.state is MapState.ODOMETRY_ONLY
+    assert np.array_equal(pose.T_map_odom, np.eye(4))
+
+
 def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame], out: MapLocaliser) -> None:
     """After the reset odom is meaningless in the map until three frames agree."""
     localiser = deepcopy(out)
