@@ -58,7 +58,7 @@ def test_of_two_equal_places_none_is_recognised_and_it_is_counted(
 def test_odometry_tells_which_of_two_equal_places_it_is(
     twins: RenderedCameras, places: PlaceMap, query: StereoFrame, half: int
 ) -> None:
-    """Where odometry excludes all places that look like this one, none is taken."""
+    """None is taken if odometry excludes all places that look like this one."""
     search, small = PlaceSearch(twins.model), thumbnail(query.lower.panorama)
     there = se3.exp([half * PERIOD_M, 0, 0, 0, 0, 0]) @ QUERY
     expected = Expected(there, dict.fromkeys(places.keyframes, 0.3), dict.fromkeys(places.keyframes, 0.1), False)
