@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +13,24 @@ from calib.models.camera import Array
 # Inner corners along one side: fewer do not determine a pose well, more are a misread option.
 MIN_SIDE, MAX_SIDE = 3, 60
 MIN_SQUARE_M, MAX_SQUARE_M = 1e-4, 10.0
+# Half side of the window about a checkerboard's corner [squares], short of the next edges.
+WINDOW = 0.42
+
+
+class CalibrationBoard(Protocol):
+    """A flat board with corners at known points, at which four areas of alternating brightness meet."""
+
+    @property
+    def points(self) -> Array:
+        """Return the corners (N, 3) [m] in the board's frame, z 0."""
+
+    @property
+    def square_m(self) -> float:
+        """Return the unit of length [m] of windows about corners: the side of a square or a tag."""
+
+    @property
+    def window(self) -> float:
+        """Return the half side [squares] of the window about a corner in which grey depends on that corner alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +53,14 @@ class Board:
         """Return the corners (N, 3) [m] in the board's frame, row by row: x along the columns, y down the rows, z 0."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_m, float)
+
+    @property
+    def window(self) -> float:
+        """Return the half side of the window about a corner [squares]."""
+        return WINDOW
+
+    def __str__(self) -> str:
+        return f"board of {self.columns}x{self.rows} inner corners"
 
 
 @dataclass(frozen=True, slots=True)

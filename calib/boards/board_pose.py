@@ -6,44 +6,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import Board
+from calib.boards.board import Board, CalibrationBoard
 from calib.models.camera import Array, OmniCamera
 
 MIN_CORNERS = 6
+# Corners whose rays are off by this ratio of the median error, and by this angle, are left out; number of solutions.
+OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
 
 
-def board_pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
+def board_pose(camera: OmniCamera, pixels: Array, board: CalibrationBoard) -> Array | None:
     """Estimate T_cam_board (4, 4) from corners (N, 2), NaN for unknown ones; None if too few have a ray.
 
-    Linear solution by the rays' homography [r1 r2 t] (Zhang 2000, section 2.1, with rays in place of pixels).
+    Linear solution by the rays' homography [r1 r2 t] (Zhang 2000, section 2.1, with rays in place of pixels), solved
+    again without the corners that lie far off the board.
     """
-    rays, xy1 = camera.lift(pixels), np.column_stack([board.points[:, :2] / board.square_m, np.ones(len(pixels))])
+    rays = camera.lift(pixels)
     known = np.isfinite(rays).all(axis=1)
-    if known.sum() < MIN_CORNERS:
-        return None
-    rays, xy1 = rays[known], xy1[known]
+    T = None
+    for _ in range(ROUNDS):
+        if known.sum() < MIN_CORNERS:
+            return T
+        T = _linear_pose(rays[known], board.points[known], board.square_m)
+        errors = _ray_errors_rad(T, rays, board.points)
+        near = errors < max(OUTLIER_RATIO * float(np.median(errors[known])), MIN_OUTLIER_RAD)
+        if not (known & ~near).any():
+            break
+        known &= near
+    return T
+
+
+def _linear_pose(rays: Array, points: Array, square_m: float) -> Array:
+    """Return T_cam_board (4, 4) of rays (N, 3) to points (N, 3) of a board."""
+    xy1 = np.column_stack([points[:, :2] / square_m, np.ones(len(points))])
     A = np.einsum("nij,nk->nijk", se3.hat(rays), xy1).reshape(-1, 9)
-    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3) / (board.square_m, board.square_m, 1)
-    H /= np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(np.sum(rays * (xy1 * (board.square_m, board.square_m, 1)
-                                                                           @ H.T)))
+    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3) / (square_m, square_m, 1)
+    ahead = np.sum(rays * (xy1 * (square_m, square_m, 1) @ H.T))
+    H /= np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(ahead)
     left, _, right = np.linalg.svd(H[:, :2], full_matrices=False)
     first = left @ right
     return se3.transform(np.column_stack([first, np.cross(first[:, 0], first[:, 1])]), H[:, 2])
 
 
-def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board: Board) -> float:
+def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board: CalibrationBoard) -> float:
     """Return the mean angle between the rays of corners (N, 2) and the board's points."""
-    rays, points = camera.lift(pixels), se3.apply(T_cam_board, board.points)
-    across = np.linalg.norm(np.cross(rays, points), axis=1)
-    return float(np.nanmean(np.arctan2(across, (rays * points).sum(axis=1))))
+    return float(np.nanmean(_ray_errors_rad(T_cam_board, camera.lift(pixels), board.points)))
 
 
-def ambiguous_orders(board: Board) -> list[NDArray[np.intp]]:
+def _ray_errors_rad(T_cam_board: Array, rays: Array, points: Array) -> Array:
+    """Return the angles (N,) between rays (N, 3) and points (N, 3) of a board; NaN without a ray."""
+    directions = se3.apply(T_cam_board, points)
+    across = np.linalg.norm(np.cross(rays, directions), axis=1)
+    return np.asarray(np.arctan2(across, (rays * directions).sum(axis=1)))
+
+
+def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:
     """Return the orders (N,) of the corners that one image of a board cannot distinguish; the first is the identity.
 
     If one side is odd and one even, the colours determine the order. Otherwise a rotation by 180 degrees is ambiguous,
-    and for a square board with even sides every rotation by 90 degrees.
+    and for a square board with even sides every rotation by 90 degrees. Markers leave no ambiguity.
     """
+    if not isinstance(board, Board):
+        return [np.arange(len(board.points))]
     grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)
     if (board.columns + board.rows) % 2:
         return [grid.ravel()]

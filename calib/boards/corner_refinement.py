@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import Board
+from calib.boards.board import WINDOW, CalibrationBoard
 from calib.boards.board_shape import local_mapping, quadratic_terms
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array, OmniCamera
@@ -22,9 +22,8 @@ from calib.models.ocam import project_near
 # Mapping of board offsets (..., 2) from a corner [squares] to pixels (..., 2).
 ToImage = Callable[[Array], Array]
 
-# Half side of the window in squares, short of the next edges, and its largest value in pixels: farther grey levels do
-# not depend on the corner's position.
-REACH, REACH_PX = 0.42, 8
+# Largest half side of the window in pixels: farther grey levels do not depend on the corner's position.
+REACH_PX = 8
 # Least samples along a side of the window, and width of its Gaussian weight in parts of its half side.
 MIN_WINDOW_SAMPLES = 5
 WEIGHT_PART = 0.6
@@ -44,7 +43,7 @@ def refine_corners(image: NDArray[np.uint8], corners: Array) -> Array:
         for j, i in np.argwhere(np.isfinite(corners[..., 0])):
             mapping = local_mapping(refined, int(j), int(i))
             if mapping is not None:
-                moved[j, i] = _refined_corner(grey, mapping, corners[j, i])
+                moved[j, i] = refine_in_mapping(grey, mapping, corners[j, i])
         step = np.nanmax(np.linalg.norm(moved - refined, axis=2))
         refined = moved
         if step < CONVERGED_PX:
@@ -52,32 +51,32 @@ def refine_corners(image: NDArray[np.uint8], corners: Array) -> Array:
     return refined
 
 
-def refine_with_camera(image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array, view: tuple[Board, Array]
-                       ) -> Array:
+def refine_with_camera(image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array,
+                       view: tuple[CalibrationBoard, Array]) -> Array:
     """Move the pixels (N, 2) of a view (board, pixels) onto the image's corners, with a camera as the mapping."""
     (board, pixels), grey = view, image.astype(np.float32)
     refined = pixels.copy()
     for index in np.flatnonzero(np.isfinite(pixels[:, 0])):
         to_image = _camera_mapping(camera, T_cam_board, (board, board.points[index]))
-        moved = to_image(_converged_shift(grey, to_image)[None])[0]
+        moved = to_image(_converged_shift(grey, to_image, board.window)[None])[0]
         if np.linalg.norm(moved - pixels[index]) < MAX_MOVE * _square_px(to_image) + MAX_MOVE_PX:
             refined[index] = moved
     return refined
 
 
-def _converged_shift(grey: Grey, to_image: ToImage) -> Array:
-    """Return the corner's offset (2,) [squares] after the window was moved onto it iteratively."""
+def _converged_shift(grey: Grey, to_image: ToImage, window: float) -> Array:
+    """Return the corner's offset (2,) [squares] after the window (half side) was moved onto it iteratively."""
     shift = np.zeros(2)
 
     def shifted(xy: Array) -> Array:
         return to_image(xy + shift)
 
     for _ in range(MAX_ITERATIONS):
-        shift = shift + _corner_offset(grey, shifted)
+        shift = shift + _corner_offset(grey, shifted, window)
     return shift
 
 
-def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[Board, Array]) -> ToImage:
+def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[CalibrationBoard, Array]) -> ToImage:
     """Return the camera's mapping from the board about an origin (board, point (3,)) to the image."""
     board, point = origin
 
@@ -88,12 +87,15 @@ def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[Board,
     return to_image
 
 
-def _refined_corner(grey: Grey, mapping: Array, start: Array) -> Array:
-    """Return the corner's pixel (2,) in the window of a local mapping; start (2,) if it moves too far."""
+def refine_in_mapping(grey: Grey, mapping: Array, start: Array, window: float = WINDOW) -> Array:
+    """Return the corner's pixel (2,) in the window of a local mapping (6, 2); start (2,) if it moves too far.
+
+    mapping: see local_mapping; window: half side [squares].
+    """
     def to_image(xy: Array) -> Array:
         return np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ mapping)
 
-    moved = to_image(_corner_offset(grey, to_image))
+    moved = to_image(_corner_offset(grey, to_image, window))
     limit_px = MAX_MOVE * _square_px(to_image) + MAX_MOVE_PX
     return moved if np.linalg.norm(moved - start) < limit_px else start
 
@@ -104,10 +106,10 @@ def _square_px(to_image: ToImage) -> float:
     return float(np.sqrt(abs(np.linalg.det(ends[1:] - ends[0]))))
 
 
-def _corner_offset(grey: Grey, to_image: ToImage) -> Array:
+def _corner_offset(grey: Grey, to_image: ToImage, window: float) -> Array:
     """Return the offset (2,) [squares] of the corner in the window about the origin of a mapping."""
     size = _square_px(to_image)
-    reach = min(REACH, REACH_PX / max(size, 1e-6))
+    reach = min(window, REACH_PX / max(size, 1e-6))
     # An odd number of samples, about one a pixel.
     side = int(np.clip(np.ceil(2 * reach * size), MIN_WINDOW_SAMPLES, 2 * REACH_PX)) // 2 * 2 + 1
     x, y = np.meshgrid(*2 * [np.linspace(-reach, reach, side)])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.corner_refinement import refine_with_camera
 from calib.errors import CalibError
 from calib.fit.bundle import BundleResult, Observations
@@ -45,7 +45,7 @@ class CameraCalibration:
     """A calibrated camera; fit holds the poses and residuals of the views, in their order."""
 
     camera: OmniCamera
-    board: Board
+    board: CalibrationBoard
     views: tuple[BoardView, ...]
     fit: BundleResult
     parameters: tuple[tuple[str, float, float], ...]  # name, value, standard deviation
@@ -58,7 +58,7 @@ class CameraCalibration:
         return np.asarray(np.nanmean(self.fit.errors_px, axis=1))
 
 
-def calibrate_camera(views: Sequence[BoardView], board: Board, size: tuple[int, int], model: Model = "ocam",
+def calibrate_camera(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int], model: Model = "ocam",
                      view: View = "mirror") -> CameraCalibration:
     """Fit a camera to board views; outlier views are rejected.
 
@@ -68,7 +68,7 @@ def calibrate_camera(views: Sequence[BoardView], board: Board, size: tuple[int, 
     return calibrate_consistent(good, rejected, board, size, model, view)
 
 
-def calibrate_consistent(views: Sequence[BoardView], rejected: Sequence[RejectedView], board: Board,
+def calibrate_consistent(views: Sequence[BoardView], rejected: Sequence[RejectedView], board: CalibrationBoard,
                          size: tuple[int, int], model: Model, view: View, ocam: FittedModel | None = None
                          ) -> CameraCalibration:
     """Fit a camera to views of which the inconsistent ones have been rejected; see calibrate_camera.
@@ -99,7 +99,7 @@ def refine_camera_calibration(found: CameraCalibration, images: Mapping[str, NDA
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def observations(views: Sequence[BoardView], board: Board) -> Observations:
+def observations(views: Sequence[BoardView], board: CalibrationBoard) -> Observations:
     """Return the observed corners of views of a board."""
     return Observations(np.array([view.pixels for view in views]), board.points)
 
@@ -111,7 +111,7 @@ def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> No
                          "with the board all around the camera, near, and tilted")
 
 
-def consistent_views(views: Sequence[BoardView], board: Board, size: tuple[int, int],
+def consistent_views(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int],
                      view: View) -> tuple[list[BoardView], list[RejectedView]]:
     """Reject views with large errors in the linear solution, the worst first, because it affects the others."""
     _require(len(views), "views of the board")

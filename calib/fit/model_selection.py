@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView, CalibrationBoard
 from calib.errors import CalibError
 from calib.fit.camera_fit import (
     CameraCalibration,
@@ -62,8 +62,8 @@ class SelectedCalibration:
         return next(score for score in self.scores if score.model == self.model)
 
 
-def select_calibration(views: Sequence[BoardView], board: Board, size: tuple[int, int], choice: ModelChoice = "auto",
-                       view: View = "mirror") -> SelectedCalibration:
+def select_calibration(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int],
+                       choice: ModelChoice = "auto", view: View = "mirror") -> SelectedCalibration:
     """Calibrate a camera with every model of the choice, and select the one with the least held-out error.
 
     Models are compared on the views that all of them accept. Raises CalibError if no model can be fitted.

@@ -100,7 +100,7 @@ def _partial_poses(xy: Array, points: Array) -> Array:
     x, y = np.nan_to_num(xy[..., 0]), np.nan_to_num(xy[..., 1])
     rows = np.stack([-y * X, -y * Y, -y, x * X, x * Y, x], axis=-1) * known
     scale = np.linalg.norm(rows, axis=1, keepdims=True)
-    h = np.linalg.svd(rows / scale, full_matrices=True)[2][:, -1] / scale[:, 0]
+    h = np.linalg.svd(rows / scale, full_matrices=False)[2][:, -1] / scale[:, 0]
     T = np.tile(np.eye(4), (len(h), 1, 1))
     T[:, :2, [0, 1, 3]] = h.reshape(-1, 2, 3)
     across = se3.apply(T, points)[..., :2]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.corner_refinement import refine_with_camera
 from calib.errors import CalibError
 from calib.fit.bundle import BundleResult, Observations, Prior, adjust_bundle
@@ -48,7 +48,7 @@ class RigCalibration:
     lower: OmniCamera
     upper: OmniCamera
     T_upper_lower: Array  # (4, 4)
-    board: Board
+    board: CalibrationBoard
     views: tuple[PairView, ...]
     fit: BundleResult
     parameters: tuple[tuple[tuple[str, float, float], ...], ...]  # of lower and upper: name, value, sigma
@@ -138,7 +138,8 @@ class _RigParameterisation:
                            T_upper_lower, self.corners)
 
 
-def calibrate_rig(views: Sequence[PairView], board: Board, cameras: Sides, refined: bool = True) -> RigCalibration:
+def calibrate_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, refined: bool = True
+                  ) -> RigCalibration:
     """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
 
     cameras: start values, or the fixed cameras if not refined. The terms of real mirrors (MIRROR_NAMES) are fitted if a
@@ -186,8 +187,8 @@ def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images],
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def _refined_view(seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera, posed_board: tuple[Array, Board]
-                  ) -> BoardView:
+def _refined_view(seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera,
+                  posed_board: tuple[Array, CalibrationBoard]) -> BoardView:
     T_cam_board, board = posed_board
     return replace(seen, pixels=refine_with_camera(image, camera, T_cam_board, (board, seen.pixels)))
 
@@ -223,7 +224,7 @@ def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> Pai
     return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
 
 
-def _solve(good: Sequence[PairView], board: Board, given: tuple[Sides, bool], start: tuple[Array, Array]
+def _solve(good: Sequence[PairView], board: CalibrationBoard, given: tuple[Sides, bool], start: tuple[Array, Array]
            ) -> tuple[BundleResult, _RigParameterisation]:
     """Adjust both cameras, the transform between them, and one pose of the board for every view."""
     T_upper_lower, T_lower_board = start
@@ -233,7 +234,7 @@ def _solve(good: Sequence[PairView], board: Board, given: tuple[Sides, bool], st
     return fit, unknowns
 
 
-def _unknowns(board: Board, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+def _unknowns(board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
               ) -> _RigParameterisation:
     (lower, upper), refined = given
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
@@ -243,7 +244,7 @@ def _unknowns(board: Board, given: tuple[Sides, bool], T_upper_lower: Array, T_l
     return _RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
 
 
-def _observations(good: Sequence[PairView], board: Board) -> Observations:
+def _observations(good: Sequence[PairView], board: CalibrationBoard) -> Observations:
     """Return the corners (K, 2N, 2) of both cameras, the lower one's first."""
     none = np.full((len(board.points), 2), np.nan)
     pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen])
@@ -268,8 +269,9 @@ def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
     return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 
-def _rig_calibration(good: Sequence[PairView], board: Board, solved: tuple[BundleResult, _RigParameterisation],
-                     rejected: Sequence[RejectedView]) -> RigCalibration:
+def _rig_calibration(good: Sequence[PairView], board: CalibrationBoard,
+                     solved: tuple[BundleResult, _RigParameterisation], rejected: Sequence[RejectedView]
+                     ) -> RigCalibration:
     fit, unknowns = solved
     found, (lower, upper, _) = unknowns.camera(fit.parameters), unknowns.ends
     sigma = np.sqrt(np.maximum(0, np.diag(fit.covariance)))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.board_pose import ambiguous_orders, board_pose, pose_error_rad
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
@@ -40,7 +40,7 @@ class RelativePoseInitialisation:
     rejected: tuple[tuple[int, str], ...]  # view and reason
 
 
-def initialise_relative_pose(views: Sequence[ViewPair], board: Board, cameras: tuple[OmniCamera, OmniCamera]
+def initialise_relative_pose(views: Sequence[ViewPair], board: CalibrationBoard, cameras: tuple[OmniCamera, OmniCamera]
                              ) -> RelativePoseInitialisation:
     """Find the transform with the most consistent pairs, and the board's pose in every view.
 
@@ -71,12 +71,12 @@ def initialise_relative_pose(views: Sequence[ViewPair], board: Board, cameras: t
     return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, tuple(rejected))
 
 
-def _checked_pose(camera: OmniCamera, pixels: Array, board: Board) -> Array | None:
+def _checked_pose(camera: OmniCamera, pixels: Array, board: CalibrationBoard) -> Array | None:
     T = board_pose(camera, pixels, board)
     return T if T is not None and pose_error_rad(camera, T, pixels, board) < MAX_POSE_ERROR_RAD else None
 
 
-def _pose_hypotheses(camera: OmniCamera, seen: BoardView, board: Board, orders: Sequence[NDArray[np.intp]]
+def _pose_hypotheses(camera: OmniCamera, seen: BoardView, board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
                      ) -> Array | None:
     """Return the board's poses (S, 4, 4), one for every order of its corners; None if one does not fit."""
     poses = [_checked_pose(camera, seen.pixels[order], board) for order in orders]

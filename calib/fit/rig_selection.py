@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.boards.board import Board
+from calib.boards.board import CalibrationBoard
 from calib.errors import CalibError
 from calib.fit.rig_fit import PairView, RigCalibration, Sides, calibrate_rig, rig_held_out_px
 from calib.models.ocam import OcamCamera
@@ -48,8 +48,8 @@ class SelectedRig:
     scores: tuple[RigScore, ...]
 
 
-def select_rig(views: Sequence[PairView], board: Board, cameras: Sides, mirrors: tuple[OcamCamera, OcamCamera] | None,
-               ) -> SelectedRig:
+def select_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides,
+               mirrors: tuple[OcamCamera, OcamCamera] | None) -> SelectedRig:
     """Calibrate a rig with central cameras, and with the terms of real mirrors; select by the held-out error.
 
     mirrors: ocam cameras from which the terms of real mirrors are fitted, None: central cameras only. Raises CalibError

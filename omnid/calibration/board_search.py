@@ -12,16 +12,26 @@ import numpy as np
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import BoardSearch, find_board
+from calib.boards.marker_board import AprilGrid, CharucoBoard
+from calib.boards.marker_finder import find_marker_board
+from calib.boards.marker_reading import seen_dictionary
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
+AnyBoard = Board | CharucoBoard | AprilGrid
+# Images in which markers of other dictionaries are searched if no board is found.
+HINT_IMAGES = 3
 
-def find_boards(images: Images, board: Board, *, thorough: bool, show_progress: bool) -> list[BoardView]:
-    """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other grids."""
+
+def find_boards(images: Images, board: AnyBoard, *, thorough: bool, show_progress: bool) -> list[BoardView]:
+    """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other boards."""
     views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
 
     def search_of(named: tuple[str, Image]) -> tuple[str, BoardSearch]:
-        return named[0], find_board(named[1], board, named[0], thorough=thorough)
+        name, image = named
+        if isinstance(board, Board):
+            return name, find_board(image, board, name, thorough=thorough)
+        return name, BoardSearch(find_marker_board(image, board, name, thorough=thorough))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (name, search) in enumerate(pool.map(search_of, images.items()), 1):
@@ -30,9 +40,10 @@ def find_boards(images: Images, board: Board, *, thorough: bool, show_progress: 
             if search.grid_size != (0, 0):
                 other_grids[_sorted(search.grid_size)] += 1
             if show_progress:
-                print(f"[{number}/{len(images)}] {name}: {_progress(search)}", file=sys.stderr)
+                print(f"[{number}/{len(images)}] {name}: {_progress(search, board)}", file=sys.stderr)
     if not views:
-        raise OmnidError(_none_found(len(images), board, other_grids))
+        hint = _grid_hint(other_grids) if isinstance(board, Board) else _marker_hint(images, board)
+        raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
 
 
@@ -40,24 +51,38 @@ def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
     return min(sides), max(sides)
 
 
-def _progress(search: BoardSearch) -> str:
-    if search.view is not None:
-        return f"board found, confidence {search.view.confidence:.2f}"
-    columns, rows = search.grid_size
+def _progress(search: BoardSearch, board: AnyBoard) -> str:
+    view, (columns, rows) = search.view, search.grid_size
+    if view is not None and isinstance(board, Board):
+        return f"board found, confidence {view.confidence:.2f}"
+    if view is not None:
+        return f"board found, {int(np.isfinite(view.pixels[:, 0]).sum())} of {len(view.pixels)} corners"
     return f"no board, but a grid of {columns}x{rows}" if columns else "no board"
 
 
-def _none_found(images: int, board: Board, other_grids: Counter[tuple[int, int]]) -> str:
-    hint = "count the inner corners, and take images with the whole board in view, sharp and well lit"
-    if other_grids:
-        (columns, rows), times = other_grids.most_common(1)[0]
-        hint = f"a grid of {columns}x{rows} was found in {times}: try --corners {columns}x{rows}"
-    return f"calibrate: no board of {board.columns}x{board.rows} inner corners in any of {images} images; {hint}"
+def _grid_hint(other_grids: Counter[tuple[int, int]]) -> str:
+    if not other_grids:
+        return "count the inner corners, and take images with the whole board in view, sharp and well lit"
+    (columns, rows), times = other_grids.most_common(1)[0]
+    return f"a grid of {columns}x{rows} was found in {times}: try --corners {columns}x{rows}"
+
+
+def _marker_hint(images: Images, board: CharucoBoard | AprilGrid) -> str:
+    layout, sample = board.markers, list(images.values())[::-(-len(images) // HINT_IMAGES)]
+    names = [name for image in sample if (name := seen_dictionary(image, layout.border_bits))]
+    if not names:
+        return "take images with the board nearer (six pixels a bit of its markers), sharp and well lit"
+    name = Counter(names).most_common(1)[0][0]
+    if isinstance(board, CharucoBoard) and name != board.dictionary:
+        return f"markers of {name} were seen: try --dictionary {name}"
+    if isinstance(board, AprilGrid):
+        return f"markers of {name} were seen, not at the places of such a grid: check --tags and --tag-spacing"
+    return "its markers were seen, not at the places of such a board: check --corners, --marker-mm, --legacy-charuco"
 
 
 def select_diverse_views(views: Sequence[BoardView], count: int) -> list[BoardView]:
     """Select at most count views whose first and last corners are far apart (farthest point sampling)."""
-    corners = np.nan_to_num(np.array([view.pixels[[0, -1]].ravel() for view in views]))
+    corners = np.array([view.pixels[np.flatnonzero(np.isfinite(view.pixels[:, 0]))[[0, -1]]].ravel() for view in views])
     chosen = [0]
     distance = np.full(len(views), np.inf)
     while len(chosen) < min(count, len(views)):

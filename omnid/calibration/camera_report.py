@@ -45,8 +45,8 @@ def _head(found: CameraCalibration) -> str:
     camera, board = found.camera, found.board
     model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
     used = int(np.isfinite(found.fit.errors_px).sum())
-    return (f"<h1>Camera calibration</h1><p>Model {model}, {camera.size[0]}x{camera.size[1]} px. Board of "
-            f"{board.columns}x{board.rows} inner corners, {board.square_m * 1e3:g} mm squares. "
+    return (f"<h1>Camera calibration</h1><p>Model {model}, {camera.size[0]}x{camera.size[1]} px. "
+            f"{escape(f'{board}')}, {board.square_m * 1e3:g} mm. "
             f"{len(found.views)} views, {used} corners. <b>Mean reprojection error {found.fit.mean_px:.3f} px</b>.</p>")
 
 

@@ -1,9 +1,8 @@
-"""`omnid calibrate camera`: calibrate one camera by images of a checkerboard."""
+"""`omnid calibrate camera`: calibrate one camera by images of a board."""
 
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView, CalibrationBoard
 from calib.camera_file import CameraFile, Quality, camera_toml
 from calib.fit.camera_fit import CameraCalibration
 from calib.fit.model_selection import (
@@ -30,6 +29,7 @@ from calib.rig_file import write_file
 from omnid.calibration.board_search import find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, read_images
+from omnid.commands.board_options import add_board_options, board_of
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -44,11 +44,9 @@ MISFIT = "the camera model does not describe this camera: {}; do not use it wher
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `camera` to `omnid calibrate`."""
-    parser = actions.add_parser("camera", help="a camera.toml from images of a checkerboard")
+    parser = actions.add_parser("camera", help="a camera.toml from images of a board")
     parser.add_argument("images", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
-    parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="inner corners (points where "
-                        "four squares meet) along both sides of the board")
-    parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
+    add_board_options(parser)
     parser.add_argument("--topic", help="the camera's topic in a log")
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in a mirror (default) or "
@@ -61,18 +59,9 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.set_defaults(run=run)
 
 
-def corners(text: str) -> tuple[int, int]:
-    """Parse the inner corners along both sides, like 6x7."""
-    sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
-    if sides is None:
-        raise argparse.ArgumentTypeError(f"expected two numbers of inner corners like 6x7, found {text!r}")
-    return int(sides[1]), int(sides[2])
-
-
 def run(args: argparse.Namespace) -> int:
     """Find the boards, fit the camera, write the files and print one line."""
-    columns, rows = args.corners
-    board = Board(columns, rows, args.square_mm / 1e3)
+    board = board_of(args)
     _check_outputs(args)
     images = read_images(args.images, args.topic)
     many = any(source.endswith(".mcap") for source in args.images)
@@ -100,7 +89,8 @@ def _check_outputs(args: argparse.Namespace) -> None:
         raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}")
 
 
-def _fitted(views: list[BoardView], images: Images, board: Board, args: argparse.Namespace) -> SelectedCalibration:
+def _fitted(views: list[BoardView], images: Images, board: CalibrationBoard, args: argparse.Namespace
+            ) -> SelectedCalibration:
     height, width = images[views[0].name].shape
     selected = select_calibration(views, board, (width, height), args.model, args.view)
     print_scores(selected, "camera", args.quiet)

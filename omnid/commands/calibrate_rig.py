@@ -1,4 +1,4 @@
-"""`omnid calibrate rig`: calibrate a rig by simultaneous images of a checkerboard."""
+"""`omnid calibrate rig`: calibrate a rig by simultaneous images of a board."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.boards.board import Board, BoardView
+from calib.boards.board import BoardView
 from calib.camera_file import CameraFile, read_camera
 from calib.fit.camera_fit import RejectedView
 from calib.fit.model_selection import MODEL_CHOICES, refine_selection, select_calibration
@@ -25,16 +25,17 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
-from omnid.calibration.board_search import find_boards, select_diverse_views
+from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
 from omnid.calibration.images import Images
 from omnid.calibration.rig_report import rig_report_html
-from omnid.commands.calibrate_camera import MODEL_HELP, corners, misfit_warnings, print_scores
+from omnid.commands.board_options import add_board_options, board_of, length_option
+from omnid.commands.calibrate_camera import MODEL_HELP, misfit_warnings, print_scores
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 MAX_LOG_VIEWS = 40
-# The side of a square scales the rig: a baseline outside this range shows a wrong --square-mm.
+# The board scales the rig: a baseline outside this range shows a wrong --square-mm or --tag-mm.
 BASELINE_RANGE_M = (0.01, 3.0)
 # Relative difference from the expected baseline that is refused, and that gives a warning.
 REFUSED_PART, WARNING_PART = 0.1, 0.02
@@ -42,12 +43,10 @@ REFUSED_PART, WARNING_PART = 0.1, 0.02
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `rig` to `omnid calibrate`."""
-    parser = actions.add_parser("rig", help="a rig.toml from images of a checkerboard that both cameras saw at once")
+    parser = actions.add_parser("rig", help="a rig.toml from images of a board that both cameras saw at once")
     parser.add_argument("images", type=Path, metavar="LOG|DIR", help="a log of both cameras, or a folder with "
                         "lower_*.png, upper_*.png of the same names")
-    parser.add_argument("--corners", required=True, type=corners, metavar="6x7", help="inner corners (points where "
-                        "four squares meet) along both sides of the board")
-    parser.add_argument("--square-mm", required=True, type=float, metavar="MM", help="side of one square")
+    add_board_options(parser)
     parser.add_argument("--expected-baseline-mm", type=float, metavar="MM", help="the measured distance of the "
                         "mirrors: a result that differs by more than a tenth is refused")
     parser.add_argument("--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is "
@@ -69,8 +68,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 def run(args: argparse.Namespace) -> int:
     """Find the boards, fit cameras and rig, write the files and print one line."""
-    columns, rows = args.corners
-    board = Board(columns, rows, args.square_mm / 1e3)
+    board = board_of(args)
     given = _given(args)
     _check_outputs(args)
     images = read_pairs(args.images, args.lower, args.upper)
@@ -131,7 +129,7 @@ def _sizes_fit(images: PairedImages, given: tuple[CameraFile, CameraFile] | None
                              f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera")
 
 
-def _fitted(images: PairedImages, board: Board, given: tuple[CameraFile, CameraFile] | None,
+def _fitted(images: PairedImages, board: AnyBoard, given: tuple[CameraFile, CameraFile] | None,
             args: argparse.Namespace) -> RigCalibration:
     """Fit the rig to all boards; the cameras are fitted first, unless they are given."""
     views = _views(images, board, show_progress=not args.quiet)
@@ -160,7 +158,7 @@ def _with_rejected(found: RigCalibration, rejected: list[RejectedView]) -> RigCa
     return replace(found, rejected=(*rejected, *found.rejected))
 
 
-def _views(images: PairedImages, board: Board, *, show_progress: bool) -> list[PairView]:
+def _views(images: PairedImages, board: AnyBoard, *, show_progress: bool) -> list[PairView]:
     """Find the board in the images of both cameras; of a log's many pairs the most diverse ones are selected."""
     found = [_found(side, board, name, is_log=bool(images.topics[0]), show_progress=show_progress)
              for name, side in zip(SIDES, images.sides, strict=True)]
@@ -172,7 +170,7 @@ def _views(images: PairedImages, board: Board, *, show_progress: bool) -> list[P
     return [view for view in seen if any(view.seen)]
 
 
-def _found(images: Images, board: Board, name: str, *, is_log: bool, show_progress: bool) -> dict[str, BoardView]:
+def _found(images: Images, board: AnyBoard, name: str, *, is_log: bool, show_progress: bool) -> dict[str, BoardView]:
     """Find the board in the images of the camera of that name; returns the views by the names of the images."""
     try:
         views = find_boards(images, board, thorough=not is_log, show_progress=show_progress)
@@ -181,7 +179,7 @@ def _found(images: Images, board: Board, name: str, *, is_log: bool, show_progre
     return {view.name: view for view in views}
 
 
-def _calibrated_cameras(views: list[PairView], images: PairedImages, board: Board, args: argparse.Namespace
+def _calibrated_cameras(views: list[PairView], images: PairedImages, board: AnyBoard, args: argparse.Namespace
                         ) -> tuple[Sides, tuple[OcamCamera, OcamCamera] | None, list[PairView], list[RejectedView]]:
     """Calibrate each camera by all its images.
 
@@ -219,18 +217,18 @@ def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView
 def _check_baseline(found: RigCalibration, args: argparse.Namespace) -> list[str]:
     """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
     baseline_mm, expected = found.baseline_m * 1e3, args.expected_baseline_mm
-    low, high = BASELINE_RANGE_M
+    (option, length_mm), (low, high) = length_option(args), BASELINE_RANGE_M
     if not low <= found.baseline_m <= high:
         raise OmnidError(f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found "
-                         f"{baseline_mm:.4g} mm; it is proportional to --square-mm, which is {args.square_mm:g}: "
-                         "measure the squares")
+                         f"{baseline_mm:.4g} mm; it is proportional to {option}, which is {length_mm:g}: "
+                         "measure the board")
     if expected is None:
         return []
     off = baseline_mm / expected - 1
     if abs(off) > REFUSED_PART:
-        raise OmnidError(f"calibrate rig: expected a baseline of {expected:g} mm, found {baseline_mm:.1f} mm; squares "
-                         f"of {args.square_mm * expected / baseline_mm:.2f} mm would explain it: measure the squares "
-                         f"(--square-mm is {args.square_mm:g}) and the distance of the mirrors")
+        raise OmnidError(f"calibrate rig: expected a baseline of {expected:g} mm, found {baseline_mm:.1f} mm; "
+                         f"{option} {length_mm * expected / baseline_mm:.2f} would explain it: measure the board "
+                         f"({option} is {length_mm:g}) and the distance of the mirrors")
     if abs(off) > WARNING_PART:
         return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected:g} mm"]
     return []

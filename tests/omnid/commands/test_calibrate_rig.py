@@ -227,7 +227,7 @@ def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path,
 
 
 @pytest.mark.parametrize(("square_mm", "words", "message"), [
-    (25, ["--expected-baseline-mm", "180"], "squares of 29.97 mm would explain it"),
+    (25, ["--expected-baseline-mm", "180"], "--square-mm 29.97 would explain it"),
     (0.3, [], "expected a baseline of 10 to 3000 mm, found 1.802 mm"),
     (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
     (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),

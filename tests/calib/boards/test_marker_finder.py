@@ -1,0 +1,95 @@
+"""Boards with markers: layouts, detection in rendered mirror images, hidden parts, misread markers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.boards.board_pose import board_pose
+from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
+from calib.boards.marker_finder import find_marker_board
+from calib.boards.marker_reading import consistent_markers, seen_dictionary
+from calib.errors import CalibError
+from calib.models.camera import Mask
+from calib.models.unified import UnifiedCamera
+from calib.rig import MountedCamera
+from tests.simulation.boards import BoardImage, board_poses_around_camera
+from tests.simulation.marker_boards import frame_board, print_of, render_marker_board
+from tests.simulation.sensor import Sensor
+
+MOUNTED = MountedCamera(UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480)), np.eye(4),
+                        Mask((241.3, 237.8), 40.0, 232.0))
+CHARUCO = CharucoBoard(6, 5, 0.05, 0.0375, "4X4_50")
+GRID = AprilGrid(4, 3, 0.06, 0.3)
+
+
+def rendered(board: MarkerBoard, hidden: float = 0.0) -> BoardImage:
+    mask = MOUNTED.mask
+    assert mask is not None
+    T = board_poses_around_camera(MOUNTED.camera, frame_board(board), mask, 1, seed=3, distance_m=(0.25, 0.3))[0]
+    return render_marker_board(MOUNTED, board, T, seed=1, sensor=Sensor(noise_sigma=2.0), hidden=hidden)
+
+
+@pytest.mark.parametrize(("board", "hidden", "least", "most"), [
+    (CHARUCO, 0.0, 0.7, 1.0), (CHARUCO, 0.5, 0.25, 0.55), (GRID, 0.0, 0.7, 1.0), (GRID, 0.5, 0.25, 0.55)])
+def test_finds_the_visible_corners_in_a_mirror(board: MarkerBoard, hidden: float, least: float, most: float) -> None:
+    made = rendered(board, hidden)
+    view = find_marker_board(made.image, board, "name")
+    assert view is not None and view.name == "name" and least <= view.confidence <= most
+    off = np.linalg.norm(view.pixels - made.corners, axis=1)
+    assert np.isfinite(off).mean() == view.confidence
+    assert np.nanmedian(off) < 0.05 and np.nanpercentile(off, 90) < 0.3
+
+
+@pytest.mark.parametrize("board", [CHARUCO, GRID, CharucoBoard(6, 5, 0.05, 0.0375, "4X4_50", legacy=True)])
+def test_finds_the_corners_of_a_print_seen_directly(board: MarkerBoard) -> None:
+    """The print is drawn by the codes of the family, so the tags' numbers and orientation are those of Kalibr."""
+    sheet, pixels = print_of(board)
+    view = find_marker_board(sheet, board)
+    assert view is not None and view.confidence > 0.9
+    assert np.nanmax(np.linalg.norm(view.pixels - pixels, axis=1)) < 0.1
+
+
+def test_a_grid_has_the_frame_of_kalibr() -> None:
+    np.testing.assert_allclose(GRID.points[:3, :2], [[0, 0], [0.06, 0], [0.078, 0]])
+    np.testing.assert_allclose(GRID.points[8:10, :2], [[0, 0.06], [0.06, 0.06]])
+    np.testing.assert_allclose(GRID.markers.corners[5].mean(axis=0), [0.108, 0.108])
+    assert len(GRID.points) == 48 and GRID.window == pytest.approx(0.2)
+
+
+def test_another_dictionary_is_no_board_and_named() -> None:
+    made = rendered(CHARUCO)
+    assert find_marker_board(made.image, CharucoBoard(6, 5, 0.05, 0.0375, "6X6_50")) is None
+    assert find_marker_board(made.image, GRID) is None
+    assert seen_dictionary(made.image, 1) == "4X4_50"
+    assert seen_dictionary(np.full((100, 100), 90, np.uint8), 1) is None
+
+
+def test_leaves_out_markers_that_lie_elsewhere() -> None:
+    layout = CHARUCO.markers
+    pixels = {int(number): 1000 * corners + 300 for number, corners in zip(layout.ids, layout.corners, strict=True)}
+    moved = pixels | {4: pixels[4] + 37.0}
+    assert sorted(consistent_markers(pixels, layout)) == sorted(pixels)
+    assert sorted(consistent_markers(moved, layout)) == sorted(set(pixels) - {4})
+
+
+def test_a_corner_far_off_does_not_change_the_pose() -> None:
+    made = rendered(GRID)
+    spoilt = made.corners.copy()
+    spoilt[7] += 25.0
+    T = board_pose(MOUNTED.camera, spoilt, GRID)
+    assert T is not None
+    np.testing.assert_allclose(T, made.T_cam_board, atol=1e-4)
+
+
+@pytest.mark.parametrize(("make", "words"), [
+    (lambda: CharucoBoard(6, 5, 0.05, 0.06, "4X4_50"), "markers of 0.3 to 0.95 of the squares' side, found 60 mm"),
+    (lambda: CharucoBoard(6, 5, 0.05, 0.03, "4X5_50"), "expected a dictionary of markers .*4X4_50.* found '4X5_50'"),
+    (lambda: CharucoBoard(20, 20, 0.05, 0.03, "4X4_50"), "4X4_50 has 50 markers, and this board needs 220"),
+    (lambda: CharucoBoard(1, 5, 0.05, 0.03, "4X4_50"), "expected 2 to 60 inner corners"),
+    (lambda: AprilGrid(6, 6, float("nan"), 0.3), "tags of 0.1 mm to 10 m"),
+    (lambda: AprilGrid(6, 6, 0.08, 24.0), "like Kalibr's tagSpacing, found 24"),
+    (lambda: AprilGrid(30, 30, 0.08, 0.3), "APRILTAG_36h11 has 587 markers, and this board needs 900")])
+def test_refuses_impossible_boards(make: type[MarkerBoard], words: str) -> None:
+    with pytest.raises(CalibError, match=words):
+        make()
