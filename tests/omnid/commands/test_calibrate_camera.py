@@ -126,7 +126,7 @@ def test_suggests_the_right_number_of_corners(folder: Path, tmp_path: Path,
     assert "a grid of 5x6 was found in 1: try --corners 5x6" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"], ["--corners", "6x5"]])
+@pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"]])
 def test_invalid_options_are_one_line(folder: Path, tmp_path: Path, words: list[str],
                                       capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
