@@ -77,7 +77,7 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
 
 
 @pytest.mark.parametrize(("protocol", "true"), [
-    ("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}),
+    pytest.param("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}, marks=pytest.mark.slow),
     ("roboteq_power", {"reverse_right": True, "max_wheel_mps": 2.0}),
     pytest.param("odrive_ascii", {"swapped": True, "gear": 40.0}, marks=pytest.mark.slow),
     pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
