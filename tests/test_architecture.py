@@ -71,8 +71,8 @@ ARROWS: Mapping[str, str] = {
         "drivers.errors drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config "
         "omnid.controller omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics "
         "omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings "
-        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.viewer "
-        "omnid.web",
+        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages "
+        "omnid.viewer omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
         "omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration "
@@ -127,9 +127,9 @@ ARROWS: Mapping[str, str] = {
     "omnid.settings_dump": "omnid.settings",
     "omnid.settings_migration": "omnid.settings",
     "omnid.sinks":
-        "drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
-        "omnid.core.control omnid.core.mapping omnid.diagnostics omnid.errors omnid.formats omnid.messages "
-        "omnid.stages omnid.tracking_state omnid.transport",
+        "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
+        "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.errors omnid.formats "
+        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame "
         "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.odometry "

@@ -41,6 +41,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
                   "map build wednesday.mcap -o place.omap --extend"),
     "map info": ("map info place.omap",),
     "map merge": ("map merge east.omap west.omap -o place.omap",),
+    "map tags": ("map tags drive.mcap --tag 5=0.16 --tag 6=0.16 --map place.omap --localize-only",),
     "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
     "diff": ("diff yesterday.mcap today.mcap",),
     "doctor": ("doctor --config /etc/omnid/omnid.toml",),

@@ -1,0 +1,50 @@
+"""AprilTags of a log as landmarks: their poses in the map, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.replay.command import Command
+from tests.simulation import Scene, build, write_log
+from tests.simulation.surfaces import Rectangle
+
+EDGE_M, QUIET_M = 0.6, 0.15  # of the black square, and the white border around it
+AT_START = np.array([0.9, 0.9, 0.1])  # m: the tag's middle in the rig frame of the first pair; it faces the rig's y
+
+
+@pytest.fixture(scope="module")
+def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short drive past a tag."""
+    folder = tmp_path_factory.mktemp("tagged")
+    run = build("two_walls", seed=3, size=384, pairs=8)
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    square = cv2.aruco.generateImageMarker(family, 5, 320)
+    image = cv2.copyMakeBorder(square, 80, 80, 80, 80, cv2.BORDER_CONSTANT, value=255)
+    T, half = run.poses[0], EDGE_M / 2 + QUIET_M
+    # On a wall to the left, what is to the right lies ahead.
+    corner = T[:3, :3] @ (AT_START + np.array([-half, 0, half])) + T[:3, 3]
+    tag = Rectangle(corner, T[:3, :3] @ [2 * half, 0, 0], T[:3, :3] @ [0, 0, -2 * half], image, "tag")
+    write_log(folder, run.rig, run.poses, Scene((*run.scene.rectangles, tag)), sensor=run.sensor, seed=3)
+    return folder
+
+
+def test_a_tag_is_located_in_the_map(omnid: Command, tagged: Path) -> None:
+    code, out, err = omnid("map", "tags", tagged / "log.mcap", "--rig", tagged / "rig.toml", "--tag", f"5={EDGE_M}",
+                           "--tag", "6=0.2", "--json")
+    assert code == 1 and "not found: 6;" in err
+    [found] = json.loads(out)["tags"]
+    assert found["id"] == 5 and found["views"] >= 2 and found["rejected"] == 0
+    error = np.linalg.norm(np.array(found["xyz_m"]) - AT_START)
+    assert error < 0.02 and error < 5 * found["sigma_m"]
+
+
+def test_wrong_sizes_are_one_line(omnid: Command, tagged: Path) -> None:
+    for word, message in (("5", "expected ID=SIZE"), ("5=x", "expected ID=SIZE"), ("900=0.2", "0 to 586"),
+                          ("5=0", "0.005 to 10 m"), ("5=nan", "0.005 to 10 m")):
+        error = omnid.refused("map", "tags", tagged / "log.mcap", "--rig", tagged / "rig.toml", "--tag", word)
+        assert message in error
