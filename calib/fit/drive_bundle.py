@@ -29,6 +29,9 @@ MAX_STEPS = 30  # of a search
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6  # relative gain below which a search ends, while landmarks are selected and last
 MAX_TRIALS = 8  # of a damping
 MIN_LANDMARKS = 100
+# Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms):
+# beside a calibration with boards about one observation of ten counts.
+OBSERVATIONS_ALIKE = 10.0
 HOLD_OUT = 3  # every third landmark is held out of a comparison of models
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
@@ -61,13 +64,14 @@ class DriveAdjustment:
 
 
 def adjust_drive(parameters: RigParameters, state: DriveState, observations: DriveObservations, prior: Array,
-                 fixed: Sequence[int] = (0,)) -> DriveAdjustment:
+                 fixed: Sequence[int] = (0,), *, alike: float = 1.0) -> DriveAdjustment:
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
-    prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. CalibError
-    where fewer than MIN_LANDMARKS landmarks agree.
+    prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. alike:
+    number of observations that tell no more than one, which gives the prior more weight. CalibError where fewer than
+    MIN_LANDMARKS landmarks agree.
     """
-    problem = DriveProblem(parameters, observations, prior, np.asarray(fixed))
+    problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))
     state, sigma_px = _descend(problem, state, ROUGH_GAIN)
     for number in range(SELECTIONS):
         kept, used = observations.only(_consistent(problem, state, sigma_px))
@@ -80,7 +84,7 @@ def adjust_drive(parameters: RigParameters, state: DriveState, observations: Dri
         observations, state = kept, replace(state, points=state.points[used])
         problem = replace(problem, observations=observations)
         state, sigma_px = _descend(problem, state, FINE_GAIN if number == SELECTIONS - 1 else ROUGH_GAIN)
-    covariance = linearise(problem, state, sigma_px).covariance(prior)
+    covariance = linearise(problem, state, sigma_px).covariance(alike**2 * prior)
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
 
 

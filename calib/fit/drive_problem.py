@@ -157,7 +157,7 @@ class NormalEquations:
         return step, np.asarray(inverse @ (self.b - self.coupling.T @ step)).reshape(-1, 3)
 
     def covariance(self, prior: Array) -> Array:
-        """Return the covariance (P, P) of the rig, whose prior information is (P, P).
+        """Return the covariance (P, P) of the rig, to whose gradient the prior adds the variance (P, P).
 
         Errors of one landmark's observations depend on each other: its patch, its surface and its slope are the same
         in all of them. So the variance of the gradient is that of the landmarks' sums (sandwich estimator with

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, adjust_pairs, held_out_error, observation_sigma
+from calib.fit.drive_bundle import (
+    OBSERVATIONS_ALIKE,
+    DriveAdjustment,
+    adjust_drive,
+    adjust_pairs,
+    held_out_error,
+    observation_sigma,
+)
 from calib.fit.drive_models import DriveModelScore, best_model, candidate_distortions, drive_structure
 from calib.fit.drive_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
 from calib.fit.drive_prior import baseline_by_prior, nominal_sigmas, prior_information
@@ -124,7 +131,9 @@ def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics:
 
 def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveAdjustment:
     prior = prior_information(parameters, parameters.rig)
-    return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, prior, drives.fixed)
+    alike = 1.0 if parameters.rig.covariance is None else OBSERVATIONS_ALIKE
+    return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, prior, drives.fixed,
+                        alike=alike)
 
 
 def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:

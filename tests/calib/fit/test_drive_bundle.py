@@ -218,3 +218,15 @@ def test_the_fewest_terms_that_no_more_improve_are_chosen(held_out: tuple[float,
                                                           ) -> None:
     scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=True)]
     assert best_model(scores).distortion == expected
+
+
+def test_observations_that_are_alike_leave_more_to_the_prior(truth: Rig) -> None:
+    """A prior half as strong as the drive, about a centre that is off, weighs ten times as much."""
+    state, observations = drive(truth, 9)
+    parameters = RigParameters.about(disturbed(truth, np.random.default_rng(9)))
+    begin = replace(state, steps=np.zeros(15))
+    free = adjust_drive(parameters, begin, observations, PRIOR)
+    prior = np.diag(1 / (2 * np.diag(free.covariance)))
+    once, ten = (np.abs(adjust_drive(parameters, begin, observations, prior, alike=alike).state.steps).sum()
+                 for alike in (1.0, 10.0))
+    assert ten < 0.7 * once < 0.7 * np.abs(free.state.steps).sum()
