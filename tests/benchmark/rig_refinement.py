@@ -1,4 +1,4 @@
-"""What the daemon's refinement of the rig says: `python -m tests.benchmark.rig_refinement LOG:RIG ...`.
+"""Report of the daemon's refinement of the rig: `python -m tests.benchmark.rig_refinement LOG:RIG ...`.
 
 LOG: a folder with log.mcap; RIG: a rig.toml, or `perturbed` for LOG/rig.toml with the errors of self_calibration.
 """
