@@ -1,7 +1,11 @@
-"""Pairs per second through the whole pipeline and the time of each stage: `python -m pytest -m benchmark -s`."""
+"""Pairs per second through the whole pipeline and the time of each stage: `python -m pytest -m benchmark -s`.
+
+OMNID_BENCHMARK_PROFILE: a profile, such as small.
+"""
 
 from __future__ import annotations
 
+import os
 import time
 from importlib.resources import files
 from pathlib import Path
@@ -13,7 +17,8 @@ from calib.kalibr import import_kalibr
 from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.log_reader import LogReader
-from omnid.config import Config
+from omnid.commands.config import PROFILES
+from omnid.config import load_config
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.run_summary import run_summary
 from omnid.engine.graph import Graph
@@ -25,6 +30,7 @@ from tests.replay.test_memory import to_and_fro
 
 TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"
 PAIRS = 300
+PROFILE = os.environ.get("OMNID_BENCHMARK_PROFILE", "")
 WANTED_HZ = 20.0
 
 
@@ -37,19 +43,23 @@ def recording() -> tuple[LogReader, Rig]:
 
 
 @pytest.mark.benchmark
+@pytest.mark.parametrize("hz", [10, 30])
 @pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
-def test_pairs_per_second(tmp_path: Path, threaded: bool) -> None:
+def test_pairs_per_second(tmp_path: Path, threaded: bool, hz: int) -> None:
+    """hz: pairs a second by their stamps; the map takes 5 of them."""
     reader, rig = recording()
-    config, frames, statistics = Config(), list(reader.frames()), RunStatistics()
+    config = load_config(None, PROFILES[PROFILE] if PROFILE else ())
+    frames, statistics = list(reader.frames()), RunStatistics()
     cv2.setNumThreads(config.graph.opencv_threads)
     place = geometry(with_rims(rig, frames), config.panorama)
     graph = Graph(threaded=threaded)
     sinks = Sinks({"statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "t")},
                   {"map": MapFile(tmp_path / "m")})
-    read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
+    read = graph.source("read", lambda: to_and_fro(frames, PAIRS, round(1e9 / hz)))
     wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)
-    print(f"\n{rate_hz:.1f} pairs/s\n{run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary())}")
+    summary = run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary())
+    print(f"\n{rate_hz:.1f} pairs/s of {hz} Hz, profile {PROFILE or 'none'}\n{summary}")
     assert not threaded or rate_hz >= WANTED_HZ
