@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -71,6 +71,19 @@ class Rig:
     def baseline_m(self) -> float:
         """Return the distance of the two viewpoints [m]."""
         return float(np.linalg.norm(self.upper.viewpoint - self.lower.viewpoint))
+
+    def with_upper_moved(self, turn: Array, direction: Array, longer_m: float = 0.0) -> Rig:
+        """Return the rig with its upper camera moved in the rectified frame, the lower one kept.
+
+        turn (3,): rotation vector [rad], R = exp(turn) R_before; direction (2,): the viewpoint lies along (e_x, e_y, 1)
+        at the baseline plus longer_m.
+        """
+        R_rig_rect = self.T_rect_rig[:3, :3].T
+        along = np.array([*direction, 1.0]) / np.linalg.norm([*direction, 1.0])
+        viewpoint = self.lower.viewpoint + (self.baseline_m + longer_m) * R_rig_rect @ along
+        R_rig_upper = R_rig_rect @ se3.rotation_exp(turn) @ R_rig_rect.T @ self.upper.T_cam_rig[:3, :3].T
+        T_upper_rig = se3.inverse(se3.transform(R_rig_upper, viewpoint))
+        return replace(self, upper=replace(self.upper, T_cam_rig=T_upper_rig))
 
     @property
     def T_rect_rig(self) -> Array:

@@ -91,16 +91,11 @@ class RigParameters:
     def at(self, steps: Array) -> Rig:
         """Return the rig after steps (P,); CalibError where there is no such camera."""
         first, second = len(self.lower.names), len(self.lower.names) + len(self.upper.names)
-        rig, turn = self.rig, steps[second:second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
-        R_rect_rig = rig.T_rect_rig[:3, :3]
-        along = np.array([turn[3], turn[4], 1.0]) / np.linalg.norm([turn[3], turn[4], 1.0])
-        viewpoint = rig.lower.viewpoint + rig.baseline_m * R_rect_rig.T @ along
-        R_rig_upper = R_rect_rig.T @ se3.rotation_exp(turn[:3]) @ R_rect_rig @ rig.upper.T_cam_rig[:3, :3].T
+        turn = steps[second:second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
+        rig = self.rig.with_upper_moved(turn[:3], turn[3:])
         cameras = [_with_wavefront(own.camera_at(part), wavefront) for own, part, wavefront in zip(
             (self.lower, self.upper), (steps[:first], steps[first:second]), self.wavefronts_at(steps), strict=True)]
-        lower = replace(rig.lower, camera=cameras[0])
-        upper = replace(rig.upper, camera=cameras[1],
-                        T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
+        lower, upper = replace(rig.lower, camera=cameras[0]), replace(rig.upper, camera=cameras[1])
         return replace(rig, lower=lower, upper=upper, covariance=None, times=self.times_at(steps))
 
     def transform_steps(self, rig: Rig) -> Array:

@@ -96,9 +96,4 @@ def apply_drift(rig: Rig, drift: RigDrift) -> Rig:
 
     The covariance is left out: that of the former calibration does not describe the new transform.
     """
-    R_rig_rect = se3.inverse(rig.T_rect_rig)[:3, :3]
-    along = np.array([*drift.shift, 1.0]) / np.linalg.norm([*drift.shift, 1.0])
-    viewpoint = rig.lower.viewpoint + rig.baseline_m * R_rig_rect @ along
-    R_rig_upper = R_rig_rect @ se3.rotation_exp(drift.turn) @ R_rig_rect.T @ rig.upper.T_cam_rig[:3, :3].T
-    T_upper_rig = se3.inverse(se3.transform(R_rig_upper, viewpoint))
-    return replace(rig, upper=replace(rig.upper, T_cam_rig=T_upper_rig), covariance=None)
+    return replace(rig.with_upper_moved(drift.turn, drift.shift), covariance=None)

@@ -76,12 +76,8 @@ def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
     r_x, r_y, r_z, e_x, e_y, longer = (change.pop(name, 0.0) for name in TRANSFORM_NAMES)
     if change:
         raise CalibError(f"covariance: the rig has no parameter {next(iter(change))!r}")
-    R_rig_rect = rig.T_rect_rig[:3, :3].T
-    along = np.array([e_x, e_y, 1.0]) / np.linalg.norm([e_x, e_y, 1.0])
-    viewpoint = rig.lower.viewpoint + (rig.baseline_m + longer) * R_rig_rect @ along
-    R_rig_upper = R_rig_rect @ se3.rotation_exp([r_x, r_y, r_z]) @ R_rig_rect.T @ rig.upper.T_cam_rig[:3, :3].T
-    upper = replace(rig.upper, camera=cameras[1], T_cam_rig=se3.inverse(se3.transform(R_rig_upper, viewpoint)))
-    return replace(rig, lower=replace(rig.lower, camera=cameras[0]), upper=upper)
+    moved = rig.with_upper_moved(np.array([r_x, r_y, r_z]), np.array([e_x, e_y]), longer)
+    return replace(moved, lower=replace(moved.lower, camera=cameras[0]), upper=replace(moved.upper, camera=cameras[1]))
 
 
 def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
