@@ -68,6 +68,17 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
     return CharucoBoard(columns, rows, args.square_mm / 1e3, args.marker_mm / 1e3, name, args.legacy_charuco)
 
 
+def options_of(args: argparse.Namespace) -> list[str]:
+    """Return the options that describe the board, as words of a command line."""
+    words = [] if args.board == "checkerboard" else ["--board", args.board]
+    for name in ALL:
+        value = getattr(args, name)
+        if value not in (None, False):
+            words.append("--" + name.replace("_", "-"))
+            words += [] if value is True else ["x".join(map(str, value)) if isinstance(value, tuple) else f"{value}"]
+    return [f"{float(word):g}" if word.replace(".", "", 1).isdigit() else word for word in words]
+
+
 def length_option(args: argparse.Namespace) -> tuple[str, float]:
     """Return the option that scales the board, and its value [mm]."""
     return ("--tag-mm", args.tag_mm) if args.board == "aprilgrid" else ("--square-mm", args.square_mm)

@@ -16,6 +16,9 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
               "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786"),
     "demo": ("demo", "demo --output /tmp/demo --quiet"),
     "eval": ("eval est.txt truth.txt",),
+    "calibrate board": ("calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
+                        "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 "
+                        "--dictionary 5X5_100 -o board.pdf"),
     "calibrate camera": ("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),
     "calibrate rig": ("calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml",
                       "calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml"),

@@ -1,0 +1,32 @@
+"""`omnid calibrate board`: a board to print, true to scale."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+
+from omnid.commands.board_options import add_board_options, board_of, options_of
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `board` to the actions of `calibrate`."""
+    from omnid.calibration.printable_board import PAPERS_MM
+
+    parser = subparsers.add_parser("board", help="a board to print, true to scale, with a ruler to check the print")
+    add_board_options(parser)
+    parser.add_argument("--paper", choices=sorted(PAPERS_MM), default="a4",
+                        help="default %(default)s, either way round")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.pdf")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the PDF."""
+    from omnid.calibration.printable_board import board_pdf
+
+    board, options = board_of(args), shlex.join(options_of(args))
+    args.output.write_bytes(board_pdf(board, args.paper, options))
+    print(f"{args.output}: {board}; print it at 100 % on {args.paper}, measure the line of 100 mm, then: "
+          f"omnid calibrate rig LOG {options} -o rig.toml")
+    return 0
