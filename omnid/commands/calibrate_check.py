@@ -21,6 +21,7 @@ from omnid.runs.log_rig import attached_rig
 from omnid.sinks.files import check_outputs
 
 REFINEMENTS = 3
+MAX_SKEW_S = 3e-3  # median of the pairs: more is no scatter of stamps
 # No mirror moves this far to the side [deg of the baseline]; a camera's centre that is some pixels off has this effect.
 NO_MIRROR_DEG = 5.0
 RECALIBRATE = ("the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board")
@@ -54,12 +55,27 @@ def run(args: argparse.Namespace) -> int:
         pairs = read_rig_pairs(reader, rig)
     finally:
         reader.close()
+    skewed = _skewed(pairs)
+    if skewed and args.refine:
+        raise OmnidError(f"calibrate check: --refine would take motion for a drift: {skewed}; `omnid calibrate drive` "
+                         "calibrates such a rig")
     found = check_rig(pairs, rig, Config().panorama)
     _require_matches(found.finding, len(pairs))
     print(report(found, len(pairs)))
+    if skewed:
+        print(f"this holds only for a robot that stands: {skewed}, and the motion in between looks like a drift; the "
+              "check at the start of `omnid replay` allows for it")
     if args.refine:
         _refine(rig, pairs, found, args.output)
     return 0 if found.good else 1
+
+
+def _skewed(pairs: list[FramePair]) -> str:
+    """Return that the cameras are not synchronised; empty if they are."""
+    skew_s = float(np.median([pair.skew_s for pair in pairs]))
+    if abs(skew_s) < MAX_SKEW_S:
+        return ""
+    return f"the upper images are {1e3 * abs(skew_s):.1f} ms {'later' if skew_s > 0 else 'earlier'} than the lower ones"
 
 
 def _require_matches(finding: RigFinding, pairs: int) -> None:

@@ -42,6 +42,17 @@ def test_images_that_are_not_synchronous_make_pairs(tmp_path: Path) -> None:
     assert [pair.skew_s for pair in found] == pytest.approx([0.04] * 4)
 
 
+def test_motion_between_the_exposures_is_no_drift_to_correct(tmp_path: Path, capsys: pytest.CaptureFixture[str]
+                                                             ) -> None:
+    run = build("two_walls", 3, 256, 8)
+    write_log(tmp_path, run.rig, run.poses, run.scene, readout=Readout(skew_ms=(-20.0, -20.0)), supersample=1)
+    words = ["calibrate", "check", str(tmp_path / "log.mcap"), "--rig", str(tmp_path / "rig.toml")]
+    main(words)
+    assert "only for a robot that stands: the upper images are 20.0 ms earlier" in capsys.readouterr().out
+    assert main([*words, "--refine", "-o", str(tmp_path / "new.toml")]) == 2
+    assert "calibrate drive" in capsys.readouterr().err and not (tmp_path / "new.toml").exists()
+
+
 def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
     found = check_rotated(scene, pairs, (0, 0, 0))
     assert found.good and found.finding.condition == "good" and found.finding.turn_deg < 0.05
