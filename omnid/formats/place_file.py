@@ -24,7 +24,7 @@ from omnid.errors import OmnidError
 from omnid.formats import place_rows
 from omnid.formats.place_rows import BadRowError
 
-VERSION: Final = 1
+VERSION: Final = 1  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
