@@ -152,14 +152,8 @@ def _covariance(matrix: ArrayLike) -> Array:
     return flat
 
 
-def odometry_cdr(
-    stamp_ns: int,
-    T_odom_base: Array,
-    covariance: Array,
-    velocity: Array,
-    velocity_covariance: Array,
-    frames: Frames = ("odom", "base_link"),
-) -> bytes:
+def odometry_cdr(stamp_ns: int, T_odom_base: Array, covariance: Array, velocity: Array, velocity_covariance: Array,
+                 frames: Frames = ("odom", "base_link")) -> bytes:
     """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
     parent, child = frames
     twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
