@@ -45,7 +45,6 @@ START_DISTORTION = ("p1", "p2")  # until the model is chosen
 MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
 MAX_CHANGE_SIGMAS = 4.0  # of a nominal rig's sigmas: intrinsics
 TIMES = (UPPER_DELAY, LINE_TIME)
-DIRECTION_NAMES = TRANSFORM_NAMES[3:]
 SYNCHRONOUS_S = 3e-3  # largest difference of stamps during which nothing moves that counts
 # Times below these are those of synchronous cameras with global shutters.
 MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
@@ -237,12 +236,11 @@ def _straightened(log: Path, parameters: RigParameters, topics: Topics, config: 
     # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     prior = prior_information(parameters, rig)
-    apart_s = float(np.median([abs(pair.skew_s) for pair in pairs]))
+    if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:
+        return steps  # the motion between the exposures would look like errors of the centres
     for _ in range(PAIR_ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
         steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)
-        if apart_s > SYNCHRONOUS_S:  # the motion between the exposures looks like a direction of the baseline
-            steps[[parameters.names.index(name) for name in DIRECTION_NAMES]] = 0.0
     finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
     report(finding.summary)
     return steps
