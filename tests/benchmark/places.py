@@ -187,6 +187,9 @@ def queries_text(answers: Sequence[Answer]) -> str:
             f"{sum(math.isinf(answer.time_s) for answer in answers)} not localised; p95 of the time "
             f"{times[int(0.95 * len(times))]:.1f} s; longest processor time of a search "
             f"{1e3 * max(answer.work_s for answer in answers):.0f} ms")
+    for number, answer in enumerate(answers):
+        if answer.is_wrong:
+            text += f"; wrong: {number} by {answer.error_m:.3f} m, {math.degrees(answer.error_rad):.2f}°"
     if right:
         text += (f"; errors p50 {1e3 * float(np.median([a.error_m for a in right])):.1f} mm, "
                  f"max {1e3 * max(a.error_m for a in right):.1f} mm, "
