@@ -105,7 +105,7 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
         log = _local(job.log, folder)
     except Exception as error:  # any of the many that the file systems raise
         return {"status": FAILED, "error": one_line(error)}
-    outputs = ["--tum", "est.txt", "--map", "map.ply", "--plan", "plan.png"]
+    outputs = ["--tum", "est.txt", "--map-tum", "map_est.txt", "--cloud", "cloud.ply", "--plan", "plan.png"]
     if job.options.record:
         outputs += ["--record", "recording.mcap"]
     code, text = _omnid(["replay", str(log), *job.options.arguments, *outputs, "--inline", "--quiet", "--json"], folder,

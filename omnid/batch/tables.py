@@ -86,7 +86,7 @@ def _row(result: JobResult, out: Path) -> tuple[str, ...]:
             f"{result.seconds:.1f} s")
 
 
-_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"), ("map.ply", "map"),
+_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"), ("map_est.txt", "path in the map"), ("cloud.ply", "cloud"),
                  ("messages.txt", "messages"))
 
 

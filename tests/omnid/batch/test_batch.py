@@ -68,12 +68,12 @@ def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: 
     good, out = short_log(tmp_path / "logs" / "day1" / "log.mcap"), tmp_path / "out"
     short_log(tmp_path / "logs" / "day2" / "log.mcap", BYTES + 60_000)
     (tmp_path / "logs" / "broken.mcap").write_text("no log")
-    single = omnid("replay", good, "--tum", tmp_path / "est.txt", "--map", tmp_path / "map.ply", "--plan",
+    single = omnid("replay", good, "--tum", tmp_path / "est.txt", "--cloud", tmp_path / "cloud.ply", "--plan",
                    tmp_path / "plan.png", "--quiet")
     assert single.returncode == 0
     done = omnid("batch", tmp_path / "logs", "--out", out, "--jobs", 2)
     assert done.returncode == 1 and "2 ok, 1 failed" in done.stdout, done.stderr
-    for name in ("est.txt", "map.ply", "plan.png"):
+    for name in ("est.txt", "cloud.ply", "plan.png"):
         assert (out / "day1-log" / name).read_bytes() == (tmp_path / name).read_bytes()
     found = rows(out)
     assert [found[name]["status"] for name in ("broken", "day1-log", "day2-log")] == ["failed", "ok", "ok"]
