@@ -86,8 +86,8 @@ def _row(result: JobResult, out: Path) -> tuple[str, ...]:
             f"{result.seconds:.1f} s")
 
 
-_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"), ("map_est.txt", "path in the map"), ("cloud.ply", "cloud"),
-                 ("messages.txt", "messages"))
+_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"),
+                 ("map_est.txt", "path in the map"), ("cloud.ply", "cloud"), ("messages.txt", "messages"))
 
 
 def _metres(value: float, digits: int = 2) -> str:
