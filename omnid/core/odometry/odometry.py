@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY, ExposureVelocity
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
+from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
@@ -46,19 +46,6 @@ START_ROUNDS = 2  # of starting a map again, once the velocity is known
 # start of the refinement, which aligns the patches of all landmarks.
 TRACKED_SHARE = 0.6
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
-
-
-class KeyframeLocaliser(Protocol):
-    """A bounded store of keyframes that gives the pose of a frame among them; see core/places."""
-
-    def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
-        """Keep a keyframe and its frame."""
-
-    def clear(self) -> None:
-        """Drop all keyframes."""
-
-    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
-        """Return the pose of a frame among the keyframes; None if it fits none."""
 
 
 class VisualOdometry:
