@@ -28,9 +28,10 @@ def run(args: argparse.Namespace) -> int:
     from omnid.runs.replay import ReplayOptions
 
     _make_folder(args.output)
-    tum, others = args.output / "trajectory.tum", {"map": "map.ply", "plan": "plan.png", "record": "log.mcap"}
-    options = ReplayOptions(tum=tum, **{option: args.output / name for option, name in others.items()}, publish=True,
-                            bus_optional=True, realtime=True, settings=args.config)
+    tum = args.output / "trajectory.tum"
+    options = ReplayOptions(tum=tum, cloud=args.output / "map.ply", plan=args.output / "plan.png",
+                            record=args.output / "log.mcap", publish=True, bus_optional=True, realtime=True,
+                            settings=args.config)
     config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3",
                                        *args.overrides])
     sample = files("omnid.sample")
