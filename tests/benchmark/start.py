@@ -1,0 +1,84 @@
+"""Time from the start of a program to its first result, on an idle machine: `python -m tests.benchmark.start`.
+
+`omnid demo`: to the first line with pairs, on a terminal. `omnid run` on the sample log: to the first pose that a
+client receives. The others: the whole command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pty
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.resources import files
+from pathlib import Path
+
+from omnid.client import Unreachable, subscribe
+from tests.omnid.transport.bus_fixtures import free_endpoint
+
+SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
+COMMANDS = (("--version",), ("replay", "--help"), ("--help",))
+
+
+def demo_s(folder: Path) -> float:
+    """Return the time to the first line of the demo that counts pairs."""
+    start_s = time.monotonic()
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-m", "omnid", "demo", "--output", str(folder)])
+    shown = b""
+    while b"pairs/s" not in shown:
+        shown += os.read(terminal, 4096)
+    taken_s = time.monotonic() - start_s
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    os.close(terminal)
+    return taken_s
+
+
+def first_pose_s() -> float:
+    """Return the time to the first pose of a daemon."""
+    endpoint, start_s = free_endpoint(), time.monotonic()
+    command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--set", f'bus.listen=["{endpoint}"]']
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as daemon:
+        while True:
+            try:
+                with subscribe(connect=(endpoint,)) as poses:
+                    next(iter(poses))
+                break
+            except Unreachable:
+                time.sleep(0.01)
+        taken_s = time.monotonic() - start_s
+        daemon.terminate()
+    return taken_s
+
+
+def command_s(words: tuple[str, ...]) -> float:
+    """Return the time of a command."""
+    start_s = time.monotonic()
+    subprocess.run([sys.executable, "-m", "omnid", *words], stdout=subprocess.DEVNULL, check=True)
+    return time.monotonic() - start_s
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=5)
+    count = parser.parse_args().runs
+    with tempfile.TemporaryDirectory() as folder:
+        rows = {"`omnid demo`: first line": [demo_s(Path(folder) / str(run)) for run in range(count)]}
+    rows["`omnid run`: first pose"] = [first_pose_s() for _ in range(count)]
+    for words in COMMANDS:
+        rows[f"`omnid {' '.join(words)}`"] = [command_s(words) for _ in range(count)]
+    print(f"| | median of {count} | smallest, largest |\n|---|---|---|")
+    for name, times_s in rows.items():
+        print(f"| {name} | {statistics.median(times_s):.2f} s | {min(times_s):.2f}, {max(times_s):.2f} s |")
+
+
+if __name__ == "__main__":
+    main()
