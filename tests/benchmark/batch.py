@@ -1,0 +1,95 @@
+"""`omnid batch` on many short logs: one and two programs at a time, and two dask workers of which one is killed.
+
+`python -m tests.benchmark.batch [--logs 50]`; dask needs the extra `fleet`. The logs are starts of the sample of
+different lengths: recordings that were cut. Each est.txt and cloud.ply is compared with that of the first series.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+
+from omnid.batch.tables import CSV_FILE
+
+SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
+FIRST_BYTES, STEP_BYTES = 600_000, 20_000
+KILLED_AFTER_S = 8.0
+
+
+def batch(logs: Path, out: Path, *words: str) -> tuple[float, Counter[str], int]:
+    """Run a batch; return its time, the results by state, and the number of attempts beyond the first."""
+    start_s = time.monotonic()
+    subprocess.run([sys.executable, "-m", "omnid", "batch", str(logs), "--out", str(out), *words], check=True,
+                   capture_output=True)
+    results = [json.loads(path.read_text()) for path in out.glob("*/result.json")]
+    assert (out / CSV_FILE).exists()
+    return (time.monotonic() - start_s, Counter(result["status"] for result in results),
+            sum(result["attempts"] - 1 for result in results))
+
+
+@contextmanager
+def dask(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Run a scheduler and two workers; yield its address and the workers."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with ExitStack() as ends:
+        known = folder / "scheduler.json"
+        scheduler = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
+                                      "--port", "0", "--no-dashboard", "--scheduler-file", str(known)], **quiet)
+        ends.callback(scheduler.kill)
+        while not known.exists():
+            time.sleep(0.1)
+        address = json.loads(known.read_text())["address"]
+        workers = [subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1",
+                                     "--no-dashboard", "--no-nanny", "--local-directory", str(folder)], **quiet)
+                   for _ in range(2)]
+        for worker in workers:
+            ends.callback(worker.kill)
+        yield address, workers
+
+
+def same(first: Path, other: Path) -> bool:
+    """True if both series have the same trajectories and clouds."""
+    return all((other / path.relative_to(first)).read_bytes() == path.read_bytes()
+               for name in ("est.txt", "cloud.ply") for path in first.glob(f"*/{name}"))
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--logs", type=int, default=50)
+    count = parser.parse_args().logs
+    print(f"| {count} logs | time | results | repeated | same bytes |\n|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        top = Path(folder)
+        logs = top / "logs"
+        logs.mkdir()
+        sample = SAMPLE.read_bytes()
+        for number in range(count):
+            (logs / f"{number:03d}.mcap").write_bytes(sample[: FIRST_BYTES + STEP_BYTES * number])
+        for jobs in (1, 2):
+            taken_s, states, repeated = batch(logs, top / f"jobs{jobs}", "--jobs", str(jobs))
+            equal = same(top / "jobs1", top / f"jobs{jobs}")
+            print(f"| {jobs} at a time | {taken_s:.0f} s | {dict(states)} | {repeated} | {equal} |", flush=True)
+        if find_spec("distributed") is None:
+            return
+        with dask(top) as (address, workers):
+            threading.Timer(KILLED_AFTER_S, workers[0].kill).start()
+            taken_s, states, repeated = batch(logs, top / "dask", "--dask", address)
+        equal = same(top / "jobs1", top / "dask")
+        print(f"| two dask workers, one killed after {KILLED_AFTER_S:g} s | {taken_s:.0f} s | {dict(states)} "
+              f"| {repeated} | {equal} |")
+
+
+if __name__ == "__main__":
+    main()
