@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import MAX_SIDE, MAX_SQUARE_M, MIN_SQUARE_M
+from calib.boards.board import MAX_SIDE, MAX_SQUARE_M, MIN_SQUARE_M, grid_points
 from calib.errors import CalibError
 from calib.models.camera import Array
 
@@ -66,8 +66,7 @@ class CharucoBoard:
     @property
     def points(self) -> Array:
         """Return the inner corners (N, 3) [m], row by row from the first one, z 0."""
-        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_m, float)
+        return grid_points(self.columns, self.rows, self.square_m)
 
     @property
     def window(self) -> float:

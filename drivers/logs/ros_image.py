@@ -44,7 +44,7 @@ def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) 
     aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
     """
     try:
-        members = _CdrReader(message) if aligned else _Ros1Reader(message)
+        members = _cdr_members(message) if aligned else _MemberReader(message, "<", aligned=False)
         stamp_ns = _header(members)
         return _raw(members, stamp_ns) if schema_name == IMAGE else _compressed(members, stamp_ns)
     except struct.error as error:
@@ -53,7 +53,8 @@ def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) 
 
 def _header(members: _MemberReader) -> int:
     """Return the stamp of a std_msgs/Header [ns]."""
-    members.sequence_number()
+    if not members.aligned:
+        members.number("I")  # the sequence number that a header has in ROS 1
     seconds, nanoseconds = members.number("i"), members.number("I")
     if seconds < 0 or nanoseconds >= 10**9:
         raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
@@ -85,17 +86,14 @@ def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
 class _MemberReader:
     """Reads the members of a message in order; raises struct.error at the end of the bytes."""
 
-    def __init__(self, body: memoryview, order: str) -> None:
-        """order: "<" little endian, ">" big endian."""
-        self._order, self._body, self._offset = order, body, 0
-
-    def sequence_number(self) -> None:
-        """Skip the number that a header begins with in ROS 1."""
+    def __init__(self, body: memoryview, order: str, aligned: bool) -> None:
+        """order: "<" little endian, ">" big endian. aligned: each number begins at a multiple of its size."""
+        self._order, self._body, self.aligned, self._offset = order, body, aligned, 0
 
     def number(self, code: str) -> int:
         """Return a number; code: its format in struct."""
         size = struct.calcsize("=" + code)
-        self._offset += self._padding(size)
+        self._offset += -self._offset % size if self.aligned else 0
         value: int = struct.unpack_from(self._order + code, self._body, self._offset)[0]
         self._offset += size
         return value
@@ -113,33 +111,9 @@ class _MemberReader:
         """Return a string, truncated to 256 bytes."""
         return bytes(self.octets()[:_MAX_STRING]).rstrip(b"\0").decode("utf-8", "replace")
 
-    def _padding(self, size: int) -> int:
-        """Return the bytes that are left out before a number of this size."""
-        raise NotImplementedError
 
-
-class _CdrReader(_MemberReader):
-    """Members in CDR."""
-
-    def __init__(self, message: memoryview) -> None:
-        if len(message) < _CDR_HEADER_BYTES or message[0] != 0 or message[1] not in (0, 1):
-            start = bytes(message[:_CDR_HEADER_BYTES]).hex()
-            raise FrameDecodeError(f"a message starts with {start}, not with a CDR header")
-        super().__init__(message[_CDR_HEADER_BYTES:], "<" if message[1] else ">")  # CDR_LE or CDR_BE
-
-    def _padding(self, size: int) -> int:
-        return -self._offset % size
-
-
-class _Ros1Reader(_MemberReader):
-    """Members as ROS 1 serialises them."""
-
-    def __init__(self, message: memoryview) -> None:
-        super().__init__(message, "<")
-
-    def sequence_number(self) -> None:
-        """Skip the number."""
-        self.number("I")
-
-    def _padding(self, size: int) -> int:
-        return 0
+def _cdr_members(message: memoryview) -> _MemberReader:
+    if len(message) < _CDR_HEADER_BYTES or message[0] != 0 or message[1] not in (0, 1):
+        start = bytes(message[:_CDR_HEADER_BYTES]).hex()
+        raise FrameDecodeError(f"a message starts with {start}, not with a CDR header")
+    return _MemberReader(message[_CDR_HEADER_BYTES:], "<" if message[1] else ">", aligned=True)  # CDR_LE or CDR_BE
