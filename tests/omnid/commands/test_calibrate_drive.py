@@ -79,7 +79,8 @@ def test_a_disturbed_rig_is_put_right(tmp_path: Path, capsys: pytest.CaptureFixt
     code = calibrate(tmp_path / "rooms" / "log.mcap", "--rig", tmp_path / "wrong.toml", "-o", tmp_path / "better.toml")
     assert code == 0 and "lengths change by" in capsys.readouterr().out
     before, after = (errors(tmp_path / "two_walls", tmp_path / name) for name in ("wrong.toml", "better.toml"))
-    # The ATE from the first pose contains the direction of the rig frame, which a drive on a plane hardly shows.
+    # The bound of the ATE is loose: 2.8 mm were measured with patches of planes, below 2 mm before; the cause is not
+    # known. It counts from the first pose, so the direction of the rig frame is part of it.
     assert abs(after[0]) < 8e-4 and after[1] < 4e-3 < before[1]
     assert np.isclose(read_rig(tmp_path / "better.toml").baseline_m, truth.baseline_m)
 
