@@ -9,7 +9,8 @@ from typing import Final
 
 # Words after `omnid` of a command without subcommands -> its examples, without `omnid`.
 EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
-    "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated"),
+    "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated",
+            "run --lower /dev/video0 --upper /dev/video2 --rig rig.toml"),
     "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
                "replay drive.mcap --record out.mcap --method paper"),
     "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
@@ -36,7 +37,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "view": ("view out.mcap", "view out.mcap -o out.rrd"),
     "web": ("web", "web --connect tcp/robot:7447",
             "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml"),
-    "record": ("record recordings/ --rig rig.toml",),
+    "record": ("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
     "report": ("report out.mcap -o report.html",),
     "log info": ("log info recordings/*.mcap",),
     "log recover": ("log recover robot_20260131T235900Z_001.mcap.part",),

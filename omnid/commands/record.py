@@ -21,6 +21,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         help="folder of the files; default: record.folder of the settings")
     parser.add_argument("--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it "
                         "exists")
+    for camera in ("lower", "upper"):
+        parser.add_argument(f"--{camera}", metavar="DEVICE", help=f"the {camera} camera; default: cameras.{camera} of "
+                            "the settings")
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -32,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import load_config
     from omnid.runs.record import record
 
-    named = {"record.folder": args.folder, "cameras.rig": args.rig}
+    named = {"record.folder": args.folder, "cameras.rig": args.rig, "cameras.lower": args.lower,
+             "cameras.upper": args.upper}
     config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, Camera] = ("lower", "upper")

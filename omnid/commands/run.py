@@ -30,6 +30,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
     parser.add_argument("--log", type=Path, metavar="LOG", help="use the images of a log instead of cameras, for a "
                         "trial: in real time, forwards and backwards until it is stopped")
+    for camera in ("lower", "upper"):
+        parser.add_argument(f"--{camera}", metavar="DEVICE|TOPIC", help=f"device of the {camera} camera; default: "
+                            f"cameras.{camera} of the settings; with --log the topic of its images, default: found by "
+                            "name")
     parser.add_argument("--pace", type=float, default=1.0,
                         help="speed of the log relative to its recording; default %(default)s")
     parser.add_argument("--once", action="store_true", help="stop at the end of the log")
@@ -48,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from omnid.runs.live import LiveRun
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
+    if args.log is None:
+        named |= {"cameras.lower": args.lower, "cameras.upper": args.upper}
     shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
     config = load_config(args.config, [*args.overrides, *shortcuts, *map_settings(args)])
     for warning in unused_settings(config, "run", args.overrides):
@@ -57,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         _require_no_log_options(args)
         return LiveRun(config, _devices(config), log, show=show).run()
     config = replace(config, controller=config.controller.of_log)  # the log's images do not follow the wheels
-    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args.log), show).run()
+    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args), show).run()
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:
@@ -77,7 +83,7 @@ def _devices(config: Config) -> OpenCamera:
 def _recorded(args: argparse.Namespace) -> OpenCamera:
     from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
 
-    images = LogImages.load(args.log)
+    images = LogImages.load(args.log, args.lower, args.upper)
     clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened
     opened: Counter[Camera] = Counter()
 
@@ -88,9 +94,9 @@ def _recorded(args: argparse.Namespace) -> OpenCamera:
     return open_camera
 
 
-def _rig_of(log: Path) -> Rig:
+def _rig_of(args: argparse.Namespace) -> Rig:
     from drivers.logs.log_reader import LogReader
     from omnid.runs.log_rig import attached_rig
 
-    with closing(LogReader(log)) as reader:
-        return attached_rig(reader, log)
+    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        return attached_rig(reader, args.log)
