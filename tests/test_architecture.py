@@ -126,6 +126,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.settings": "calib.bounded_toml omnid.errors",
     "omnid.settings_dump": "omnid.settings",
     "omnid.settings_migration": "omnid.settings",
+    "omnid.simulation": "",
+    "omnid.simulation.rendering": "calib.models calib.rig calib.se3",
     "omnid.sinks":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
         "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.errors omnid.formats "

@@ -29,11 +29,11 @@ from omnid.calibration.drive import calibrate_drive
 from omnid.cli import main as omnid_main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 from tests.simulation.logs import write_log
 from tests.simulation.recipes import build, mild_rig
 from tests.simulation.rigs import with_real_mirrors
-from tests.simulation.sensor import Exposure, Sensor
 
 BOARD = Board(9, 6, 0.05)
 SENSOR = Sensor(noise_sigma=2.0)
@@ -59,7 +59,7 @@ def render_boards(seed: int, amount: float, folder: Path) -> None:
     for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
         made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
         for name, mounted in sides:
-            jpeg = Exposure.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
+            jpeg = MountedSensor.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
             (folder / f"{name}_{k:02d}.jpg").write_bytes(jpeg)
         corners.append([made[name].corners for name, _ in sides])
     np.save(folder / "corners.npy", np.array(corners))

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.boards.board import Board
 from calib.models.camera import Array, Mask
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.textures import value_noise
 from tests.benchmark.boards_rendered import BEHIND_THE_WALLS, HardBoard
 from tests.simulation.boards import SQUARE_PX as SQUARE_PX_OF_PRINT
 from tests.simulation.boards import BoardRenderer, board_pose
-from tests.simulation.sensor import Exposure, Sensor
-from tests.simulation.textures import value_noise
 
 Random = np.random.Generator
 SIZE, BOARDS = (1280, 800), (Board(8, 6, 0.03), Board(9, 6, 0.03), Board(7, 5, 0.04))
@@ -73,7 +73,7 @@ def render_near_board(seed: int, number: int) -> HardBoard:
                "shadow": rng.choice([1.0, rng.uniform(0.3, 0.8)])}
     T, blur = _near_pose(rng, camera, board), rng.uniform(*DEFOCUSED_PX)
     rendered, empty = (renderer.render_board(pose, **options) for pose in (T, BEHIND_THE_WALLS))
-    shape = Exposure.of(sensor, renderer.mounted.visible, SIZE)
+    shape = MountedSensor.of(sensor, renderer.mounted.visible, SIZE)
     images = [cv2.imdecode(np.frombuffer(shape.jpeg(_defocused(made.image, blur, number)), np.uint8),
                            cv2.IMREAD_GRAYSCALE).astype(np.uint8) for made in (rendered, empty)]
     name = (f"{number:03d} near {board.columns}x{board.rows} cover {cover:g} noise {sensor.noise_sigma:.1f} blur up to "

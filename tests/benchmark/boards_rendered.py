@@ -15,9 +15,9 @@ from calib.boards.board import Board
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from tests.simulation import textures
+from omnid.simulation.rendering import textures
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.simulation.boards import BoardRenderer, board_pose, in_view, six_walls
-from tests.simulation.sensor import Exposure, Sensor
 
 Random = np.random.Generator
 Image = NDArray[np.uint8]
@@ -57,7 +57,7 @@ def render_hard_board(seed: int, number: int) -> HardBoard:
              "contrast": (low, min(250.0, low + light)), "shadow": rng.choice([1.0, 1.0, rng.uniform(0.35, 0.8)])}
     rendered = renderer.render_board(_pose(rng, kind, renderer), **options)
     empty = renderer.render_board(BEHIND_THE_WALLS, **options)
-    exposure = Exposure.of(sensor, mask, size)
+    exposure = MountedSensor.of(sensor, mask, size)
     images = [cv2.imdecode(np.frombuffer(exposure.jpeg(made.image), np.uint8), cv2.IMREAD_GRAYSCALE)
                 for made in (rendered, empty)]
     name = (f"{number:03d} {kind} {size[0]}x{size[1]} {walls} {board.columns}x{board.rows} noise "

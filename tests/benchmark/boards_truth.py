@@ -24,8 +24,8 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from omnid.calibration.board_search import find_boards
 from omnid.calibration.image_pairs import PairedImages, read_pairs
+from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
-from tests.simulation.sensor import Sensor
 
 BOARD = Board(7, 6, 0.03)
 LIMITS = {"focal_percent": 0.05, "centre_px": 0.1, "turn_deg": 0.02, "baseline_mm": 0.3}

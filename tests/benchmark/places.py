@@ -32,12 +32,12 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.run_result import RunResult
+from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.replay.edited import images, save
 from tests.simulation.closed_worlds import ring, with_other_posters, with_people
-from tests.simulation.ray_caster import render_grey
 from tests.simulation.rigs import with_upper_rotated
 
 FALSE_M, FALSE_RAD = 0.1, math.radians(2)  # error of a loop that is a false one

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.models.camera import Array
-from tests.simulation import textures
-from tests.simulation.builders import CEILING_M, Point, box, posters, wall
+from omnid.simulation.rendering import textures
+from omnid.simulation.rendering.shapes import CEILING_M, Point, box, posters, wall
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation.paths import planar_poses
-from tests.simulation.surfaces import Rectangle, Scene
 
 PX_PER_M = 200.0  # resolution of floor and ceiling
 DOOR_M = (0.95, 2.1)  # width, height

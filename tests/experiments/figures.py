@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.models.camera import Array
+from omnid.simulation.rendering.surfaces import Rectangle
 from tests.simulation.recipes import SimulatedRun
-from tests.simulation.surfaces import Rectangle
 
 DPI = 110
 STYLES = (("0.65", ":"), ("0.5", "--"), ("0.0", "-"))

@@ -21,8 +21,8 @@ from calib import se3
 from calib.models.camera import Array, OmniCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from tests.simulation.sensor import Floats
-from tests.simulation.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.sensor import Floats
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 MIRROR_M = 0.01  # the conic's semi-latus rectum: radius of the mirror at the height of the viewpoint
 INSTALL = "apt-get install povray"

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from omnid.simulation.rendering.sensor import Floats
 from tests.experiments.povray import shoot, write_world
 from tests.simulation.logs import pack_log, write_log
 from tests.simulation.recipes import SimulatedRun
-from tests.simulation.sensor import Floats
 
 CAMERAS = ("lower", "upper")
 

@@ -12,14 +12,14 @@ from calib import se3
 from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.rigs import make_rig
 from tests.experiments.building import building
 from tests.experiments.povray import INSTALL, PovrayError, available, shoot, view_text, write_world
 from tests.experiments.rendering import cast_log, render_log
 from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
 from tests.experiments.truth import cast, sees, surface_distance_m
 from tests.experiments.views import Experiment
-from tests.simulation.ray_caster import render_grey
-from tests.simulation.rigs import make_rig
 
 needs_povray = pytest.mark.skipif(not available(), reason=f"POV-Ray is not installed: {INSTALL}")
 MISALIGNED = (1.0, -2.0, 20.0)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.models.camera import Array
-from tests.simulation.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 Indices = NDArray[np.intp]
 Flags = NDArray[np.bool_]

@@ -11,6 +11,7 @@ from calib import se3
 from calib.models.camera import Array
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.tum import Trajectory
+from omnid.simulation.rendering.surfaces import Rectangle
 from tests.experiments import figures
 from tests.experiments.estimation import Method, estimate
 from tests.experiments.path_following import METHODS as PATH_METHODS
@@ -18,7 +19,6 @@ from tests.experiments.path_following import THE_PAPER, against_truth
 from tests.experiments.truth import sees, surface_distance_m
 from tests.experiments.views import Experiment
 from tests.simulation.recipes import SimulatedRun
-from tests.simulation.surfaces import Rectangle
 
 METHODS: dict[str, Method] = {
     "the paper": THE_PAPER, "the paper without its Kalman filter": PATH_METHODS["the paper without its Kalman filter"],

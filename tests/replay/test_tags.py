@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from omnid.simulation.rendering.surfaces import Rectangle
 from tests.replay.command import Command
 from tests.simulation import Scene, build, write_log
-from tests.simulation.surfaces import Rectangle
 
 EDGE_M, QUIET_M = 0.6, 0.15  # of the black square, and the white border around it
 AT_START = np.array([0.9, 0.9, 0.1])  # m: the tag's middle in the rig frame of the first pair; it faces the rig's y

@@ -11,11 +11,11 @@ import sys
 import time
 from pathlib import Path
 
+from omnid.simulation.rendering.sensor import DIM
 from tests.simulation.logs import write_log
 from tests.simulation.readout import Readout
 from tests.simulation.recipes import RECIPES, build
 from tests.simulation.rigs import with_real_mirrors
-from tests.simulation.sensor import DIM
 
 
 def main() -> None:

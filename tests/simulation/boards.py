@@ -12,10 +12,10 @@ from calib import se3
 from calib.boards.board import Board
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
-from tests.simulation.ray_caster import render_grey
-from tests.simulation.sensor import Exposure, Sensor
-from tests.simulation.surfaces import Rectangle, Scene
-from tests.simulation.textures import value_noise
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.textures import value_noise
 
 # Side of a square in the board's texture.
 SQUARE_PX = 24
@@ -104,7 +104,7 @@ class BoardRenderer:
         board_poses_around_camera = clutter(rng) if walls is None else walls
         scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *board_poses_around_camera))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
-        exposure = Exposure.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
+        exposure = MountedSensor.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
         T_cam_board = self.mounted.T_cam_rig @ T_rig_board
         corners = self.mounted.camera.project(se3.apply(T_cam_board, self.board.points))
         return BoardImage(exposure.expose(ideal, rng), corners, T_cam_board)

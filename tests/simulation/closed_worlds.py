@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from calib.models.camera import Array
-from tests.simulation import textures
-from tests.simulation.builders import CEILING_M, PX_PER_M, Point, Random, box, corridor, posters, wall
+from omnid.simulation.rendering import textures
+from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, Point, Random, box, posters, wall
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from tests.simulation.builders import corridor
 from tests.simulation.paths import planar_poses
-from tests.simulation.surfaces import Rectangle, Scene
 
 KINDS = ("brick", "plaster", "granite", "plaster")
 FLAT_PX_PER_M = 160.0  # of floor and ceiling

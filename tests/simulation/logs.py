@@ -16,12 +16,12 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation.mirrors import MirrorCamera
-from tests.simulation.ray_caster import render_grey
 from tests.simulation.readout import Readout, body_twists
 from tests.simulation.rigs import nominal_rig
-from tests.simulation.sensor import Exposure, Floats, Sensor
-from tests.simulation.surfaces import Scene
 
 START_NS = 1_700_000_000_000_000_000
 # Delay from an image's stamp to its arrival at the recorder.
@@ -71,7 +71,7 @@ def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, 
     if not readout.is_synchronous:
         skews = readout.skew_ns(len(poses)).astype(np.int64)
     sensor = sensor or Sensor()
-    exposures = [Exposure.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+    exposures = [MountedSensor.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
     _write_rigs(folder, rig, exposures)
 
     def images() -> Images:
@@ -86,7 +86,7 @@ def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, 
     (folder / "log.mcap.part").replace(folder / "log.mcap")
 
 
-def _write_rigs(folder: Path, rig: Rig, exposures: list[Exposure]) -> None:
+def _write_rigs(folder: Path, rig: Rig, exposures: list[MountedSensor]) -> None:
     """Write the files that describe the rig."""
     if isinstance(rig.lower.camera, MirrorCamera):
         write_rig(folder / "nominal.toml", nominal_rig(rig))
@@ -160,7 +160,7 @@ def _unified(camera: OmniCamera) -> UnifiedCamera:
     return camera
 
 
-def _masked(mounted: MountedCamera, exposure: Exposure) -> MountedCamera:
+def _masked(mounted: MountedCamera, exposure: MountedSensor) -> MountedCamera:
     """Return the camera with a mask that excludes struts and hub."""
     clear = (255 * (exposure.hidden == 0)).astype(np.uint8)
     return replace(mounted, mask=replace(mounted.visible, image=clear))

@@ -11,10 +11,10 @@ from calib.boards.board import Board
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard, predefined
 from calib.models.camera import Array
 from calib.rig import MountedCamera
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation.boards import BoardImage, clutter
-from tests.simulation.ray_caster import render_grey
-from tests.simulation.sensor import Exposure, Sensor
-from tests.simulation.surfaces import Rectangle, Scene
 
 # Pixels of a charuco's square and of a tag's bit in the print; light margin in squares or tags.
 SQUARE_PX, BIT_PX, MARGIN = 56, 8, 0.5
@@ -51,7 +51,7 @@ def render_marker_board(mounted: MountedCamera, board: MarkerBoard, T_rig_frame:
     sheet = Rectangle(origin, right - origin, below - origin, print_.astype(np.uint8), "board")
     scene = Scene((sheet, *clutter(rng)))
     ideal = render_grey(scene, mounted, np.eye(4), 2)
-    exposure = Exposure.of(sensor or Sensor(), mounted.visible, mounted.camera.size)
+    exposure = MountedSensor.of(sensor or Sensor(), mounted.visible, mounted.camera.size)
     T_cam_board = mounted.T_cam_rig @ T_rig_frame @ T_frame_board
     return BoardImage(exposure.expose(ideal, rng), mounted.camera.project(se3.apply(T_cam_board, board.points)),
                       T_cam_board)

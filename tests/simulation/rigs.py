@@ -1,4 +1,4 @@
-"""Rigs of two cameras that look up into mirrors, with given misalignments."""
+"""Rigs of ray-traced mirrors, nominal rigs, and rigs that are wrong."""
 
 from __future__ import annotations
 
@@ -7,40 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib import se3
-from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
+from omnid.simulation.rendering.rigs import camera_pose
 from tests.simulation.mirrors import MirrorCamera
 
-# Radii of the horizon at scale 1 and of the mirror's rim, in parts of the image's width.
-HORIZON = 207.5676 / 768
-RIM = 373.0 / 768
-TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
-# The image's centre shows the floor; up in the image is forward, and the mirror's flip is in fu < 0.
 # Deviation of real mirrors: tilt of a camera below its mirror, shape, centre of the image.
 TILT_RAD, SHAPE, CENTRE_PX = np.deg2rad(0.7), 0.015, 3.0
-R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
-
-
-def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, rim: float = RIM, xi: float = 1.0,
-             misaligned_deg: tuple[float, float, float] = (0, 0, 0), offset_mm: tuple[float, float] = (0, 0),
-             lower_misaligned_deg: tuple[float, float, float] = (0, 0, 0),
-             lower_offset_mm: tuple[float, float] = (0, 0),
-             distortion: tuple[float, float, float, float] = (0, 0, 0, 0),
-             centre_px: tuple[float, float] = (0, 0)) -> Rig:
-    """Return a rig with its frame at the lower viewpoint, z up, unless lower_* are given.
-
-    misaligned_deg: rotation vector of the upper camera, in the rig frame, about its viewpoint, which lies offset_mm
-    (x, y) off the axis. scale: horizon radius; rim: mirror radius as fraction of size; centre_px moves the optical
-    centre (and the rim) off the image's centre.
-    """
-    focal = HORIZON * size * scale * (xi if xi > 0 else 1.0)
-    centre = ((size - 1) / 2 + centre_px[0], (size - 1) / 2 + centre_px[1])
-    camera = UnifiedCamera(xi, (-focal, focal), centre, (size, size), distortion)
-    mask = Mask(centre, 0.0, rim * size)
-    lower = MountedCamera(camera, _T_cam_rig(lower_misaligned_deg, (*lower_offset_mm, 0.0)), mask)
-    upper = MountedCamera(camera, _T_cam_rig(misaligned_deg, (*offset_mm, 1e3 * baseline_m)), mask)
-    return Rig(lower, upper, topics=TOPICS)
 
 
 def with_real_mirrors(rig: Rig, seed: int, amount: float = 1.0) -> Rig:
@@ -79,14 +52,9 @@ def nominal_rig(rig: Rig) -> Rig:
         centre = ((mirror.size[0] - 1) / 2, (mirror.size[1] - 1) / 2)
         cameras.append(UnifiedCamera(1.0, (-focal, focal), centre, mirror.size))
     ruler_mm = round(2e3 * rig.baseline_m) / 2
-    lower, upper = (MountedCamera(camera, _T_cam_rig((0, 0, 0), (0, 0, height_mm)))
+    lower, upper = (MountedCamera(camera, camera_pose((0, 0, 0), (0, 0, height_mm)))
                     for camera, height_mm in zip(cameras, (0.0, ruler_mm), strict=True))
     return Rig(lower, upper, rig.T_base_rig, rig.topics)
-
-
-def _T_cam_rig(misaligned_deg: tuple[float, float, float], viewpoint_mm: tuple[float, float, float]) -> Array:
-    R = se3.rotation_exp(np.deg2rad(misaligned_deg)) @ R_RIG_CAM
-    return se3.inverse(se3.transform(R, 1e-3 * np.array(viewpoint_mm)))
 
 
 def with_upper_rotated(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from calib import se3
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig
-from tests.simulation import RECIPES, Exposure, Sensor, build, make_rig, write_log
+from tests.simulation import RECIPES, MountedSensor, Sensor, build, make_rig, write_log
 from tests.simulation.paths import back_again, spline_path, turns
 from tests.simulation.recipes import TURN_DEG
 
@@ -107,8 +107,8 @@ def test_turns_and_return_path() -> None:
 
 def test_struts_and_hub_are_dark_and_fixed() -> None:
     rig = make_rig(size=SIZE)
-    exposure = Exposure.of(Sensor(strut_angles_deg=(0.0,), strut_width=0.05, hub=0.1, noise_sigma=0), rig.lower.visible,
-                           (SIZE, SIZE))
+    sensor = Sensor(strut_angles_deg=(0.0,), strut_width=0.05, hub=0.1, noise_sigma=0)
+    exposure = MountedSensor.of(sensor, rig.lower.visible, (SIZE, SIZE))
     image = exposure.expose(np.full((SIZE, SIZE), 200, np.float32), np.random.default_rng(0))
     middle = SIZE // 2
     assert image[middle, middle] < 30 and image[middle, SIZE - 10] < 30

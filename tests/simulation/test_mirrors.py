@@ -7,9 +7,9 @@ import numpy as np
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
+from omnid.simulation.rendering.ray_caster import render
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation.mirrors import MirrorCamera
-from tests.simulation.ray_caster import render
-from tests.simulation.surfaces import Rectangle, Scene
 
 CENTER, SIZE = (384.2, 381.1), (768, 768)
 NOMINAL = MirrorCamera(207.0, CENTER, SIZE)

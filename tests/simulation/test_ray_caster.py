@@ -8,8 +8,9 @@ import pytest
 
 from calib import se3
 from calib.rig import MountedCamera, Rig
-from tests.simulation import Rectangle, Scene, build, make_rig, ray_caster, render
-from tests.simulation.builders import wall
+from omnid.simulation.rendering import ray_caster
+from omnid.simulation.rendering.shapes import wall
+from tests.simulation import Rectangle, Scene, build, make_rig, render
 from tests.simulation.paths import planar_poses
 from tests.simulation.rigs import with_real_mirrors
 

@@ -16,8 +16,8 @@ from calib.errors import CalibError
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
+from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import SQUARE_PX, BoardRenderer, board_poses_around_camera, board_texture
-from tests.simulation.sensor import Sensor
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480))

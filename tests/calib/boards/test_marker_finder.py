@@ -13,9 +13,9 @@ from calib.errors import CalibError
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
+from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardImage, board_poses_around_camera
 from tests.simulation.marker_boards import frame_board, print_of, render_marker_board
-from tests.simulation.sensor import Sensor
 
 MOUNTED = MountedCamera(UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480)), np.eye(4),
                         Mask((241.3, 237.8), 40.0, 232.0))

@@ -18,8 +18,8 @@ from calib.fit.unified_fit import unified_from_ocam
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
+from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardRenderer, board_poses_around_camera
-from tests.simulation.sensor import Sensor
 
 BOTH: tuple[Model, Model] = ("ocam", "omni")
 BOARD = Board(7, 6, 0.03)

@@ -11,7 +11,7 @@ from calib.fit.drive_parameters import RigParameters
 from calib.fit.drive_prior import RULER_SIGMA_M, baseline_by_prior, nominal_sigmas, prior_information
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
-from tests.simulation.rigs import make_rig
+from omnid.simulation.rendering.rigs import make_rig
 
 NOMINAL = make_rig()
 NAMES = ("lower xi", "lower fu", *TRANSFORM_NAMES)

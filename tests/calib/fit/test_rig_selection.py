@@ -12,8 +12,9 @@ from calib.fit.rig_fit import PairView
 from calib.fit.rig_selection import SelectedRig, select_rig
 from calib.models.ocam import OcamCamera
 from calib.rig import Rig
+from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.boards import board_poses_around_rig
-from tests.simulation.rigs import make_rig, with_real_mirrors
+from tests.simulation.rigs import with_real_mirrors
 
 BOARD = Board(9, 6, 0.05)
 PERFECT = make_rig(baseline_m=0.18)

@@ -15,8 +15,8 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 from calib.rig_frame import rig_between
+from omnid.simulation.rendering.rigs import make_rig
 from tests.calib.fit.test_rig_fit import LOWER, ODD, RIG, UPPER, pairs
-from tests.simulation.rigs import make_rig
 
 
 def with_sigma(rig: Rig, name: str, sigma: float) -> Rig:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
-from tests.simulation.sensor import Exposure, Sensor
-from tests.simulation.textures import value_noise
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.textures import value_noise
 
 CENTER, RIM = (201.4, 197.2), 176.0
 SIZE = (400, 396)
@@ -19,7 +19,7 @@ SENSOR = Sensor(strut_angles_deg=(20.0, 140.0, 260.0), strut_width=0.03, hub=0.0
 
 def frames(count: int, sensor: Sensor = SENSOR) -> list[NDArray[np.uint8]]:
     ring = Mask(CENTER, 0.0, RIM)
-    exposure, rng = Exposure.of(sensor, ring, SIZE), np.random.default_rng(2)
+    exposure, rng = MountedSensor.of(sensor, ring, SIZE), np.random.default_rng(2)
     v, u = np.indices(SIZE[::-1])
     inside = np.hypot(u - CENTER[0], v - CENTER[1]) <= RIM
     worlds = [130 + 50 * value_noise(rng, SIZE, 60.0) for _ in range(count)]
@@ -30,7 +30,7 @@ def test_masks_rim_hub_and_struts() -> None:
     mask = find_mask(frames(10), (205.0, 200.0))
     assert mask.image is not None
     assert mask.center == pytest.approx(CENTER, abs=0.5) and mask.outer_px == pytest.approx(RIM - 1.5, abs=1.0)
-    hidden = Exposure.of(SENSOR, Mask(CENTER, 0.0, RIM), SIZE).hidden > 0.9
+    hidden = MountedSensor.of(SENSOR, Mask(CENTER, 0.0, RIM), SIZE).hidden > 0.9
     v, u = np.indices(SIZE[::-1])
     radius = np.hypot(u - CENTER[0], v - CENTER[1])
     assert (mask.image[hidden & (radius < RIM - 6)] == 0).mean() > 0.97

@@ -14,7 +14,8 @@ from calib.models.camera import Array
 from calib.rig import Rig, ShutterTimes
 from omnid.calibration.drive import is_nominal, require_same_rig, significant_times
 from omnid.errors import OmnidError
-from tests.simulation.rigs import make_rig, nominal_rig, with_real_mirrors
+from omnid.simulation.rendering.rigs import make_rig
+from tests.simulation.rigs import nominal_rig, with_real_mirrors
 
 MEASURED = make_rig(misaligned_deg=(0.6, -0.4, 0.5))
 

@@ -9,8 +9,8 @@ import pytest
 
 from calib import se3
 from omnid.calibration.drive_scale import level_turn, rescaled, turned_about_lower
+from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.paths import loop, spline_path, vibrate
-from tests.simulation.rigs import make_rig
 
 
 def test_a_rescaled_rig_has_a_longer_baseline_and_the_same_rotations() -> None:

@@ -11,10 +11,10 @@ import pytest
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.camera_file import read_camera
 from omnid.cli import main
+from omnid.simulation.rendering.sensor import Sensor
 from tests.calib.boards.test_marker_finder import CHARUCO, GRID, MOUNTED
 from tests.simulation.boards import board_poses_around_camera
 from tests.simulation.marker_boards import frame_board, render_marker_board
-from tests.simulation.sensor import Sensor
 
 VIEWS = 6
 CHARUCO_WORDS = ["--board", "charuco", "--corners", "6x5", "--square-mm", "50", "--marker-mm", "37.5"]

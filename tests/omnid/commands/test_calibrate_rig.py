@@ -20,8 +20,8 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
+from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
-from tests.simulation.sensor import Sensor
 
 BOARD = Board(7, 6, 0.03)
 T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])

@@ -15,7 +15,7 @@ from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
-from tests.simulation import Exposure, Scene, Sensor, render_grey
+from tests.simulation import MountedSensor, Scene, Sensor, render_grey
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -53,7 +53,7 @@ class RenderedCameras:
     cylinder: Cylinder
     maps: tuple[Maps, Maps]
     usable: Flags
-    exposures: tuple[Exposure, Exposure]
+    exposures: tuple[MountedSensor, MountedSensor]
     matcher: Matcher
 
     @staticmethod
@@ -63,7 +63,7 @@ class RenderedCameras:
         maps = remap_tables(rig, rig.lower, cylinder, PAD_PX), remap_tables(rig, rig.upper, cylinder, PAD_PX)
         seen = visible(rig.lower, maps[0], 2) & visible(rig.upper, maps[1], 2)
         seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
-        sensors = [Exposure.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+        sensors = [MountedSensor.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
         return RenderedCameras(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
                     Matcher(seen.shape, MatchingSettings(disparities=32)))
 

@@ -10,9 +10,9 @@ import pytest
 from calib.rig import ShutterTimes
 from omnid.config import PanoramaConfig, TimingConfig
 from omnid.messages import FramePair
+from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
-from tests.simulation.rigs import make_rig
 
 
 @pytest.mark.parametrize(("config", "delay_s", "line_s"), [

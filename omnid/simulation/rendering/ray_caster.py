@@ -1,13 +1,14 @@
 """Ray caster: images of a mirror camera, by casting the rays that its model lifts from the pixels.
 
-The camera's lift() defines the rays of a central camera. A MirrorCamera has a ray of its own, with its own origin on
-the mirror, for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the tiles whose
+The camera's lift() defines the rays of a central camera. A non-central one has a ray of its own, with its own origin,
+for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the tiles whose
 cone of directions overlaps its own. With a rolling shutter every row has a pose of its own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -16,8 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array
 from calib.rig import MountedCamera
-from tests.simulation.mirrors import MirrorCamera
-from tests.simulation.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 Floats = NDArray[np.float32]
 TILE_PX = 32
@@ -35,6 +35,14 @@ MAX_CONE_RAD = 1.5
 MIN_SLANT = 0.02
 # Guards against division by zero at a rectangle through the viewpoint [m].
 MIN_DISTANCE_M = 1e-9
+
+
+@runtime_checkable
+class NonCentralCamera(Protocol):
+    """A camera whose rays do not meet in one point."""
+
+    def rays(self, pixels: Array) -> tuple[Array, Array]:
+        """Return origins (N, 3) [m] and unit directions (N, 3) of pixels (N, 2), in the camera frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +85,10 @@ def _reach_m(origins: Floats | None) -> float:
 
 def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats | None:
     """Return the origins (3, N) of the samples' rays of a non-central camera; None for a central one."""
-    if not isinstance(mounted.camera, MirrorCamera):
+    camera = mounted.camera
+    if not isinstance(camera, NonCentralCamera):
         return None
-    origins = [mounted.camera.rays(pixels)[0] for pixels in _sample_pixels(mounted, supersample)]
+    origins = [camera.rays(pixels)[0] for pixels in _sample_pixels(mounted, supersample)]
     return np.ascontiguousarray(np.concatenate(origins)[index].T, np.float32)
 
 
@@ -158,7 +167,7 @@ def _moving(table: RayTable, row_twist: Array) -> RayTable:
     origins = row * v + half * (W @ v)
     if table.origins is not None:
         origins += table.origins + row * (W @ table.origins) + half * (W @ W @ table.origins)
-    rays = table.rays + row * (W @ table.rays) + half * (W @ W @ table.rays)
+    rays = np.asarray(table.rays + row * (W @ table.rays) + half * (W @ W @ table.rays), np.float32)
     angles = table.angles + height * np.linalg.norm(row_twist[3:])
     return replace(table, rays=rays, origins=origins, angles=angles, reach_m=_reach_m(origins))
 

@@ -57,7 +57,7 @@ DIM = Sensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class MountedSensor:
     """One camera's sensor with its fixed patterns, computed once."""
 
     sensor: Sensor
@@ -65,9 +65,9 @@ class Exposure:
     falloff: Floats
 
     @staticmethod
-    def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Exposure:
+    def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> MountedSensor:
         """Return the exposure of a camera with that mask and image size (width, height)."""
-        return Exposure(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
+        return MountedSensor(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
 
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
         """Return the sensor's image (H, W) uint8 of an ideal one."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.models.camera import Array
-from tests.simulation.surfaces import Texture
+from omnid.simulation.rendering.surfaces import Texture
 
 Random = np.random.Generator
 # (width, height) [px]

@@ -1,0 +1,1 @@
+"""Images of textured worlds by ray casting."""
