@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from omnid.core.odometry.stereo_frame import Features
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
+
+JUMP_M, JUMP_RAD = 0.5, math.radians(30)  # between two poses for one stamp, from which odom would jump
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,3 +61,14 @@ class OdometryEstimate:
     tracked: int
     inliers: int
     features: Features = field(default_factory=Features)
+
+
+def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
+    """Return the estimate with more inliers, the first one of two equal ones."""
+    return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
+
+
+def is_jump(T_predicted: Array, T_odom_rect: Array) -> bool:
+    """True if odom would jump from the predicted pose to this one."""
+    step = se3.log(se3.inverse(T_predicted) @ T_odom_rect)
+    return bool(np.linalg.norm(step[:3]) > JUMP_M or np.linalg.norm(step[3:]) > JUMP_RAD)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
-from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
+from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate, is_jump, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY, ExposureVelocity
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
@@ -98,7 +98,7 @@ class VisualOdometry:
 
             # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
             refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
-            estimate = _with_more_inliers(estimate, refined)
+            estimate = with_more_inliers(estimate, refined)
             if self._is_good(estimate):
                 break
 
@@ -106,8 +106,11 @@ class VisualOdometry:
         after_break = after_refusal or dt_s > self._limits.max_gap_s
         if searched and after_break and not self._is_plausible(estimate, dt_s):
             estimate = self._relocaliser.locate(frame)
-        if estimate is None or not self._is_plausible(estimate, dt_s):
-            return self._refuse(frame, usable, T_predicted, dt_s)
+        # Predicted poses were published: a pose far from them does not close the gap, as odom would jump.
+        jumps = estimate is not None and after_refusal and is_jump(T_predicted, estimate.T_odom_rect)
+        if estimate is None or jumps or not self._is_plausible(estimate, dt_s):
+            elsewhere = estimate is not None and jumps and estimate.inliers >= self._limits.good_inliers
+            return self._refuse(frame, usable, T_predicted, dt_s, elsewhere=elsewhere)
 
         if self._unmoved is not None:
             estimate = self._start_again(frame, usable, estimate, dt_s)
@@ -223,12 +226,17 @@ class VisualOdometry:
         self._filter.reset()
         self._velocity.reset()
 
-    def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> OdometryEstimate:
-        """Continue with the predicted pose, slowing down, with a growing covariance; restart the map if need be."""
+    def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: bool
+                ) -> OdometryEstimate:
+        """Continue with the predicted pose, slowing down, with a growing covariance; restart the map if need be.
+
+        elsewhere: the frame was recognised where the robot cannot have come by the predicted motion.
+        """
         A = se3.adjoint(se3.inverse(T_predicted) @ self._T_odom_rect)
         self._T_odom_rect, self._covariance = T_predicted, A @ self._covariance @ A.T
         self._filter.slow_down(math.exp(-dt_s / SLOWING_S))
-        self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=self._is_textured(frame, usable)))
+        textured = self._is_textured(frame, usable)
+        self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=elsewhere))
         if not self._status.restart:
             return self._result(0, 0)
         self._map.clear()
@@ -336,8 +344,3 @@ class VisualOdometry:
             inliers,
             features or Features(),
         )
-
-
-def _with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
-    """Return the estimate with more inliers, the first one of two equal ones."""
-    return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)

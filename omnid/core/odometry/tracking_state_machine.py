@@ -5,7 +5,8 @@
     ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
     REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
     REFUSED from then on -------------------------------------> LOST, and the map is started again when
-                                                                restart_after textured frames matched nothing
+                                                                restart_after textured frames matched nothing,
+                                                                or one was recognised elsewhere
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class FrameFacts:
     dt_s: float  # since the previous frame
     inliers: int = 0
     textured: bool = True  # the frame has enough corners for a map
+    elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,5 +68,5 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
     if refused_frames < limits.lost_after:
         return TrackingStatus(TrackingState.DEGRADED, refused_frames, status.unmatched_frames, time_since_fix_s)
     unmatched_frames = status.unmatched_frames + int(facts.textured)
-    restart = unmatched_frames >= limits.restart_after
+    restart = facts.elsewhere or unmatched_frames >= limits.restart_after
     return TrackingStatus(TrackingState.LOST, refused_frames, unmatched_frames, time_since_fix_s, restart)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -149,17 +150,33 @@ def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
     assert (back[-1].state, back[-1].resets) == (TrackingState.TRACKING, 0)
 
 
-def test_relocalises_at_a_keyframe_that_has_left_the_local_map(cameras: RenderedCameras) -> None:
+def test_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: RenderedCameras) -> None:
+    """A tracker that reaches a pixel far does not find the way back; the keyframe tells it, and the gap is closed."""
+    odometry = VisualOdometry(cameras.model, KltSettings(iterations=1, levels=0), OdometryLimits(),
+                              Relocaliser(cameras.model))
+    run(odometry, [cameras.frame(k, PATH[0]) for k in range(3)])
+    run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
+    (T_world_rig,) = planar_poses(np.array([[0.3, -0.3]]), np.array([0.45]))
+    back = run(odometry, [cameras.frame(200 + k, T_world_rig) for k in range(2)], first=False)
+    distance, angle = motion_errors(back[0].T_odom_rect, se3.inverse(PATH[0]) @ T_world_rig)
+    assert distance < 0.02 and angle < 0.01
+    assert [estimate.state for estimate in back] == [TrackingState.DEGRADED, TrackingState.TRACKING]
+    assert back[-1].resets == 0 and np.sqrt(np.diag(back[-1].covariance)).max() < 0.03
+
+
+def test_odom_does_not_jump_to_a_keyframe_far_from_the_predicted_pose(cameras: RenderedCameras) -> None:
+    """Carried in the dark: the place is known, but odom goes on, the reset counter tells it, and so does sigma."""
     path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
     odometry = visual_odometry(cameras.model, OdometryLimits(keyframes=2))
     run(odometry, [cameras.frame(k, T) for k, T in enumerate(path)])
-    run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
+    dark = run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
     (T_world_rig,) = planar_poses(np.array([[0.1, -0.1]]), np.array([2.0]))
-    back = run(odometry, [cameras.frame(200 + k, T_world_rig) for k in range(2)], first=False)
-    distance, angle = motion_errors(back[-1].T_odom_rect, se3.inverse(path[0]) @ T_world_rig)
-    assert distance < 0.01 and angle < 0.005
-    assert [estimate.state for estimate in back] == [TrackingState.DEGRADED, TrackingState.TRACKING]
-    assert back[-1].resets == 0
+    there = run(odometry, [cameras.frame(200 + k, T_world_rig) for k in range(3)], first=False)
+    poses = [estimate.T_odom_rect for estimate in (dark[-1], *there)]
+    assert max(motion_errors(a, b)[0] for a, b in pairwise(poses)) < 0.1
+    assert [estimate.resets for estimate in there] == [1, 1, 1]
+    assert [estimate.state for estimate in there] == [TrackingState.TRACKING] * 3
+    assert np.sqrt(there[-1].covariance[0, 0]) > 0.2
 
 
 def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from omnid.core.odometry.limits import OdometryLimits
@@ -40,6 +42,8 @@ TRANSITIONS = [
     (DARK, FrameFacts(REFUSED, DT_S), UNMATCHED),
     (UNMATCHED, FrameFacts(REFUSED, DT_S, textured=False), TrackingStatus(LOST, 5, 1, 5 * DT_S)),
     (UNMATCHED, FrameFacts(REFUSED, DT_S), TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True)),
+    (REFUSED_ONCE, FrameFacts(REFUSED, DT_S, elsewhere=True), REFUSED_TWICE),
+    (DARK, FrameFacts(REFUSED, DT_S, elsewhere=True), replace(UNMATCHED, restart=True)),
     (UNMATCHED, FrameFacts(ACCEPTED, DT_S, inliers=200), TrackingStatus(DEGRADED)),
     (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0), FIX),
     (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(NOT_STARTED, 0.0),
