@@ -37,10 +37,12 @@ from omnid.transport.decode import (
     decode_pose,
 )
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import Unreachable
 from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
-__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "Pose", "PoseAttachment", "Robot", "Subscription",
+__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "Pose", "PoseAttachment", "Robot", "Scan",
+           "Subscription",
            "Unreachable", "subscribe"]
 
 T = TypeVar("T")
@@ -49,6 +51,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
     Diagnostics: ("status", decode_diagnostics),
     Cloud: ("cloud", decode_cloud),
     Map: ("map", decode_map),
+    Scan: ("scan", decode_scan),
 }
 _QUERY_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.002

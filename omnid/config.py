@@ -12,6 +12,7 @@ from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l
 from drivers.logs.log_folder import RotationSettings
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
+from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.limits import PlaceLimits
@@ -169,6 +170,16 @@ class MappingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ObstaclesConfig:
+    """Ring of the nearest obstacles around the base, published as scan."""
+
+    enabled: bool = knob(True, "find obstacles; off: nothing keeps the base from driving against them")
+    rate_hz: float = knob(5.0, "rings a second, each with dense stereo, which the map shares; 0: one for each pair",
+                          low=0, high=100)
+    ring: RingSettings = field(default_factory=RingSettings)
+
+
+@dataclass(frozen=True, slots=True)
 class RecordConfig:
     """Recordings of `omnid run`, `omnid record` and `omnid replay --record`."""
 
@@ -223,6 +234,7 @@ class Config:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    obstacles: ObstaclesConfig = field(default_factory=ObstaclesConfig)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     motor: MotorSettings = field(default_factory=MotorSettings)
     live: LiveConfig = field(default_factory=LiveConfig)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
@@ -151,6 +152,23 @@ class PlaceUpdate:
     state: MapState
     keyframe: int = -1  # of the map, to which the pose belongs; -1: none
     T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObstacleRing:
+    """Nearest obstacle in each direction from the base: sector k is about azimuth -pi + (k + 0.5) 2 pi / 360.
+
+    Ranges are from the base's origin, in the plane of its x (forward) and y (left). Unknown is not free: a plain
+    surface shows stereo nothing.
+    """
+
+    seq: int
+    stamp_ns: int
+    ranges_m: NDArray[np.float32]  # (360,) inf: seen to be free up to obstacles.ring.max_range_m; NaN: unknown
+    sigma_m: NDArray[np.float32]  # (360,) NaN where there is no range
+    free_m: NDArray[np.float32]  # (360,) up to which the floor, or something behind, was seen; 0: nothing was
+    T_odom_base: Array  # (4, 4)
+    moving: tuple[MovingObstacle, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,7 +74,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages "
         "omnid.viewer omnid.web",
     "omnid.config":
-        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.odometry "
+        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.obstacles omnid.core.odometry "
         "omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration "
         "omnid.transport",
     "omnid.controller":
@@ -83,6 +83,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.core": "",
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
+    "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
     "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places":
@@ -101,7 +102,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.places omnid.errors",
-    "omnid.messages": "omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.tracking_state",
+    "omnid.messages":
+        "omnid.core.mapping omnid.core.obstacles omnid.core.odometry omnid.core.stereo omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
         "omnid.sinks omnid.transport",
@@ -134,7 +136,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame "
-        "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.odometry "
+        "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "
         "omnid.core.odometry.paper omnid.core.places omnid.core.rig omnid.core.stereo omnid.errors omnid.messages "
         "omnid.tracking_state",
     "omnid.tracking_state": "",

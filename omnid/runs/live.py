@@ -144,6 +144,7 @@ class LiveRun:
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
                       features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
+                      ring_period_s=lambda: ladder.level.ring_period_s,
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         sinks = run_places.known_to(sinks)

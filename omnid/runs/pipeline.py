@@ -13,13 +13,14 @@ from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.messages import FramePair, MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping, no_wait
+from omnid.stages.obstacles import Obstacles
 from omnid.stages.odometry import OdometryStage, all_features
 from omnid.stages.places import Places
 from omnid.stages.rig_gate import RigGate, never
@@ -33,6 +34,7 @@ class Sinks:
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
+    rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
     known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
     localize_only: bool = False  # it stays as it is
     recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
@@ -43,6 +45,7 @@ class Sinks:
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
     features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
     map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
+    ring_period_s: Callable[[], float] = no_wait  # least time between two obstacle rings, under overload
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     recorded_frames: tuple[Stream[Frame], ...] = ()
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
@@ -82,6 +85,12 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         outgoing["bus-places"] = updates
         for name, place_sink in sinks.places.items():
             graph.sink(name, place_sink, updates)
+    if config.obstacles.enabled and (sinks.rings or sinks.recorder or sinks.bus):
+        rings: Stream[ObstacleRing] = graph.stage(
+            "obstacles", Obstacles(geometry, config.obstacles, sinks.ring_period_s), odometry)
+        outgoing["bus-scan"] = rings
+        for name, ring_sink in sinks.rings.items():
+            graph.sink(name, ring_sink, rings)
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
     if sinks.recorder:

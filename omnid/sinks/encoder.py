@@ -12,13 +12,14 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
+from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
-Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate
+Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | ObstacleRing
 
 
 class OutgoingMessage(NamedTuple):
@@ -30,16 +31,17 @@ class OutgoingMessage(NamedTuple):
 
 
 class MapEncoding(NamedTuple):
-    """Encoding of the map."""
+    """Encoding of the map and of the scan."""
 
     points: int  # largest number of points of the cloud: the most confident ones
     heights_m: tuple[float, float] = (-1.0, 1.5)  # of obstacles, in the base's frame at the start
     cell_m: float = 0.05  # of the grid
+    max_range_m: float = 6.0  # of the scan
 
 
 def map_encoding(config: Config, points: int) -> MapEncoding:
     """Return the encoding of the configuration, with at most so many points."""
-    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m)
+    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m, config.obstacles.ring.max_range_m)
 
 
 class Encoder:
@@ -59,6 +61,10 @@ class Encoder:
                 yield OutgoingMessage("drive", codec.TWIST_SCHEMA, payload)
             case PlaceUpdate():
                 yield from self._map_pose(message)
+            case ObstacleRing():
+                payload = scan_cdr(message.stamp_ns + self.offset_ns, "base_link", message.ranges_m, message.sigma_m,
+                                   (0.0, self._map_encoding.max_range_m))
+                yield OutgoingMessage("scan", SCAN_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from omnid.transport import codec
+from omnid.transport.scan_codec import SCAN_SCHEMA
 
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
@@ -27,6 +28,7 @@ PUBLISHED: Final = {
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
     "map": Topic(codec.GRID_SCHEMA, latched=True),
+    "scan": Topic(SCAN_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(IMAGE_SCHEMA),
 }

@@ -40,10 +40,10 @@ def range_scan(points: Array, heights_m: tuple[float, float]) -> RangeScan:
     chosen = first[known] + np.floor(NEAREST_SHARE * count[known]).astype(np.intp)
     scan = np.full(SECTORS, np.nan, np.float32)
     scan[known] = ranges[order[chosen]]
-    return _filled(scan)
+    return fill_gaps(scan)
 
 
-def _filled(scan: RangeScan) -> RangeScan:
+def fill_gaps(scan: RangeScan) -> RangeScan:
     """Return the scan with short gaps filled, if the ranges on both sides are those of one surface.
 
     Stereo sees edges: a wall between two of them is no gap.

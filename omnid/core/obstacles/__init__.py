@@ -1,0 +1,1 @@
+"""Obstacles around the base: ring of ranges from stereo, its filter over time, moving obstacles."""

@@ -1,0 +1,67 @@
+"""Obstacle stage: ring of the nearest obstacles around the base, from the depth of pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.config import ObstaclesConfig
+from omnid.core.obstacles.observation import observe
+from omnid.core.obstacles.ring_filter import RingFilter
+from omnid.messages import ObstacleRing, OdometryUpdate
+from omnid.stages.geometry import Geometry
+from omnid.stages.mapping import STAMP_JITTER_NS, no_wait
+from omnid.stages.odometry import of_base
+from omnid.tracking_state import TrackingState
+
+Array = NDArray[np.float64]
+
+
+class Obstacles:
+    """Makes a ring of each pair that is due; dense stereo of a pair is shared with the map."""
+
+    def __init__(self, geometry: Geometry, config: ObstaclesConfig, min_period_s: Callable[[], float] = no_wait
+                 ) -> None:
+        """min_period_s: called for each pair, the least time between two rings under overload."""
+        self._T_base_rig = geometry.rig.T_base_rig
+        self._config, self._min_period_s = config, min_period_s
+        self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
+        self._filter = RingFilter(config.ring)
+        self._view: Array = (self._T_base_rig @ geometry.T_rig_rect)[:3, 3]
+        self._last_ns: int | None = None
+        self._resets = 0
+
+    def process(self, odometry: OdometryUpdate) -> ObstacleRing | None:
+        """Return the ring at a pair, None where it is not due."""
+        if not self._is_due(odometry):
+            return None
+        self._last_ns = odometry.stamp_ns
+        if odometry.state is TrackingState.LOST or odometry.reset_counter != self._resets:
+            self._filter.clear()  # its memory is in odom, which has lost its relation to the robot
+            self._resets = odometry.reset_counter
+        depth = odometry.depth
+        points = se3.apply(self._T_base_rig, depth.points)
+        seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._config.ring)
+        T_odom_base = of_base(odometry, self._T_base_rig)[0]
+        ring = self._filter.update(odometry.stamp_ns, planar(T_odom_base), seen)
+        return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base)
+
+    def _is_due(self, odometry: OdometryUpdate) -> bool:
+        """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""
+        if self._last_ns is None:
+            return True
+        wait_ns = max(self._period_ns, self._min_period_s() * 1e9)
+        is_keyframe = len(odometry.features.new) > 0
+        since_ns = odometry.stamp_ns - self._last_ns
+        return since_ns < 0 or since_ns >= (wait_ns / 2 if is_keyframe else wait_ns) - STAMP_JITTER_NS
+
+
+def planar(T_odom_base: Array) -> Array:
+    """Return the pose in the plane: its yaw, and x and y."""
+    yaw = float(se3.yaw(T_odom_base))
+    R = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return se3.transform(R, [T_odom_base[0, 3], T_odom_base[1, 3], 0.0])

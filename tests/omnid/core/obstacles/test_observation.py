@@ -1,0 +1,98 @@
+"""Ring of one pair, from points of worlds that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omnid.core.mapping.range_scan import azimuths
+from omnid.core.obstacles.observation import Observation, observe
+from omnid.core.obstacles.settings import RingSettings
+from omnid.errors import OmnidError
+
+FLOOR_M = -1.2
+VIEW = np.zeros(3)
+SETTINGS = RingSettings()
+
+
+def seen(*parts: np.ndarray, sigma_of_m2: float = 0.01, settings: RingSettings = SETTINGS) -> Observation:
+    """Return the observation of points, whose sigma is so many metres per square metre of range."""
+    points = np.vstack(parts)
+    return observe(points, sigma_of_m2 * (points**2).sum(axis=1), VIEW, settings)
+
+
+def arc(range_m: float, degrees: tuple[float, float], heights_m: tuple[float, float], count: int = 2000) -> np.ndarray:
+    """Return points of an upright cylinder about the base."""
+    rng = np.random.default_rng(1)
+    angle, z = np.deg2rad(rng.uniform(*degrees, count)), rng.uniform(*heights_m, count)
+    return np.column_stack([range_m * np.cos(angle), range_m * np.sin(angle), z])
+
+
+def floor(longest_m: float, degrees: tuple[float, float] = (-180, 180), z_m: float = FLOOR_M) -> np.ndarray:
+    """Return points of the floor."""
+    rng = np.random.default_rng(2)
+    angle, r = np.deg2rad(rng.uniform(*degrees, 60_000)), rng.uniform(0.8, longest_m, 60_000)
+    return np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(60_000, z_m)])
+
+
+def within(low_deg: float, high_deg: float) -> np.ndarray:
+    """Return which sectors lie between two azimuths."""
+    degrees = np.rad2deg(azimuths())
+    return (degrees > low_deg) & (degrees < high_deg)
+
+
+def test_a_wall_is_found_at_its_range_and_elsewhere_nothing_is_known() -> None:
+    ring = seen(arc(2.0, (-30, 30), (-0.8, 0.6)))
+    np.testing.assert_allclose(ring.ranges_m[within(-29, 29)], 2.0, atol=1e-3)
+    assert np.isnan(ring.ranges_m[~within(-32, 32)]).all() and (ring.free_m[~within(-32, 32)] == 0).all()
+    assert np.all(ring.sigma_m[within(-29, 29)] > 0.02) and np.all(ring.sigma_m[within(-29, 29)] < 0.06)
+
+
+def test_the_floor_is_no_obstacle_and_shows_how_far_the_way_is_free() -> None:
+    ring = seen(floor(3.0))
+    assert np.isnan(ring.ranges_m).all()
+    np.testing.assert_allclose(ring.free_m, 3.0, atol=0.3)
+
+
+def test_a_floor_that_is_seen_again_behind_a_gap_does_not_count() -> None:
+    ground = floor(4.0)
+    r = np.hypot(ground[:, 0], ground[:, 1])
+    ring = seen(ground[(r < 1.5) | (r > 2.6)])
+    np.testing.assert_allclose(ring.free_m, 1.5, atol=0.3)
+
+
+def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
+    rng = np.random.default_rng(3)
+    ground = floor(6.0, z_m=-1.2)
+    r = np.linalg.norm(ground, axis=1)
+    noisy = ground * (1 + 0.01 * r * rng.standard_normal(len(r)))[:, None]
+    tilted = noisy + np.outer(np.tan(np.deg2rad(0.7)) * ground[:, 0], [0, 0, 1])
+    ring = seen(tilted)
+    assert np.isfinite(ring.ranges_m).sum() <= 2
+
+
+def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> None:
+    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.4, (-5, 5), (-0.9, -0.6), 150))
+    np.testing.assert_allclose(ring.ranges_m[within(-4, 4)], 1.4, atol=0.02)
+    np.testing.assert_allclose(ring.ranges_m[within(8, 50)], 3.0, atol=0.02)
+
+
+def test_few_points_are_no_obstacle() -> None:
+    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.0, (0, 1), (-0.5, 0.5), SETTINGS.min_points - 1))
+    np.testing.assert_allclose(ring.ranges_m[within(-50, 50)], 3.0, atol=0.02)
+
+
+def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
+    ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.2, 1.4)))
+    assert np.isposinf(ring.ranges_m[within(-28, 28)]).all() and (ring.free_m[within(-28, 28)] == 6.0).all()
+    assert np.isnan(ring.ranges_m[within(92, 118)]).all()
+
+
+def test_nothing_is_unknown() -> None:
+    ring = observe(np.zeros((0, 3)), np.zeros(0), VIEW, SETTINGS)
+    assert np.isnan(ring.ranges_m).all() and (ring.free_m == 0).all()
+
+
+def test_heights_must_be_in_order() -> None:
+    with pytest.raises(OmnidError, match="lower height first"):
+        RingSettings(heights_m=(1.0, 0.5))

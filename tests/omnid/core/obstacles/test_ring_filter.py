@@ -1,0 +1,105 @@
+"""Ring over time: votes, and memory in odom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib import se3
+from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.ring_filter import RingFilter
+from omnid.core.obstacles.settings import RingSettings
+
+S = 1_000_000_000
+SETTINGS = RingSettings()
+AHEAD = np.abs(azimuths()) < np.deg2rad(15)
+BEHIND = np.abs(azimuths()) > np.deg2rad(165)
+
+
+def ring_of(range_m: float, where: np.ndarray = AHEAD, other: float = np.nan) -> Observation:
+    """Return an observation with one range in some sectors."""
+    ranges = np.where(where, range_m, other).astype(np.float32)
+    return Observation(ranges, np.where(np.isfinite(ranges), 0.02, np.nan).astype(np.float32),
+                       np.where(np.isfinite(ranges), ranges, 0).astype(np.float32))
+
+
+def pose(x_m: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
+    """Return a pose in the plane."""
+    return se3.transform(se3.rotation_exp([0, 0, np.deg2rad(yaw_deg)]), [x_m, 0, 0])
+
+
+def test_an_obstacle_seen_once_is_unknown_and_seen_twice_is_there() -> None:
+    ring = RingFilter(SETTINGS)
+    assert np.isnan(ring.update(0, pose(), ring_of(2.0)).ranges_m[AHEAD]).all()
+    np.testing.assert_allclose(ring.update(S // 5, pose(), ring_of(2.0)).ranges_m[AHEAD], 2.0, atol=1e-5)
+
+
+def test_votes_are_for_the_same_place_in_odom() -> None:
+    ring = RingFilter(SETTINGS)
+    ring.update(0, pose(), ring_of(2.0))
+    known = ring.update(S // 5, pose(0.5), ring_of(1.5)).ranges_m[AHEAD]
+    assert np.isfinite(known).mean() > 0.9
+    ring = RingFilter(SETTINGS)
+    ring.update(0, pose(), ring_of(2.0))
+    assert np.isnan(ring.update(S // 5, pose(0.5), ring_of(2.0)).ranges_m[AHEAD]).all()
+
+
+def test_a_false_match_of_one_pair_never_becomes_an_obstacle() -> None:
+    ring = RingFilter(SETTINGS)
+    rng = np.random.default_rng(1)
+    for i in range(30):
+        seen = ring_of(3.0, np.ones(SECTORS, bool))
+        seen.ranges_m[180] = rng.uniform(0.8, 2.5) if i % 5 == 0 else 3.0
+        result = ring.update(i * S // 5, pose(), seen)
+        if i > 2:
+            known = result.ranges_m[np.isfinite(result.ranges_m)]
+            np.testing.assert_allclose(known, 3.0, atol=1e-4)
+
+
+def test_an_obstacle_that_becomes_too_near_is_remembered_and_follows_the_turns_of_the_base() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(3):
+        ring.update(i * S // 5, pose(), ring_of(0.8))
+    nothing = ring_of(np.nan)
+    for i in range(3, 103):  # 20 s in which nothing is seen: far longer than memory_s
+        x_m = min(0.3, 0.05 * (i - 2))
+        result = ring.update(i * S // 5, pose(x_m), nothing)
+    assert np.isfinite(result.ranges_m[AHEAD]).mean() > 0.9
+    assert abs(float(np.nanmin(result.ranges_m)) - 0.5) < 0.02
+    turned = ring.update(103 * S // 5, pose(0.3, 180), nothing)
+    assert np.isfinite(turned.ranges_m[BEHIND]).mean() > 0.9 and np.isnan(turned.ranges_m[AHEAD]).all()
+
+
+def test_an_obstacle_beyond_the_blind_zone_is_forgotten_after_memory_s() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(3):
+        ring.update(i * S // 5, pose(), ring_of(2.0))
+    nothing = ring_of(np.nan)
+    last_seen_ns = 2 * S // 5
+    until_ns = last_seen_ns + round(SETTINGS.memory_s * 1e9)
+    assert np.isfinite(ring.update(until_ns - S // 10, pose(), nothing).ranges_m[AHEAD]).any()
+    assert np.isnan(ring.update(until_ns + S // 10, pose(), nothing).ranges_m).all()
+
+
+def test_an_obstacle_that_goes_away_is_forgotten_when_something_behind_it_is_seen() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(4):
+        ring.update(i * S // 5, pose(), ring_of(0.7))
+    for i in range(4, 9):
+        result = ring.update(i * S // 5, pose(), ring_of(2.5))
+    np.testing.assert_allclose(result.ranges_m[AHEAD], 2.5, atol=1e-5)
+
+
+def test_clear_forgets() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(4):
+        ring.update(i * S // 5, pose(), ring_of(0.7))
+    ring.clear()
+    assert np.isnan(ring.update(S, pose(), ring_of(np.nan)).ranges_m).all()
+
+
+def test_without_votes_the_first_pair_counts() -> None:
+    ring = RingFilter(replace(SETTINGS, min_votes=1))
+    np.testing.assert_allclose(ring.update(0, pose(), ring_of(2.0)).ranges_m[AHEAD], 2.0, atol=1e-5)
