@@ -242,12 +242,21 @@ class Fleet:
         tokens = self._session.liveliness()
         self._declared.append(tokens.declare_subscriber("**/alive", on_token, history=True))
 
+    def stop(self, robot: str) -> None:
+        """Stop the wheels of a robot until it is armed; may block while it does not read."""
+        self._session.put(f"{robot}/{STOP}", b"", congestion_control=zenoh.CongestionControl.BLOCK,
+                          priority=zenoh.Priority.REAL_TIME, express=True)
+
+    def close(self) -> None:
+        """End the connection; a second call does nothing."""
+        with suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
+        self.close()
 
 
 class Driver:

@@ -18,6 +18,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                                    "remedy, recordings, a stop and an arm button; /metrics for Prometheus. It prints "
                                    "the address with a token: who knows it may stop and arm the robot.")
     add_robot(parser)
+    parser.add_argument("--all", action="store_true", help="a page with all robots that the router or robot reaches, "
+                        "and one about each")
     parser.add_argument("--listen", default="127.0.0.1:8447", metavar="HOST:PORT", help="where browsers connect; "
                         "default %(default)s, this machine only; 0.0.0.0:8447 for its network")
     parser.add_argument("--token-file", type=Path, metavar="FILE", help="the token; the file is made if it is missing; "
@@ -34,16 +36,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     from omnid.errors import OmnidError
+    from omnid.monitor.fleet import check_all
 
     _require_packages()
     from omnid.web.server import WebSettings, serve
 
     if (args.tls_certificate is None) != (args.tls_key is None):
         raise OmnidError("--tls-certificate and --tls-key belong together: name both")
+    if args.all:
+        check_all(args.robot, {"--recordings": args.recordings})
     config = config_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
     folder = args.recordings or Path(config.record.folder)
-    serve(config.bus, WebSettings(args.listen, args.token_file, tuple(args.host), folder, tls))
+    serve(config.bus, WebSettings(args.listen, args.token_file, tuple(args.host), folder, tls, args.all))
     return 0
 
 

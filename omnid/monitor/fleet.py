@@ -15,6 +15,7 @@ from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState, plain
 from omnid.monitor.screen import CLEAR, fitted
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 
@@ -22,7 +23,7 @@ MAX_ROBOTS: Final = 500
 SHOW_PERIOD_S: Final = 1.0
 _NAME_COLUMNS: Final = 20
 _RETRY_S: Final = 0.5
-_TOPICS: Final = ("odom", "status")
+FLEET_TOPICS: Final = ("odom", "status")
 _HEAD: Final = (f"{'robot':{_NAME_COLUMNS}} {'state':10} {'Hz':>5} {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
                "  worst")
 
@@ -82,7 +83,7 @@ def _connected(bus: BusConfig, end_s: float) -> Fleet | None:
 def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float) -> None:
     inbox, tokens = Inbox(), Inbox()
     connection.on_alive(lambda robot, alive: tokens.put(robot, b"alive" if alive else b"", b""))
-    connection.on_message(inbox.put, _TOPICS)
+    connection.on_message(inbox.put, FLEET_TOPICS)
     next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
         while (token := tokens.get(0.0)) is not None:
@@ -110,16 +111,16 @@ def show(fleet: FleetState, stream: IO[str], dropped: int = 0) -> None:
 
 def fleet_table(robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0) -> Iterator[str]:
     """Yield a head and a line for each robot: those that are gone or have the worst state first."""
-    counts = [sum(1 for state in robots.values() if _severity(state) >= level) for level in (0, 1, 2)]
+    counts = [sum(1 for state in robots.values() if severity(state) >= level) for level in (0, 1, 2)]
     more = f"; {refused} more than {MAX_ROBOTS} are left out" if refused else ""
     lost = f"; {dropped} messages dropped" if dropped else ""
     yield f"{counts[0]} robots, {counts[1] - counts[2]} with warnings, {counts[2]} with errors or gone{more}{lost}"
     yield _HEAD
-    for name, state in sorted(robots.items(), key=lambda entry: (-_severity(entry[1]), entry[0])):
+    for name, state in sorted(robots.items(), key=lambda entry: (-severity(entry[1]), entry[0])):
         yield _line(name, state)
 
 
-def _severity(state: RobotState) -> int:
+def severity(state: RobotState) -> int:
     """Return 2 for an error, a robot that is gone or without poses, 1 for a warning, else 0."""
     levels = [status.level % 4 for status in state.statuses.values()]
     if state.alive is False or state.rate_hz == 0.0 or any(level >= 2 for level in levels):
@@ -127,15 +128,28 @@ def _severity(state: RobotState) -> int:
     return int(any(levels))
 
 
+def word_of(state: RobotState) -> str:
+    """Return the state of a robot in one or two words."""
+    if state.alive is False:
+        return "gone"
+    return "no pose" if state.rate_hz == 0.0 else state.state
+
+
+def worst_part(state: RobotState) -> DiagnosticStatus | None:
+    """Return the worst entry of the status; None where all are good."""
+    worst = max(state.statuses.values(), key=lambda status: status.level % 4, default=None)
+    return None if worst is None or worst.level % 4 == OK else worst
+
+
 def _line(name: str, state: RobotState) -> str:
     shown = plain(name)
     shown = shown if len(shown) <= _NAME_COLUMNS else f"{shown[: _NAME_COLUMNS - 1]}\N{HORIZONTAL ELLIPSIS}"
-    word = "gone" if state.alive is False else "no pose" if state.rate_hz == 0.0 else state.state
+    word = word_of(state)
     pose, age = state.pose, f"{1e3 * state.age.p(0.5):7.0f}" if state.age.count else f"{'':7}"
     where = f"{'':9} {'':9} {'':8}" if pose is None else \
         f"{pose.x_m:+9.2f} {pose.y_m:+9.2f} {math.degrees(pose.yaw_rad):+8.1f}"
-    worst = max(state.statuses.values(), key=lambda status: status.level % 4, default=None)
-    problem = "" if worst is None or worst.level % 4 == 0 else f"{short_name(worst.name)}: {worst.message}"
+    worst = worst_part(state)
+    problem = "" if worst is None else f"{short_name(worst.name)}: {worst.message}"
     return plain(f"{shown:{_NAME_COLUMNS}} {word:10.10} {state.rate_hz:5.1f} {where} {age}  {problem}")
 
 

@@ -10,7 +10,7 @@ import re
 import signal
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,14 @@ from omnid.engine.logging_setup import log_unlimited
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, token_of
-from omnid.web.app import Page
 from omnid.web.feed import RobotFeed
+from omnid.web.fleet_feed import FleetFeed
+from omnid.web.fleet_page import FleetPage
+from omnid.web.guard import Guard
 from omnid.web.recordings import Recordings
+from omnid.web.recordings_page import recordings_routes
+from omnid.web.robot_page import RobotPage
+from omnid.web.site import Site
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 MOST_CONNECTIONS: Final = 128  # of browsers: each page has up to seven
@@ -34,6 +39,7 @@ END_S: Final = 2  # for browsers to finish at the end
 LONGEST_MESSAGE: Final = 256  # bytes, of a browser's websocket
 _LISTEN: Final = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9._-]+):(\d{1,5})")
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]")
+Follow = Callable[[], Coroutine[Any, Any, None]]
 _ELSEWHERE: Final = "192.0.2.1"  # an address of documentation (RFC 5737); nothing is sent there
 
 
@@ -46,6 +52,7 @@ class WebSettings:
     names: tuple[str, ...] = ()  # further names of this machine
     recordings: Path = Path("recordings")
     tls: tuple[Path, Path] | None = None  # certificate and key, PEM
+    all_robots: bool = False  # a page about all robots, and one about each
 
 
 def serve(bus: BusConfig, settings: WebSettings) -> None:
@@ -58,25 +65,36 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
         local = ipaddress.ip_address(host).is_loopback
         own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", *_names_of_machine())
         access = Access(token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}")
-        feed = RobotFeed(bus)
-        page = Page(feed, access, Recordings(settings.recordings, Path(reports)), settings.tls is not None)
-        server = _Server(_uvicorn_config(page, settings))
+        guard, follow = _site(bus, settings, access, Path(reports))
+        server = _Server(_uvicorn_config(guard, settings))
         scheme = "http" if settings.tls is None else "https"
         print(f"{scheme}://{_address(host)}:{port}/?token={token}", flush=True)
         if not local and settings.tls is None:
             log_unlimited(logging.WARNING, "the page can be reached from the network without encryption: everyone who "
                           "can listen there learns the token, and may arm the robot; use --tls-certificate and "
                           "--tls-key, or a network that you trust")
-        asyncio.run(_run(server, feed, listener))
+        asyncio.run(_run(server, follow, listener))
 
 
-async def _run(server: _Server, feed: RobotFeed, listener: socket.socket) -> None:
-    """Serve until a signal, or until following the robot fails."""
+def _site(bus: BusConfig, settings: WebSettings, access: Access, reports: Path) -> tuple[Guard, Follow]:
+    """Return the server's application, and the function that follows the robots; reports: a folder for them."""
+    secure = settings.tls is not None
+    if settings.all_robots:
+        fleet = FleetPage(FleetFeed(bus), bus)
+        return Site("fleet.html", fleet.routes(), fleet.metrics, access, secure).guard, fleet.run
+    page = RobotPage(RobotFeed(bus))
+    recordings = Recordings(settings.recordings, reports)
+    site = Site("index.html", [*page.routes(), *recordings_routes(recordings)], page.metrics, access, secure)
+    return site.guard, page.feed.run
+
+
+async def _run(server: _Server, follow: Follow, listener: socket.socket) -> None:
+    """Serve until a signal, or until following the robots fails."""
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             loop.add_signal_handler(number, server.end)
-    following = asyncio.create_task(feed.run())
+    following = asyncio.create_task(follow())
     following.add_done_callback(lambda _: server.end())
     await server.serve([listener])
     following.cancel()
@@ -119,13 +137,13 @@ class _Protocol(H11Protocol):
             self.transport.close()
 
 
-def _uvicorn_config(page: Page, settings: WebSettings) -> uvicorn.Config:
+def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
     certificate, key = settings.tls or (None, None)
     for option, path in (("--tls-certificate", certificate), ("--tls-key", key)):
         if path is not None and not os.access(path, os.R_OK):
             raise OmnidError(f"{option} {path}: cannot be read; name a PEM file")
     config = uvicorn.Config(
-        page.guard, loop="asyncio", http=_Protocol, ws="websockets-sansio", interface="asgi3", lifespan="off",
+        guard, loop="asyncio", http=_Protocol, ws="websockets-sansio", interface="asgi3", lifespan="off",
         ws_max_size=LONGEST_MESSAGE, ws_ping_interval=None, ws_per_message_deflate=False, log_config=None,
         access_log=False, proxy_headers=False, server_header=False, limit_concurrency=MOST_CONNECTIONS,
         timeout_graceful_shutdown=END_S, ssl_certfile=certificate, ssl_keyfile=key)

@@ -33,7 +33,7 @@ def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, 
     """
     return compact({
         "type": "state", "robot": plain(robot), "link": plain(link), "alive": state.alive, "state": state.state,
-        "fresh": state.rate_hz > 0, "rate_hz": _number(state.rate_hz), "missed": state.missed, "broken": state.broken,
+        "fresh": state.rate_hz > 0, "rate_hz": finite(state.rate_hz), "missed": state.missed, "broken": state.broken,
         "pose": None if state.pose is None else _pose(state.pose), "age_ms": _quantiles_ms(state.age),
         "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "in_map": _in_map(state),
         "warnings": _warnings(state, link),
@@ -80,9 +80,9 @@ def _pose(pose: Pose) -> dict[str, Any]:
     sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
     found = pose.attachment
     return {
-        "x_m": _number(pose.x_m), "y_m": _number(pose.y_m), "z_m": _number(pose.z_m), "yaw_rad": _number(pose.yaw_rad),
-        "speed_mps": _number(float(pose.velocity[0])), "sigma_mm": _number(1e3 * float(sigma[:3].max())),
-        "sigma_deg": _number(math.degrees(sigma[3:].max())), "inliers": found.inliers, "tracked": found.tracked,
+        "x_m": finite(pose.x_m), "y_m": finite(pose.y_m), "z_m": finite(pose.z_m), "yaw_rad": finite(pose.yaw_rad),
+        "speed_mps": finite(float(pose.velocity[0])), "sigma_mm": finite(1e3 * float(sigma[:3].max())),
+        "sigma_deg": finite(math.degrees(sigma[3:].max())), "inliers": found.inliers, "tracked": found.tracked,
         "resets": found.resets, "sent_ms": found.sent_ns * 1e-6 if 0 < found.sent_ns < 2**63 else None,
     }
 
@@ -124,9 +124,9 @@ def _importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
 
 def _quantiles_ms(histogram: Histogram) -> list[float | None]:
     """Return median and 99th percentile."""
-    return [_number(1e3 * histogram.p(q)) for q in (0.5, 0.99)]
+    return [finite(1e3 * histogram.p(q)) for q in (0.5, 0.99)]
 
 
-def _number(value: float) -> float | None:
+def finite(value: float) -> float | None:
     """Return the number in 6 digits; None for one that JSON does not have."""
     return float(f"{value:.6g}") if math.isfinite(value) else None

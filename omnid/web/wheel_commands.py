@@ -78,7 +78,7 @@ class WheelCommands:
                 self._again, begin_s = False, time.monotonic()
             driver, reports = self._ready_driver(), self._feed.wheel_reports
             if driver is not None:
-                await _within(self._stop_thread, driver.stop)
+                await within(self._stop_thread, driver.stop)
                 reported = await self._wait_for(partial(self._reported_since, reports), REPEAT_S)
                 if reported and not self._again and self._is_stopped():
                     return Answer(True, "the robot stops: its wheels stand until it is armed")
@@ -90,7 +90,7 @@ class WheelCommands:
         driver = self._ready_driver()
         if driver is None:
             return Answer(False, self._reason())
-        stamp_ns = await _within(self._arm_thread, driver.arm)
+        stamp_ns = await within(self._arm_thread, driver.arm)
         answered = stamp_ns is not None and await self._wait_for(lambda: self._answered_ns() >= stamp_ns, ANSWER_S)
         if not answered:
             return Answer(False, f"the robot has not answered. {self._reason()}")
@@ -139,7 +139,7 @@ class WheelCommands:
                 "see `refused` in the entry of the wheels")
 
 
-async def _within(thread: ThreadPoolExecutor, send: Callable[[], T]) -> T | None:
+async def within(thread: ThreadPoolExecutor, send: Callable[[], T]) -> T | None:
     """Call a function in a thread; return None if it has not returned in time, because the robot does not read."""
     call = asyncio.get_running_loop().run_in_executor(thread, send)
     done, _ = await asyncio.wait([call], timeout=ANSWER_S / 2)

@@ -7,29 +7,47 @@ const GIVE_UP_MS = 10000;
 const SURE_MS = 4000;
 const EMERGENCY = "STOP IS NOT SENT: use the emergency stop on the robot";
 
-export function wireCommands() {
-  const stopButton = byId("stop");
-  const armButton = byId("arm");
-  let sureUntil = 0;
+// The STOP button and the space key. Returns show(text, className), which writes beside it; before() is called first.
+export function wireStop(before = () => {}) {
+  const button = byId("stop");
   let newest = 0;
-  let wasArmed = null;
 
   async function stop() {
     newest += 1;
     const number = newest;
-    sureUntil = 0;
-    showStop("sending STOP ...", "");
-    stopButton.classList.add("sent");
-    const answer = await post("/stop", GIVE_UP_MS, () => showStop(EMERGENCY, "bad"));
+    before();
+    show("sending STOP ...", "");
+    button.classList.add("sent");
+    const answer = await post("stop", GIVE_UP_MS, () => show(EMERGENCY, "bad"));
     if (number !== newest) return; // a newer press shows its own answer
-    stopButton.classList.remove("sent");
-    showStop(answer.text, answer.done ? "good" : "bad");
+    button.classList.remove("sent");
+    show(answer.text, answer.done ? "good" : "bad");
   }
 
-  function showStop(text, className) {
+  function show(text, className) {
     byId("stop-answer").textContent = text;
     byId("stop-answer").className = className;
   }
+
+  // On pointerdown, not on click: a finger that slides off the button has pressed it all the same.
+  button.addEventListener("pointerdown", stop);
+  button.addEventListener("click", (event) => event.detail === 0 && stop()); // by keyboard or by a screen reader
+  document.addEventListener("keydown", (event) => {
+    if (event.code !== "Space" || event.repeat || event.target.matches("input, textarea")) return;
+    event.preventDefault(); // else the focused button would be pressed
+    stop();
+  }, { capture: true });
+  document.addEventListener("keyup", (event) => {
+    if (event.code === "Space" && !event.target.matches("input, textarea")) event.preventDefault();
+  }, { capture: true });
+  return show;
+}
+
+export function wireCommands() {
+  const armButton = byId("arm");
+  let sureUntil = 0;
+  let wasArmed = null;
+  const showStop = wireStop(() => { sureUntil = 0; });
 
   async function arm() {
     if (performance.now() > sureUntil) {
@@ -42,7 +60,7 @@ export function wireCommands() {
     unsure();
     byId("answer").textContent = "asking the robot ...";
     showStop("", "");
-    const answer = await post("/arm", 0, () => {});
+    const answer = await post("arm", 0, () => {});
     byId("answer").textContent = answer.text;
   }
 
@@ -52,16 +70,7 @@ export function wireCommands() {
     armButton.classList.remove("sure");
   }
 
-  // On pointerdown, not on click: a finger that slides off the button has pressed it all the same.
-  stopButton.addEventListener("pointerdown", stop);
-  stopButton.addEventListener("click", (event) => event.detail === 0 && stop()); // by keyboard or by a screen reader
   armButton.addEventListener("click", arm);
-  document.addEventListener("keydown", (event) => {
-    if (event.code !== "Space" || event.repeat) return;
-    event.preventDefault(); // else the focused button would be pressed
-    stop();
-  }, { capture: true });
-  document.addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), { capture: true });
 
   return {
     // reported: false where the robot reports no wheels. Answers that are no longer true are taken away.
@@ -77,7 +86,7 @@ export function wireCommands() {
 }
 
 // Sends a command; again and again for so many ms where the server cannot be reached. Returns {done, text}.
-async function post(address, patience, onFailure) {
+export async function post(address, patience, onFailure) {
   const end = performance.now() + patience;
   for (;;) {
     try {

@@ -116,5 +116,10 @@ byId("closer").addEventListener("click", () => plan.zoom(1.5));
 byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
 byId("fit").addEventListener("click", () => plan.fit());
 plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
-wireRecordings();
+if (location.pathname.startsWith("/robot/")) { // one of several: recordings of other machines cannot be listed
+  byId("back").hidden = false;
+  byId("recordings-box").hidden = true;
+} else {
+  wireRecordings();
+}
 connection.open();

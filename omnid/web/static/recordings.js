@@ -8,7 +8,7 @@ export function wireRecordings() {
 async function load() {
   const note = byId("recordings-note");
   try {
-    const answer = await (await fetch("/recordings")).json();
+    const answer = await (await fetch("recordings")).json();
     note.textContent = answer.recordings.length ? answer.folder
       : `none in ${answer.folder}: set record.enabled = true, or start omnid web with --recordings`;
     byId("recordings").replaceChildren(...answer.recordings.map(row));
@@ -32,7 +32,7 @@ function described(recording) {
 }
 
 async function report(recording, button, note) {
-  const address = `/recordings/${recording.key}/report`;
+  const address = `recordings/${recording.key}/report`;
   button.disabled = true;
   note.textContent = "the report is being made ...";
   try {

@@ -21,8 +21,9 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
 from tests.omnid.web.servers import PATIENCE_S, WebServer, served
+from tests.omnid.web.test_fleet_page import Robots
 from tests.replay.live import robot, wait_until
 from tests.replay.test_arming import MANUAL
 
@@ -163,6 +164,41 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, s
             assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
             screenshot(new.value, "report")
             screenshot(page, "ended")
+
+
+def test_the_page_of_all_robots(browser: Any) -> None:
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as ends:
+        ends.enter_context(script(ROUTER, endpoint))
+        robots = Robots(endpoint)
+        for bus in robots.buses.values():
+            ends.callback(bus.close)
+        server = ends.enter_context(served("--all", "--connect", endpoint))
+        publishing = threading.Event()
+        thread = threading.Thread(target=lambda: [robots.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
+        thread.start()
+        ends.callback(thread.join)
+        ends.callback(publishing.set)
+        for size, scheme in (("phone", "dark"), ("desk", "light")):
+            robots.obeys = {"hall/one"}
+            with opened(browser, server, size, scheme) as page:
+                shows(page, "robots", "hall/one")
+                shows(page, "robots", "tracking")
+                expect_it_fits(page, size)
+                page.click("#stop")
+                shows(page, "stop-answer", "NOT confirmed by two: use the emergency stop. 1 of 2 robots stop")
+                screenshot(page, f"{size}-fleet")
+                robots.obeys.add("two")
+                page.keyboard.press("Space")
+                shows(page, "stop-answer", "all 2 robots stop")
+                page.click("text=hall/one")
+                page.wait_for_url("**/robot/**")
+                shows(page, "robot", "hall/one")
+                shows(page, "state", "tracking")
+                expect_it_fits(page, size)
+                page.click("#back")
+                page.wait_for_url(f"http://{server.host}/")
+                shows(page, "robots", "hall/one")
 
 
 def test_text_of_the_robot_is_never_html(browser: Any) -> None:

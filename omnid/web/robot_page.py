@@ -1,0 +1,44 @@
+"""The addresses of the page about one robot, below that of the page itself."""
+
+from __future__ import annotations
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
+
+from omnid.web.feed import RobotFeed
+from omnid.web.guard import Guard
+from omnid.web.metrics import metrics
+from omnid.web.wheel_commands import Answer, WheelCommands
+
+
+class RobotPage:
+    """The answers about one robot."""
+
+    def __init__(self, feed: RobotFeed) -> None:
+        self.feed, self.wheels = feed, WheelCommands(feed)
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the addresses."""
+        return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
+                Route("/arm", self._arm, methods=["POST"])]
+
+    def metrics(self, guard: Guard) -> str:
+        """Return the metrics of the robot and of this server."""
+        counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self.wheels.arms}
+        return metrics(self.feed.state, self.feed.browsers, guard.refused, counts)
+
+    async def _live(self, websocket: WebSocket) -> None:
+        await self.feed.browsers.serve(websocket)
+
+    async def _stop(self, _: Request) -> Response:
+        return answered(await self.wheels.stop())
+
+    async def _arm(self, _: Request) -> Response:
+        return answered(await self.wheels.arm())
+
+
+def answered(answer: Answer) -> Response:
+    """Return the answer to a command as JSON."""
+    return JSONResponse(answer._asdict(), 200 if answer.done else 409)
