@@ -21,6 +21,8 @@ from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from omnid.config import Config, load_config, unused_settings
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -88,7 +90,7 @@ class Odometry:
         overrides: Sequence[str] = (),
         mask_images: Iterable[tuple[InputImage, InputImage]] = (),
     ) -> None:
-        """Prepare the stages; that takes about a second.
+        """Prepare the stages; that takes about a second, and half a minute where functions are to be compiled.
 
         rig, config, overrides: as in `replay`. mask_images: pairs (lower, upper), such as the first 60 of a drive, in
         which the rims of the mirrors are searched if the rig has no masks. A camera without a mask counts as far as
@@ -96,6 +98,7 @@ class Odometry:
         Raises OmnidError for a rig or a configuration that cannot be used.
         """
         with _user_errors():
+            prepare_kernels(log)
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}

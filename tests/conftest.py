@@ -8,9 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from omnid.engine.kernel_cache import prepare_kernels
 from tests.simulation import build, write_log
 
 PAIRS = 24
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels() -> None:
+    """Compile the functions of core once, or read them from the cache folder, before the first test."""
+    prepare_kernels(lambda level, line: None)
 
 
 @pytest.fixture(scope="session")

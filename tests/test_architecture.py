@@ -57,7 +57,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.__main__": "omnid.cli",
     "omnid.api":
         "calib.errors calib.models calib.rig calib.rig_file drivers.errors drivers.frame omnid.config "
-        "omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
+        "omnid.engine omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
     "omnid.batch": "drivers.logs omnid.errors omnid.report omnid.version",
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
@@ -84,7 +84,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
     "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
-    "omnid.core.odometry": "calib.panorama calib.se3 omnid.core.stereo omnid.settings omnid.tracking_state",
+    "omnid.core.odometry": "calib.panorama calib.se3 omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places":
         "calib.panorama calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings "
@@ -98,7 +98,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.doctor":
         "calib.errors calib.rig_file drivers.cameras drivers.errors drivers.motor drivers.motors omnid.config "
         "omnid.controller omnid.engine omnid.errors omnid.transport",
-    "omnid.engine": "drivers.frame omnid.errors omnid.settings",
+    "omnid.engine": "drivers.frame omnid.core omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.places omnid.errors",

@@ -42,8 +42,11 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 def run(args: argparse.Namespace) -> int:
     """Return 0 where the rig was written, 1 where the drive did not make it better."""
     from omnid.calibration.drive import calibrate_drive
+    from omnid.engine.kernel_cache import prepare_kernels
+    from omnid.engine.logging_setup import log
 
     _check(args)
+    prepare_kernels(log)
     found = calibrate_drive(args.logs, read_rig(args.rig), (args.lower, args.upper),
                             lambda line: print(line, file=sys.stderr))
     print("\n".join(describe(found)))

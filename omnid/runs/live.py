@@ -28,6 +28,7 @@ from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
@@ -80,6 +81,7 @@ class LiveRun:
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
+        prepare_kernels(self._report)
         compile_serialisers()
         offset_ns = time.time_ns() - time.monotonic_ns()
         with ExitStack() as outputs:

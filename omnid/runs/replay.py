@@ -20,6 +20,8 @@ from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.logging_setup import log as log_line
 from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
@@ -113,6 +115,7 @@ class _Replay:
         check_outputs(self._options.files, self._inputs())
         if self._options.map_tum and not self._config.places.enabled:
             raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
+        prepare_kernels(log_line)
         graph = Graph(policy=NEWEST if self._options.realtime else LOSSLESS, threaded=not self._options.inline,
                       depth=self._config.graph.depth)
         with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:

@@ -1,0 +1,111 @@
+"""Functions compiled to machine code by numba: the one way in which loops over pixels and landmarks become fast.
+
+A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: the code
+kept on disk is made again when one of them changes (engine/kernel_cache.py), and constants of other files would not be
+noticed. There is no second version in Python. Results are the same bytes in every run: no reordering of sums
+(fastmath), no threads inside. The global lock of Python is released meanwhile.
+
+numba is imported at the first compilation, not with this module: most commands compile nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final, Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# error_model: a division by zero gives inf or NaN as in numpy.
+OPTIONS: Final = {"nogil": True, "error_model": "numpy", "fastmath": False, "parallel": False}
+KERNEL_FILES: Final = "*_kernels.py"
+
+_declared: list[Kernel[Any, Any]] = []
+
+
+class Kernel(Generic[P, R]):
+    """A function that is compiled before it is called first; callable with what its signature allows."""
+
+    def __init__(self, function: Callable[P, R], signature: str, writes: tuple[str, ...]) -> None:
+        self._function, self._signature, self._writes = function, signature, writes
+        self._compiled: Any = None
+        self.__doc__, self.__name__ = function.__doc__, function.__name__
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the function, which is compiled first if that was not done."""
+        if self._compiled is None:
+            self.compile()
+        result: R = self._compiled(*args, **kwargs)
+        return result
+
+    def compile(self, *, kept: bool = False) -> None:
+        """Compile the function for its signature; kept: read it from numba's folder, or write it there."""
+        dispatcher = self._dispatcher()
+        if kept:
+            dispatcher.enable_caching()
+        dispatcher.compile(self._types())
+        dispatcher.disable_compile()  # other types are an error, not a wait of seconds
+        self._compiled = dispatcher
+
+    def _dispatcher(self) -> Any:
+        import numba
+
+        return numba.njit(**OPTIONS)(self._function)
+
+    def _types(self) -> tuple[Any, ...]:
+        """Return the types of the arguments: arrays that are not written may be read-only ones."""
+        from numba.core import sigutils, types
+
+        arguments, _ = sigutils.normalize_signature(self._signature)
+        names = self._function.__code__.co_varnames
+        return tuple(
+            types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self._writes)
+            if isinstance(kind, types.Array) else kind for kind, name in zip(arguments, names, strict=False)
+        )
+
+
+class Inner(Generic[P, R]):
+    """A function that only compiled functions call; it becomes part of them."""
+
+    def __init__(self, function: Callable[P, R]) -> None:
+        self._function = function
+        self._dispatcher: Any = None
+        self.__doc__, self.__name__ = function.__doc__, function.__name__
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the function as it is written in Python, as a test does."""
+        return self._function(*args, **kwargs)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """The type by which numba compiles calls of this object."""
+        import numba
+
+        if self._dispatcher is None:
+            self._dispatcher = numba.njit(**OPTIONS)(self._function)
+        return self._dispatcher._numba_type_
+
+
+def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Return a decorator that compiles a function.
+
+    signature: numba's types of the arguments, such as "(f8[:, ::1], i8)"; "::1" marks arrays that are contiguous.
+    writes: names of the arrays that the function writes to; all others may be read-only.
+    """
+
+    def decorate(function: Callable[P, R]) -> Kernel[P, R]:
+        kernel = Kernel(function, signature, writes)
+        _declared.append(kernel)
+        return kernel
+
+    return decorate
+
+
+def inner(function: Callable[P, R]) -> Inner[P, R]:
+    """Make a function part of the compiled functions that call it."""
+    return Inner(function)
+
+
+def declared() -> Iterator[Kernel[Any, Any]]:
+    """Return the compiled functions of all files that were imported so far, in the order of their declaration."""
+    return iter(tuple(_declared))

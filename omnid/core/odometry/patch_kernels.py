@@ -1,0 +1,249 @@
+"""Compiled part of the fit of patches: see patch_fit.py for the equations and the meaning of the arguments."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.compiled import compiled, inner
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+WINDOW_PX = 13
+PIXELS = WINDOW_PX * WINDOW_PX
+ITERATIONS, CONVERGED_PX = 12, 0.004
+GAIN_SIGMA = 0.05  # of a patch about the gain of all patches of its image: vignetting, slanted light
+LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # between two images whose exposures were made equal before
+MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window: less is no texture
+MIN_DETERMINANT = 1e-3  # of the gradients' matrix by the square of its trace: less is an edge that slides along itself
+# Interpolation makes the noise of neighbouring pixels alike: a sum over a window of a panorama varies so much more.
+NOISE_CORRELATION = 3.0
+# Variance of a gradient of the panorama's noise per variance of the noise: it enlarges the gradients' matrix.
+GRADIENT_NOISE = 0.12
+MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture
+MIDDLE_GREY = np.float32(128.0)  # taken off, so that float32 loses less
+SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)  # of Scharr's operator
+# Columns of a row of a window in memory: a multiple of what the processor adds at once. Those beyond the window hold
+# zeros in the design. Sums are kept by column until the last row, so that their order is fixed.
+LANES = 16
+
+
+@compiled("(u1[:, :, ::1], u1[:, :, ::1], i8[:], f8, f8[:, ::1], f8[:, :, ::1], b1[::1])",
+          writes=("shift", "covariance", "fits"))
+def fit(templates: Image, cells: Image, groups: Indices, noise_grey: float, shift: Array, covariance: Array,
+        fits: Flags) -> None:
+    """Write shift (N, 2), covariance (N, 2, 2) and fits (N,) of `patch_fit.fit_patches`."""
+    count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
+    designs = np.zeros((count, 3, WINDOW_PX, LANES), np.float32)
+    template = np.zeros((WINDOW_PX + 2, LANES + 2), np.float32)
+    cell = np.zeros((cells.shape[1], cells.shape[1] + LANES + 1), np.float32)
+    lanes = np.empty((9, LANES), np.float32)
+    sums, normals, ratio = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count)
+    for n in range(count):
+        write_design(templates[n], template, designs[n])
+        write_products(designs[n], lanes, sums[n], normals[n])
+        ratio[n] = np.sqrt(centred_energy(cells[n], reach) / max(normals[n, 2, 2], 1.0))
+    gain = group_medians(ratio, groups)
+    prior = 2 * max(noise_grey, 1.0) ** 2 / GAIN_SIGMA**2
+    inverse, solution = np.empty((3, 3)), np.empty(3)
+    for n in range(count):
+        normal = normals[n]
+        trace = normal[0, 0] + normal[1, 1]
+        determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
+        shift[n], covariance[n], fits[n] = 0.0, 0.0, False
+        if normal[2, 2] <= PIXELS * MIN_CONTRAST**2 or determinant <= MIN_DETERMINANT * trace**2:
+            continue
+        invert(normal, prior, inverse)
+        copy_of(cells[n], 0, cell)
+        residual = solve(designs[n], cell, lanes, reach, sums[n], normal, inverse, prior * gain[n], shift[n], solution)
+        fits[n] = max(abs(shift[n, 0]), abs(shift[n, 1])) < reach and LEAST_GAIN < solution[2] < LARGEST_GAIN
+        write_covariance(inverse, residual, min(max(solution[2], LEAST_GAIN), LARGEST_GAIN), covariance[n])
+
+
+@inner
+def copy_of(image: Image, first: int, into: Floats) -> None:
+    """Write the greys of a square of an image, from pixel (first, first) on, less MIDDLE_GREY."""
+    for row in range(into.shape[0]):
+        for column in range(into.shape[0]):
+            into[row, column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
+
+
+@inner
+def write_design(image: Image, template: Floats, design: Floats) -> None:
+    """Write minus the gradients along column and row (Scharr's 3x3 operator), and the window, into (3, WINDOW, LANES).
+
+    The window is the middle of the image (T, T). template (WINDOW + 2, LANES + 2): room for it and its border.
+    """
+    copy_of(image, image.shape[0] // 2 - WINDOW_PX // 2 - 1, template)
+    for row in range(WINDOW_PX):
+        above, here, below = template[row], template[row + 1], template[row + 2]
+        for lane in range(LANES):
+            nw, n, ne = above[lane], above[lane + 1], above[lane + 2]
+            sw, s, se = below[lane], below[lane + 1], below[lane + 2]
+            design[0, row, lane] = SIDE_WEIGHT * ((nw - ne) + (sw - se)) + INNER_WEIGHT * (here[lane] - here[lane + 2])
+            design[1, row, lane] = SIDE_WEIGHT * ((nw - sw) + (ne - se)) + INNER_WEIGHT * (n - s)
+            design[2, row, lane] = here[lane + 1]
+        for lane in range(WINDOW_PX, LANES):
+            design[0, row, lane] = design[1, row, lane] = design[2, row, lane] = 0.0
+
+
+@inner
+def write_products(design: Floats, lanes: Floats, sums: Array, normal: Array) -> None:
+    """Write the sums (3,) of the design's rows, and their products (3, 3) about the means; lanes (9, LANES): room."""
+    lanes[:] = 0.0
+    for row in range(WINDOW_PX):
+        for lane in range(LANES):
+            across, down, grey = design[0, row, lane], design[1, row, lane], design[2, row, lane]
+            lanes[0, lane] += across
+            lanes[1, lane] += down
+            lanes[2, lane] += grey
+            lanes[3, lane] += across * across
+            lanes[4, lane] += across * down
+            lanes[5, lane] += down * down
+            lanes[6, lane] += across * grey
+            lanes[7, lane] += down * grey
+            lanes[8, lane] += grey * grey
+    for a in range(3):
+        sums[a] = total_of(lanes[a])
+    product = 3
+    for b in range(3):
+        for a in range(b + 1):
+            normal[a, b] = normal[b, a] = total_of(lanes[product]) - sums[a] * sums[b] / PIXELS
+            product += 1
+
+
+@inner
+def total_of(lanes: Floats) -> float:
+    """Return the sum of all lanes."""
+    total = 0.0
+    for lane in range(LANES):
+        total += lanes[lane]
+    return total
+
+
+@inner
+def centred_energy(cell: Image, reach: int) -> float:
+    """Return the sum of squares of the unshifted window about its mean."""
+    total, squares = 0, 0
+    for row in range(WINDOW_PX):
+        for column in range(WINDOW_PX):
+            grey = int(cell[reach + row, reach + column])
+            total += grey
+            squares += grey * grey
+    return squares - total * total / PIXELS
+
+
+@inner
+def group_medians(ratio: Array, groups: Indices) -> Array:
+    """Return for each patch (N,) the median ratio of its group, within the range of gains."""
+    gain, chosen = np.zeros(len(ratio)), np.empty(len(ratio))
+    for n in range(len(ratio)):
+        if gain[n] > 0:
+            continue
+        count = 0
+        for k in range(n, len(ratio)):
+            if groups[k] == groups[n]:
+                chosen[count] = ratio[k]
+                count += 1
+        sort(chosen, count)
+        median = (chosen[(count - 1) // 2] + chosen[count // 2]) / 2
+        median = min(max(median, LEAST_GAIN), LARGEST_GAIN)
+        for k in range(n, len(ratio)):
+            if groups[k] == groups[n]:
+                gain[k] = median
+    return gain
+
+
+@inner
+def sort(values: Array, count: int) -> None:
+    """Sort the first values (Shell 1959, gaps of Ciura 2001): numpy's sort takes seconds to compile."""
+    for gap in (1750, 701, 301, 132, 57, 23, 10, 4, 1):
+        for last in range(gap, count):
+            value, place = values[last], last
+            while place >= gap and values[place - gap] > value:
+                values[place] = values[place - gap]
+                place -= gap
+            values[place] = value
+
+
+@inner
+def invert(normal: Array, prior: float, inverse: Array) -> None:
+    """Write the inverse (3, 3) of the normal matrix with the prior of the gain."""
+    a, b, c = normal[0, 0], normal[0, 1], normal[0, 2]
+    d, e, f = normal[1, 1], normal[1, 2], normal[2, 2] + prior
+    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1 / (a * m00 + b * m01 + c * m02)
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = m00 * scale, (a * f - c * c) * scale, (a * d - b * b) * scale
+    inverse[0, 1] = inverse[1, 0] = m01 * scale
+    inverse[0, 2] = inverse[2, 0] = m02 * scale
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
+
+
+@inner
+def solve(design: Floats, cell: Floats, lanes: Floats, reach: int, sums: Array, normal: Array, inverse: Array,
+          of_gain: float, shift: Array, solution: Array) -> float:
+    """Iterate shift (2,) and solution (3,) until they converge or leave the reach; return the mean squared residual.
+
+    lanes (9, LANES): room for sums.
+    """
+    dx, dy, p0, p1, p2, energy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for _ in range(ITERATIONS):
+        # 1. The bilinear window at the shift, and its products with the design and with itself.
+        x, y = min(max(dx, -reach), reach), min(max(dy, -reach), reach)
+        left, top = min(int(np.floor(x)), reach - 1), min(int(np.floor(y)), reach - 1)
+        fx, fy = x - left, y - top
+        nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
+        sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
+        lanes[:5] = 0.0
+        for row in range(WINDOW_PX):
+            above = cell[reach + top + row, reach + left :]
+            below = cell[reach + top + row + 1, reach + left :]
+            for lane in range(LANES):
+                grey = nw * above[lane] + ne * above[lane + 1] + sw * below[lane] + se * below[lane + 1]
+                lanes[0, lane] += design[0, row, lane] * grey
+                lanes[1, lane] += design[1, row, lane] * grey
+                lanes[2, lane] += design[2, row, lane] * grey
+                lanes[3, lane] += grey
+                lanes[4, lane] += grey * grey
+        total, energy = 0.0, 0.0
+        for lane in range(WINDOW_PX):
+            total += lanes[3, lane]
+            energy += lanes[4, lane]
+        mean = total / PIXELS
+        energy -= total * mean
+        p0, p1 = total_of(lanes[0]) - sums[0] * mean, total_of(lanes[1]) - sums[1] * mean
+        p2 = total_of(lanes[2]) - sums[2] * mean
+        # 2. The step.
+        for a in range(3):
+            solution[a] = inverse[a, 0] * p0 + inverse[a, 1] * p1 + inverse[a, 2] * (p2 + of_gain)
+        scale = 1 / min(max(solution[2], LEAST_GAIN), LARGEST_GAIN)
+        step_x, step_y = solution[0] * scale, solution[1] * scale
+        dx += min(max(step_x, -1.0), 1.0)
+        dy += min(max(step_y, -1.0), 1.0)
+        if max(abs(step_x), abs(step_y)) <= CONVERGED_PX or max(abs(dx), abs(dy)) >= reach:
+            break
+    shift[0], shift[1] = dx, dy
+    # |y - M^T s|^2 of the last step, without computing the differences.
+    explained = 2 * (p0 * solution[0] + p1 * solution[1] + p2 * solution[2])
+    for a in range(3):
+        for b in range(3):
+            explained -= solution[a] * normal[a, b] * solution[b]
+    return float(max(energy - explained, 0.0) / PIXELS)
+
+
+@inner
+def write_covariance(inverse: Array, residual: float, gain: float, covariance: Array) -> None:
+    """Write the covariance (2, 2) [px^2] of a shift from the mean squared residual and the fitted gain."""
+    variance = residual * PIXELS / (PIXELS - 4) / gain**2
+    # Noise in the template looks like texture: its part of the gradients' matrix is taken off.
+    determinant = inverse[0, 0] * inverse[1, 1] - inverse[0, 1] ** 2
+    trace = (inverse[0, 0] + inverse[1, 1]) / max(determinant, 1e-12)
+    noise = GRADIENT_NOISE * PIXELS * variance / 2
+    texture = min(max(1 - 2 * noise / max(trace, 1e-9), MIN_TRUE_GRADIENT), 1.0)
+    for a in range(2):
+        for b in range(2):
+            covariance[a, b] = NOISE_CORRELATION * variance / texture * inverse[a, b]

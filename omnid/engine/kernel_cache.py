@@ -1,0 +1,188 @@
+"""Compiled functions (core/compiled.py) made ready before the first image, and kept on disk between two starts.
+
+A folder holds the code of one state of the sources, of one version of numba and Python and of one processor. It is
+filled in a folder of another name, which gets its name when it is complete, and its files are checked by their digests
+before they are read: a power cut, a full disk or two programs at once cannot leave code that is half written. Folders
+of other states are removed, the oldest first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import logging
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import omnid.core
+from omnid.core.compiled import KERNEL_FILES, declared
+from omnid.errors import OmnidError
+
+MAX_FOLDERS: Final = 4  # of other states that are kept
+MAX_BYTES: Final = 64 << 20  # of a folder that is read: a larger one is none of ours
+DIGESTS: Final = "digests.json"
+_OWN_ONLY: Final = 0o022  # bits of a mode by which others could write: what is read here is run
+Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
+
+_state = {"ready": False}
+
+
+def prepare_kernels(report: Report) -> None:
+    """Compile all functions, or read them from the disk; report what takes long, and what is not kept.
+
+    The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run
+    time.
+    """
+    if _state["ready"]:
+        return
+    try:
+        import numba  # noqa: F401 - it tries to make executable memory
+    except OSError as error:
+        raise OmnidError("the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
+                         f"the service, or what else denies executable memory ({error})") from error
+    files = _kernel_files()
+    for name in files:
+        importlib.import_module(name)
+    folder = _folder_of_state(files.values())
+    reason = _why_unusable(folder.parent)
+    if not reason and _is_intact(folder):
+        _compile_into(folder)
+    else:
+        _compile_first(folder, reason, report)
+    _state["ready"] = True
+
+
+def _compile_first(folder: Path, reason: str, report: Report) -> None:
+    """Compile what is not on the disk; reason: why it cannot be kept there, empty where it can."""
+    started_s = time.monotonic()
+    report(logging.INFO, f"compiling {sum(1 for _ in declared())} functions for this processor, once; takes up to a "
+           "minute")
+    if reason:
+        _compile_into(None)
+    else:
+        try:
+            _compile_and_publish(folder)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            _compile_into(None)
+    took_s = time.monotonic() - started_s
+    if reason:
+        report(logging.WARNING, f"the compiled functions cannot be kept in {folder.parent}: {reason}: every start "
+               f"takes {took_s:.0f} s longer; make that folder writable, or set OMNID_CACHE_DIR to another one")
+    else:
+        report(logging.INFO, f"compiled in {took_s:.0f} s; kept in {folder}")
+
+
+def cache_folder() -> Path:
+    """Return the folder for what omnid can make again: of the service (systemd), of the user, or OMNID_CACHE_DIR."""
+    if own := os.environ.get("OMNID_CACHE_DIR"):
+        return Path(own)
+    if of_service := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
+        return Path(of_service)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "omnid"
+
+
+def _kernel_files() -> dict[str, Path]:
+    """Return the files with compiled functions by the names of their modules."""
+    root = Path(omnid.core.__path__[0])
+    return {f"omnid.core.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path
+            for path in sorted(root.rglob(KERNEL_FILES))}
+
+
+def _folder_of_state(files: Iterable[Path]) -> Path:
+    """Return the folder for the code of these sources, versions and processor."""
+    import llvmlite.binding as llvm
+    import numba
+    import numpy as np
+
+    digest = hashlib.sha256()
+    processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    environment = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
+    digest.update(repr((sys.version, numba.__version__, np.__version__, processor, environment)).encode())
+    for path in (Path(omnid.core.__path__[0]) / "compiled.py", *files):
+        # numba compares the times of files, and names its own files by their paths.
+        digest.update(repr((str(path), path.stat().st_mtime_ns)).encode() + path.read_bytes())
+    return cache_folder() / f"kernels-{digest.hexdigest()[:20]}"
+
+
+def _why_unusable(folder: Path) -> str:
+    """Return why nothing can be kept in a folder, which is made if needed; empty if it can."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        if status.st_uid != os.geteuid() or status.st_mode & _OWN_ONLY:
+            return "it belongs to another user, or others can write to it"
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def _compile_into(folder: Path | None) -> None:
+    """Compile all functions that are not in the folder; None: keep none."""
+    import numba
+
+    if folder is not None:
+        numba.config.CACHE_DIR = str(folder)
+    for kernel in declared():
+        kernel.compile(kept=folder is not None)
+
+
+def _compile_and_publish(folder: Path) -> None:
+    """Compile all functions into a new folder, and give it its name."""
+    making = Path(tempfile.mkdtemp(prefix="making-", dir=folder.parent))
+    try:
+        _compile_into(making)
+        digests = json.dumps(_digests(making))
+        with open(making / DIGESTS, "x") as file:
+            file.write(digests)
+        if folder.exists():  # damaged, or another program was faster
+            folder.rename(making / "before")
+        making.rename(folder)
+        shutil.rmtree(folder / "before", ignore_errors=True)
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
+    _remove_others(folder)
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Return the digests of all files in a folder."""
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(folder.rglob("*")) if path.is_file() and path.name != DIGESTS}
+
+
+def _is_intact(folder: Path) -> bool:
+    """True if a folder is complete and its files are those that were written."""
+    try:
+        status = folder.stat()
+        if status.st_uid != os.geteuid() or status.st_mode & _OWN_ONLY:
+            return False
+        if sum(path.stat().st_size for path in folder.rglob("*")) > MAX_BYTES:
+            return False
+        expected = json.loads((folder / DIGESTS).read_text())
+        return bool(expected) and expected == _digests(folder)
+    except (OSError, ValueError):
+        return False
+
+
+def _remove_others(folder: Path) -> None:
+    """Remove the folders of other states beyond MAX_FOLDERS, the oldest first, and what was left half made."""
+    with suppress(OSError):
+        others = sorted((path for path in folder.parent.glob("kernels-*") if path != folder),
+                        key=lambda path: path.stat().st_mtime, reverse=True)
+        for path in others[MAX_FOLDERS:]:
+            shutil.rmtree(path, ignore_errors=True)
+        day_ago_s = time.time() - 86400
+        for path in folder.parent.glob("making-*"):
+            if path.stat().st_mtime < day_ago_s:
+                shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,87 @@
+"""Compiled functions: made ready in programs of their own, kept on disk, and made again where the files are damaged."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# One function of its own, so that a test takes a second: the files of core compile in conftest.py already.
+PROGRAM = """
+import logging, sys
+from omnid.engine import kernel_cache
+from omnid.core import compiled
+import tests.omnid.engine.sample_kernels as sample
+kernel_cache._kernel_files = lambda: {sample.__name__: __import__("pathlib").Path(sample.__file__)}
+if sys.argv[1:] == ["deny"]:
+    import ctypes
+    if ctypes.CDLL(None, use_errno=True).prctl(65, 1, 0, 0, 0) != 0:  # PR_SET_MDWE, PR_MDWE_REFUSE_EXEC_GAIN
+        sys.exit(77)
+kernel_cache.prepare_kernels(lambda level, line: print(logging.getLevelName(level), line))
+import numpy as np
+out = np.zeros(2)
+sample.halves(np.array([3.0, 5.0]), out)
+print(out.tolist(), sum(kernel._compiled.stats.cache_hits.total() for kernel in compiled.declared()))
+"""
+
+
+def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "OMNID_CACHE_DIR": str(cache)}
+    return subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=False,
+                          env=environment, cwd=Path(__file__).parents[3])
+
+
+def test_functions_are_compiled_once_and_read_from_then_on(tmp_path: Path) -> None:
+    first, second = run(tmp_path / "cache"), run(tmp_path / "cache")
+    assert first.stdout.splitlines()[0].startswith("INFO compiling 1 functions")
+    assert first.stdout.splitlines()[1].startswith("INFO compiled in ")
+    assert first.stdout.splitlines()[2:] == ["[1.5, 2.5] 0"]
+    assert second.stdout.splitlines() == ["[1.5, 2.5] 1"], second.stderr
+
+
+def test_damaged_files_are_never_read(tmp_path: Path) -> None:
+    run(tmp_path)
+    (folder,) = tmp_path.glob("kernels-*")
+    code = next(folder.rglob("*.nbc"))
+    damaged = bytearray(code.read_bytes())
+    damaged[len(damaged) // 2] ^= 0xFF
+    code.write_bytes(damaged)
+    again = run(tmp_path)
+    assert again.stdout.splitlines()[0].startswith("INFO compiling") and again.stdout.endswith("[1.5, 2.5] 0\n")
+    (folder / "digests.json").write_text("{")
+    assert run(tmp_path).stdout.startswith("INFO compiling")
+    assert run(tmp_path).stdout == "[1.5, 2.5] 1\n"
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_a_folder_that_cannot_be_used_gives_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for folder, reason in ((tmp_path / "file", "File exists"), (tmp_path / "open", "others can write")):
+        if folder.name == "open":
+            folder.mkdir()
+            folder.chmod(0o777)
+        done = run(folder)
+        assert "WARNING the compiled functions cannot be kept" in done.stdout and reason in done.stdout
+        assert "OMNID_CACHE_DIR" in done.stdout
+        assert done.stdout.endswith("[1.5, 2.5] 0\n"), done.stderr
+    assert not list((tmp_path / "open").iterdir())
+
+
+def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
+    done = run(tmp_path, "deny")
+    if done.returncode == 77:
+        pytest.skip("this kernel has no PR_SET_MDWE (Linux 6.3)")
+    assert "OmnidError: the system allows no code that is compiled at run time: remove MemoryDenyWrite" in done.stderr
+
+
+def test_old_folders_are_removed(tmp_path: Path) -> None:
+    for index in range(7):
+        old = tmp_path / f"kernels-{index}"
+        old.mkdir()
+        os.utime(old, (index, index))
+    run(tmp_path)
+    kept = {path.name for path in tmp_path.iterdir()}
+    assert len(kept) == 5 and {f"kernels-{index}" for index in (3, 4, 5, 6)} < kept
