@@ -193,18 +193,16 @@ class MapLocaliser:
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
         T_map_rect = self._T_map_odom @ frame.T_odom_rect
-        drift_m: dict[int, float] = {}
-        for id, part in self._part_of.items():
-            path_m = self._path_m - self._path_at.get(id, -math.inf)
-            if part != self._part or path_m < LOCAL_M or not self._is_place(id):
-                continue
-            if self._recognised_at is not None:
-                since_m = self._path_m - self._recognised_at[0]
-                path_m = min(path_m, since_m + float(np.linalg.norm(
-                    self.places.poses[id][:3, 3] - self._recognised_at[1])))
-            drift_m[id] = path_m
-        error_m = {id: GATE_M + GATE_PER_M * path_m for id, path_m in drift_m.items()}
-        error_rad = {id: GATE_RAD + GATE_RAD_PER_M * path_m for id, path_m in drift_m.items()}
+        ids = [id for id, part in self._part_of.items() if part == self._part and self._is_place(id)]
+        drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
+        left = drift_m >= LOCAL_M
+        ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
+        if self._recognised_at is not None:
+            path_m, at = self._recognised_at
+            apart_m = np.linalg.norm(self.places.positions(ids) - at, axis=1)
+            drift_m = np.minimum(drift_m, self._path_m - path_m + apart_m)
+        error_m = dict(zip(ids, (GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
+        error_rad = dict(zip(ids, (GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
         return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
 
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:

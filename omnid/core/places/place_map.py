@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,6 +102,10 @@ class PlaceMap:
     def loops(self) -> int:
         """Number of links from places that were recognised."""
         return sum(link.is_loop for link in self.links)
+
+    def positions(self, ids: Sequence[int]) -> Array:
+        """Return the positions (N, 3) of keyframes in the map."""
+        return np.array([self.poses[id][:3, 3] for id in ids]).reshape(-1, 3)
 
     def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
         """Add a keyframe with the link of odometry that leads to it; None where there is no such link.

@@ -53,9 +53,10 @@ class PlaceSearch:
     def near(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
              ) -> Recognition | None:
         """Return the best recognition among keyframes near the expected pose that odometry does not contradict."""
-        at = expected.T_map_rect[:3, 3]
-        ids = [id for id, error_m in expected.error_m.items()
-               if np.linalg.norm(places.poses[id][:3, 3] - at) < NEAR_M + error_m]
+        known = list(expected.error_m)
+        apart_m = np.linalg.norm(places.positions(known) - expected.T_map_rect[:3, 3], axis=1)
+        near = apart_m < NEAR_M + np.array(list(expected.error_m.values()))
+        ids = [known[n] for n in np.flatnonzero(near).tolist()]
         enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
         found = [place for place in self._compare(small, features, (places, ids), NEAR_CANDIDATES, enough)
                  if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS]
@@ -83,7 +84,7 @@ class PlaceSearch:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
         similar, turns_rad = similarities(signature_of(small), others)
-        chosen = _spread(np.argsort(-similar, kind="stable"), np.array([places.poses[id][:3, 3] for id in ids]), most)
+        chosen = _spread(np.argsort(-similar, kind="stable"), places.positions(ids), most)
         found: list[Recognition] = []
         for n in chosen:
             there = places.keyframes[ids[n]].features

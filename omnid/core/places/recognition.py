@@ -87,10 +87,9 @@ def matches(a: PlaceFeatures, b: PlaceFeatures, turn_rad: float, model: StereoMo
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     squared = distances(a, b)
     # Azimuth falls with the column, and a turn to the left moves the world to the right.
-    shift = model.cylinder.focal_px * turn_rad
-    columns_a, columns_b = a.views[:, 0].astype(float), b.views[:, 0].astype(float)
-    aside = model.cylinder.wrap(columns_b[None] - columns_a[:, None] - shift)
-    squared[np.abs(aside) > YAW_WINDOW_RAD * model.cylinder.focal_px] = np.inf
+    turned = a.views[:, 0] + np.float32(model.cylinder.focal_px * turn_rad)
+    aside = _apart(turned, b.views[:, 0], model.cylinder.width)
+    squared[aside > YAW_WINDOW_RAD * model.cylinder.focal_px] = np.inf
     best = squared.argmin(axis=1)
     nearest = squared[np.arange(len(squared)), best]
     second = np.partition(squared, 1, axis=1)[:, 1]
@@ -102,10 +101,10 @@ def matches(a: PlaceFeatures, b: PlaceFeatures, turn_rad: float, model: StereoMo
 def near_matches(a: PlaceFeatures, b: PlaceFeatures, predicted: Array, model: StereoModel) -> tuple[Indices, Indices]:
     """Return indices (M,) into a and b of mutual nearest neighbours near the views (N, 3) that a pose predicts of a."""
     squared = distances(a, b)
-    aside = model.cylinder.wrap(b.views[None, :, 0].astype(float) - predicted[:, None, 0])
-    far = (np.abs(aside) > REACH_PX) | (squared > LARGEST_SQUARED)
+    there = predicted.astype(np.float32)
+    far = (_apart(there[:, 0], b.views[:, 0], model.cylinder.width) > REACH_PX) | (squared > LARGEST_SQUARED)
     for row in (1, 2):
-        far |= np.abs(b.views[None, :, row] - predicted[:, None, row].astype(np.float32)) > REACH_PX
+        far |= np.abs(b.views[None, :, row] - there[:, None, row]) > REACH_PX
     squared[far] = np.inf
     best = squared.argmin(axis=1)
     nearest = squared[np.arange(len(squared)), best]
@@ -118,3 +117,9 @@ def distances(a: PlaceFeatures, b: PlaceFeatures) -> NDArray[np.float32]:
     """Return the squared distances (N, M) of the descriptors."""
     x, y = a.descriptors.astype(np.float32), b.descriptors.astype(np.float32)
     return np.asarray((x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None] - 2 * x @ y.T)
+
+
+def _apart(a: NDArray[np.float32], b: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Return the distances (N, M) [px] of columns around a panorama."""
+    apart = b[None] - a[:, None]
+    return np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width)))
