@@ -150,6 +150,8 @@ class PlacesConfig:
     map: str = knob("", "map of places (.omap) to localise in, made by `omnid map build`; a run that recognises it "
                     "extends it")
     localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
+    save_s: float = knob(60.0, "time between two saves of the extended map, s; it is also saved at the end",
+                         low=1, high=86400)
     limits: PlaceLimits = field(default_factory=PlaceLimits)
 
 
@@ -300,6 +302,7 @@ USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
     "graph.depth": "replay",
     "live": "run",
     "log": "replay",
+    "places.save_s": "run",
     "realtime": "run",
     "record": "run",
     "record.cloud_points": "",

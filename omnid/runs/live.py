@@ -33,6 +33,7 @@ from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.refinement.rig_refinement import RigRefinement
+from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
@@ -96,7 +97,12 @@ class LiveRun:
             cv2.setNumThreads(self._config.graph.opencv_threads)
             for refused in prepare(self._config.realtime):
                 session.warn(refused)
-            self._graph.run()
+            try:
+                self._graph.run()
+            except BaseException:
+                with suppress(OmnidError):  # the error that ended the run is the one that is told
+                    run_places.finish()
+                raise
             run_places.finish()
         return 0
 
@@ -154,6 +160,10 @@ class LiveRun:
         if config.live.shed_load:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
+        saver = MapSaver(run_places, stages.places, config.places.save_s) \
+            if stages.places and run_places.is_extended else None
+        if saver is not None:
+            graph.ticker("save", saver.PERIOD_S, saver)
         commands = self._commands(session, bus, controller, recorder) if controller else None
         sources = StatusSources(
             graph.telemetry,
@@ -166,7 +176,7 @@ class LiveRun:
             TICKERS,
             (ladder.status, partial(start_status, stages.rig_gate),
              *([partial(places_status, stages.places)] if stages.places else ()),
-             *(part.status for part in (bus, recorder, rig_monitor, refinement) if part)),
+             *(part.status for part in (bus, recorder, rig_monitor, refinement, saver) if part)),
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
 

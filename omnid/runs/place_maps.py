@@ -49,6 +49,7 @@ class RunPlaces:
         if self._path is not None and self._writes:
             check_outputs([("--map", self._path)], [])
         self.places = given.places if given else new_places(settings) if build else None
+        self._saved = frozenset[int]()  # keyframes in the file
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         if given is not None and self._known:
             self._compare(given)
@@ -70,6 +71,24 @@ class RunPlaces:
             self._warn(f"{name}: the rig was calibrated again since this map was made")
         seen_by(given.places, given.rig, self._rig)
 
+    @property
+    def is_extended(self) -> bool:
+        """True if the file of the map is written by this run."""
+        return self._writes
+
+    def save(self, places: PlaceMap) -> bool:
+        """Write a copy of the map, changed here, as far as it is joined; False where it has nothing new.
+
+        Raises OmnidError if the file cannot be written.
+        """
+        joined = self._joined(places)
+        if self._path is None or not joined - self._known or joined == self._saved:
+            return False
+        keep_only(places, joined)
+        write_places(self._path, places, self._rig)
+        self._saved = joined
+        return True
+
     def finish(self) -> RigPlaces | None:
         """Return the map after the run, what is not joined to it left out; write it where it was extended.
 
@@ -77,7 +96,7 @@ class RunPlaces:
         """
         if self.places is None:
             return None
-        joined = self._joined()
+        joined = self._joined(self.places)
         new = len(joined - self._known)
         unjoined = len(self.places.keyframes.keys() - joined - self._known)
         keep_only(self.places, joined)
@@ -91,12 +110,12 @@ class RunPlaces:
             write_places(self._path, self.places, self._rig)
         return found
 
-    def _joined(self) -> set[int]:
+    def _joined(self, places: PlaceMap) -> frozenset[int]:
         """Return the keyframes that links join to the map that was given, or else the largest part."""
-        if self.places is None or not self.places.keyframes:
-            return set()
-        found = parts(self.places)
-        return set(next((part for part in found if self._known.intersection(part)), found[0]))
+        if not places.keyframes:
+            return frozenset()
+        found = parts(places)
+        return frozenset(next((part for part in found if self._known.intersection(part)), found[0]))
 
 
 def place_rig(geometry: Geometry) -> PlaceRig:

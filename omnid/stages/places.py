@@ -42,6 +42,17 @@ class Places:
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._to_rect = se3.adjoint(self._T_rect_rig)
         self.state = MapState.ODOMETRY_ONLY  # of the newest pose
+        self._copy_wanted = False
+        self._copy: PlaceMap | None = None
+
+    def want_copy(self) -> None:
+        """Ask for a copy of the map after the next pose; any thread may ask."""
+        self._copy_wanted = True
+
+    def take_copy(self) -> PlaceMap | None:
+        """Return the copy that was asked for, once; None while there is none. Its keyframes are those of the map."""
+        copy, self._copy = self._copy, None
+        return copy
 
     def map(self) -> PlaceMap:
         """Return the places whose poses are known relative to the first one: what can be saved."""
@@ -56,6 +67,8 @@ class Places:
         """Return the pose in the map at a pair."""
         pose = self._localiser.process(self._frame(odometry), idle=self._is_overloaded())
         self.state = pose.state
+        if self._copy_wanted:
+            self._copy_wanted, self._copy = False, self._localiser.places.part(self._localiser.places.keyframes)
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig
         covariance = in_axes(T_map_rig, self._to_rig @ pose.covariance @ self._to_rig.T)

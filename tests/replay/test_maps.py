@@ -1,7 +1,10 @@
-"""Maps of places by the command line: built from logs, extended, left as they are, refused."""
+"""Maps of places by the command line: built from logs, extended also by live runs, left as they are, refused."""
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +13,10 @@ import pytest
 from calib.rig_file import read_rig, write_rig
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
+from omnid.tracking_state import MapState
+from omnid.transport.status_names import Key
 from tests.replay.command import Command
+from tests.replay.live import Daemon, Operator, answers, command_line, free_port, started, wait_until
 from tests.simulation.rigs import with_upper_rotated
 
 
@@ -122,3 +128,51 @@ def test_build_refuses_what_it_cannot_do(omnid: Command, scene: Path, tmp_path: 
     assert "this is the log" in omnid.refused(*build, scene / "log.mcap")
     assert "cannot read the map" in omnid.refused(*build, tmp_path / "a.omap", "--extend")
     assert "places.enabled" in omnid.refused(*build, tmp_path / "a.omap", "--set", "places.enabled=false")
+
+
+@contextmanager
+def running(scene: Path, omap: Path, *words: object) -> Iterator[tuple[Daemon, Operator]]:
+    """Yield a daemon on the images of the scene, localised in the map."""
+    port = free_port()
+    command = command_line(scene, port, None, "--map", omap, "--set", "places.save_s=1", *words)
+    with started(command, port) as daemon:
+        wait_until(lambda: answers(port) or not daemon.alive, "the bus")
+        assert daemon.alive, daemon.process.communicate()[1]
+        operator = Operator(port)
+        try:
+            wait_until(lambda: operator.values("places").get(Key.STATE) == MapState.LOCALIZED, "localisation")
+            yield daemon, operator
+        finally:
+            operator.close()
+
+
+def sessions(omap: Path) -> set[int]:
+    return {keyframe.session for keyframe in read_places(omap)[0].keyframes.values()}
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, omap: Path) -> None:
+    with running(scene, omap) as (daemon, operator):
+        wait_until(lambda: sessions(omap) == {0, 1}, "a save")
+        wait_until(lambda: int(operator.values("map file").get("saves", "0")) >= 1, "the status of a save")
+        daemon.end(signal.SIGKILL)
+    assert sessions(omap) == {0, 1}
+    with running(scene, omap, "--set", "places.save_s=1000") as (daemon, operator):
+        wait_until(lambda: int(operator.values("places")["loops"]) > 3, "loops")
+        assert sessions(omap) == {0, 1}
+        code, err = daemon.end()
+        assert code == 0 and "Traceback" not in err, err
+    assert sessions(omap) == {0, 1, 2}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("default_signals")
+def test_a_map_that_cannot_be_saved_is_an_error_in_the_status(scene: Path, omap: Path) -> None:
+    """Its place is taken by a folder; the run goes on, and its exit code is that of the failed save at the end."""
+    with running(scene, omap) as (daemon, operator):
+        omap.unlink()
+        (omap / "taken").mkdir(parents=True)
+        wait_until(lambda: "cannot write the map" in operator.message("map file"), "the error")
+        assert int(operator.values("map file")["failed"]) >= 1 and daemon.alive
+        code, err = daemon.end()
+        assert code == 2 and "cannot write the map" in err and "Traceback" not in err, err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Final
 
@@ -65,7 +66,7 @@ def parts(places: PlaceMap) -> list[list[int]]:
     return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
 
 
-def keep_only(places: PlaceMap, ids: set[int]) -> None:
+def keep_only(places: PlaceMap, ids: Set[int]) -> None:
     """Remove all other keyframes from a map, and their links."""
     places.links = [link for link in places.links if link.a in ids and link.b in ids]
     for id in places.keyframes.keys() - ids:

@@ -122,4 +122,4 @@ def distances(a: PlaceFeatures, b: PlaceFeatures) -> NDArray[np.float32]:
 def _apart(a: NDArray[np.float32], b: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """Return the distances (N, M) [px] of columns around a panorama."""
     apart = b[None] - a[:, None]
-    return np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width)))
+    return np.asarray(np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width))))
