@@ -81,6 +81,21 @@ class ValidatedTable:
             self.fail(key, "a table")
         return ValidatedTable(self.values[key], self.file, self._dotted(key))
 
+    def tables(self, key: str, most: int) -> list[ValidatedTable]:
+        """Return the tables of an array under a key, at most so many; none where the key is missing."""
+        found = self.values.get(key, [])
+        if not (isinstance(found, list) and len(found) <= most and all(isinstance(item, Mapping) for item in found)):
+            self.fail(key, f"at most {most} tables [[{self._dotted(key)}]]")
+        return [ValidatedTable(item, self.file, f"{self._dotted(key)}[{number}]") for number, item in enumerate(found)]
+
+    def points(self, key: str, least: int, most: int) -> list[tuple[float, float]]:
+        """Return the points [x, y] under a key, least to most of them."""
+        found = self.values.get(key)
+        items: list[Any] = found if isinstance(found, list) and least <= len(found) <= most else [None]
+        if not all(isinstance(item, list) and len(item) == 2 and all(map(_is_number, item)) for item in items):
+            self.fail(key, f"{least} to {most} points [x, y]")
+        return [(float(x), float(y)) for x, y in items]
+
     def text(self, key: str) -> str:
         """Return the string under a key."""
         value = self.values.get(key)

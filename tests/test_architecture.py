@@ -128,8 +128,12 @@ ARROWS: Mapping[str, str] = {
     "omnid.settings": "calib.bounded_toml omnid.errors",
     "omnid.settings_dump": "omnid.settings",
     "omnid.settings_migration": "omnid.settings",
-    "omnid.simulation": "",
+    "omnid.simulation":
+        "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.errors drivers.frame drivers.motor "
+        "drivers.motors.protocols drivers.motors.simulated omnid.config omnid.controller omnid.core.control "
+        "omnid.engine omnid.errors omnid.messages omnid.runs omnid.simulation.rendering omnid.stages",
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3",
+    "omnid.simulation.worlds": "",
     "omnid.sinks":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
         "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.errors omnid.formats "

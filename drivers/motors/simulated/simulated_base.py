@@ -12,9 +12,12 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer
 
 STEP_S = 0.005  # of the integration
+REACHED = 1e-3  # m/s or rad/s: friction ends the lag
 LONGEST_ADVANCE_S = 60.0
 LEFT, RIGHT = SIDES = (0, 1)
 Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
+# Travel over the ground [m] of the left and the right wheel for a time [s] and the travel of their rims.
+Traction = Callable[[float, float, float], tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +28,12 @@ class MotionLimits:
     yaw_rate_radps: float = 2.0
     yaw_acceleration_radps2: float = 8.0
     heading_gain_hz: float = 3.0  # yaw rate per heading error
+    lag_s: float = 0.0  # time constant with which the speeds follow the commands
+
+
+def no_slip(_: float, left_m: float, right_m: float) -> tuple[float, float]:
+    """Return the travel of wheels that do not slip."""
+    return left_m, right_m
 
 
 class SimulatedBase:
@@ -50,6 +59,7 @@ class SimulatedBase:
         self._needs_stop = [False, False]
         self._since_command_s = [0.0, 0.0]
         self.limits = limits or MotionLimits()
+        self.traction: Traction = no_slip
 
     @property
     def watchdog_expired(self) -> bool:
@@ -126,10 +136,18 @@ class SimulatedBase:
     def _step(self, dt_s: float) -> None:
         self._update_watchdogs(dt_s)
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
-        self.velocity_mps += _clamp(velocity_mps - self.velocity_mps, self.limits.acceleration_mps2 * dt_s)
-        wanted_radps = _clamp(self._yaw_rate_to_goal(yaw_rate_radps), self.limits.yaw_rate_radps)
-        self.yaw_rate_radps += _clamp(wanted_radps - self.yaw_rate_radps, self.limits.yaw_acceleration_radps2 * dt_s)
+        limits = self.limits
+        self.velocity_mps += self._step_to(velocity_mps - self.velocity_mps, limits.acceleration_mps2, dt_s)
+        wanted_radps = _clamp(self._yaw_rate_to_goal(yaw_rate_radps), limits.yaw_rate_radps)
+        self.yaw_rate_radps += self._step_to(wanted_radps - self.yaw_rate_radps, limits.yaw_acceleration_radps2, dt_s)
         self._move(dt_s)
+
+    def _step_to(self, difference: float, acceleration: float, dt_s: float) -> float:
+        """Return the change of a speed towards a commanded one, with lag and limited acceleration."""
+        lag_s = self.limits.lag_s
+        if lag_s and abs(difference) > REACHED:
+            difference *= 1.0 - math.exp(-dt_s / lag_s)
+        return _clamp(difference, acceleration * dt_s)
 
     def _update_watchdogs(self, dt_s: float) -> None:
         before = self.watchdog_expired
@@ -146,12 +164,14 @@ class SimulatedBase:
         return self.limits.heading_gain_hz * _wrap(self.goal_heading_rad - self.pose[2])
 
     def _move(self, dt_s: float) -> None:
-        """Move the pose along the chord of the arc."""
+        """Move the pose along the chord of the arc that the wheels travel over the ground."""
         x_m, y_m, heading_rad = self.pose
-        rotation_rad, distance_m = self.yaw_rate_radps * dt_s, self.velocity_mps * dt_s
+        half_m = self.yaw_rate_radps * dt_s * self.drive.track_m / 2
+        rims_m = self.velocity_mps * dt_s - half_m, self.velocity_mps * dt_s + half_m
+        self.travel_m[LEFT] += rims_m[LEFT]
+        self.travel_m[RIGHT] += rims_m[RIGHT]
+        distance_m, rotation_rad = self._twist(*self.traction(dt_s, *rims_m))
         chord_rad = heading_rad + rotation_rad / 2
-        self.travel_m[LEFT] += distance_m - rotation_rad * self.drive.track_m / 2
-        self.travel_m[RIGHT] += distance_m + rotation_rad * self.drive.track_m / 2
         x_m, y_m = x_m + distance_m * math.cos(chord_rad), y_m + distance_m * math.sin(chord_rad)
         self.pose = (x_m, y_m, _wrap(heading_rad + rotation_rad))
 

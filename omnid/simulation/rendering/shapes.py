@@ -14,10 +14,10 @@ Random = np.random.Generator
 Point = tuple[float, float]
 
 
-def painted(rng: Random, kind: str, size_m: Point) -> Texture:
+def painted(rng: Random, kind: str, size_m: Point, px_per_m: float = PX_PER_M) -> Texture:
     """Return a texture of that kind (textures.PAINTERS) for a surface of so many metres."""
-    size = (max(8, round(size_m[0] * PX_PER_M)), max(8, round(size_m[1] * PX_PER_M)))
-    return textures.PAINTERS[kind](rng, size, PX_PER_M)
+    size = (max(8, round(size_m[0] * px_per_m)), max(8, round(size_m[1] * px_per_m)))
+    return textures.PAINTERS[kind](rng, size, px_per_m)
 
 
 def wall(rng: Random, kind: str, left: Point, right: Point) -> Rectangle:

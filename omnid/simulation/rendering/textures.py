@@ -72,7 +72,13 @@ def plain(rng: Random, size: Size, px_per_m: float) -> Texture:
     return _grey(rng.uniform(130, 180) + 1.2 * value_noise(rng, size, px_per_m * 1.0, 0.35))
 
 
-PAINTERS: dict[str, Painter] = {"brick": brick, "plaster": plaster, "granite": granite, "tiles": tiles, "plain": plain}
+def white(_: Random, size: Size, __: float) -> Texture:
+    """Return fresh white paint: one grey level, in which stereo finds nothing."""
+    return np.full(size[::-1], 225, np.uint8)
+
+
+PAINTERS: dict[str, Painter] = {"brick": brick, "plaster": plaster, "granite": granite, "tiles": tiles, "plain": plain,
+                                "white": white}
 
 
 def poster(rng: Random, size: Size) -> Texture:

@@ -1,0 +1,40 @@
+"""Images of both cameras of a simulated robot in its world."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.rig import Rig
+from drivers.frame import Camera, Frame
+from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Scene
+from omnid.simulation.world import World
+
+Array = NDArray[np.float64]
+CAMERAS: Final[tuple[Camera, Camera]] = ("lower", "upper")
+SAMPLES: Final = 2  # per pixel and axis
+
+
+class SimulatedCameras:
+    """Renders raw grey frames; an image follows from world, people, pose, sequence number and seed alone."""
+
+    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int) -> None:
+        self._world, self._seed = world, seed
+        self._mounted = {"lower": rig.lower, "upper": rig.upper}
+        self._sensors = {name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
+                         for name, mounted in self._mounted.items()}
+
+    def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *,
+              brightness: float = 1.0) -> Frame:
+        """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
+        mounted, sensor = self._mounted[camera], self._sensors[camera]
+        scene = Scene((*self._world.standing, *people.faces()))
+        ideal = render_grey(scene, mounted, T_world_rig, SAMPLES) * np.float32(brightness * self._world.brightness)
+        rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
+        width, height = mounted.camera.size
+        return Frame(seq, stamp_ns, camera, "mono8", sensor.expose(ideal, rng), width, height)

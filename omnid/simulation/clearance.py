@@ -1,0 +1,39 @@
+"""Distance of a robot's outline, a disc, from what stands in its world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.simulation.rendering.surfaces import Rectangle
+
+Array = NDArray[np.float64]
+FLOOR_M = 0.02  # what is lower than this is driven over
+
+
+def footprints(rectangles: Sequence[Rectangle], height_m: float) -> Array:
+    """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
+
+    Boxes and walls are closed by upright rectangles, so that their outlines are enough.
+    """
+    segments = []
+    for rectangle in rectangles:
+        corners = rectangle.corners
+        if np.ptp(corners[:, 2]) > FLOOR_M and corners[:, 2].min() < height_m and corners[:, 2].max() > FLOOR_M:
+            spread = corners[:, :2] - corners[0, :2]
+            far = int(np.argmax((spread**2).sum(axis=1)))
+            other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))
+            segments.append(corners[[far, other], :2])
+    return np.array(segments).reshape(-1, 2, 2)
+
+
+def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:
+    """Return the distance [m] from a disc to the nearest of segments (N, 2, 2); 0 or less: contact."""
+    if not len(segments):
+        return float("inf")
+    a, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    to_place = np.asarray(place) - a
+    share = np.clip((to_place * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    return float(np.linalg.norm(to_place - share[:, None] * along, axis=1).min()) - radius_m

@@ -1,0 +1,194 @@
+"""A drive in lock-step: the daemon's stages inline, the real controller, and a robot whose wheels change what it sees.
+
+Time is simulated: same world, robot, drive, seed and configuration, same bytes, on any host. Between two pairs of
+images the controller ticks; a pose reaches it robot.pose_delay_s after its images were exposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.rig import Rig
+from drivers.frame import Frame
+from omnid.config import Config
+from omnid.controller.statistics import ControllerState
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.heading_controller import Setpoint
+from omnid.engine.graph import Graph
+from omnid.messages import OdometryUpdate
+from omnid.runs.pipeline import Sinks, wire
+from omnid.simulation.cameras import CAMERAS, SimulatedCameras
+from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.vehicle import START_NS, Tick, Vehicle
+from omnid.simulation.world import World
+from omnid.stages.geometry import geometry
+from omnid.stages.lockstep_drive import controller_pose
+from omnid.stages.odometry import of_base
+from omnid.stages.synchronise import Synchronise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """State of a drive when a pair of images is due; the truth is for scripts that watch, not for planners."""
+
+    time_s: float  # since the start
+    T_world_base: Array  # (4, 4) true
+    odometry: OdometryUpdate | None  # the newest
+    T_odom_base: Array  # (4, 4) of it; the identity without one
+    controller: ControllerState
+
+
+# A setpoint of the operator, a request to arm, or a stop.
+Request: TypeAlias = Setpoint | Literal["arm", "stop"]
+# Sends requests as a person or a program would; called once for every pair of images.
+Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of the surroundings or of the hardware during a time [s]."""
+
+    kind: Literal["dark", "no lower image", "no upper image", "motor cut"]
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRun:
+    """The truth and the estimates of a drive; odom is the frame of the base at the first pair."""
+
+    stamps_ns: NDArray[np.int64]  # (N,) of the poses
+    T_world_base: Array  # (N, 4, 4) true
+    T_odom_base: Array  # (N, 4, 4) estimated
+    states: tuple[str, ...]  # of the poses
+    ticks: tuple[Tick, ...]
+    lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
+
+    @property
+    def truth_in_odom(self) -> Array:
+        """Return the true poses (N, 4, 4) in odom."""
+        return np.asarray(se3.inverse(self.T_world_base[:1]) @ self.T_world_base)
+
+    @property
+    def contacts(self) -> list[Tick]:
+        """Return the first tick of each contact with an obstacle."""
+        before = [None, *self.ticks]
+        return [tick for tick, last in zip(self.ticks, before, strict=False)
+                if tick.clearance_m <= 0 and (last is None or last.clearance_m > 0)]
+
+    @property
+    def clearance_m(self) -> float:
+        """Return the smallest distance of the robot's outline to an obstacle [m]."""
+        return min(tick.clearance_m for tick in self.ticks)
+
+
+def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: float, seed: int = 0,
+             config: Config | None = None, faults: Iterable[Fault] = ()) -> SimulatedRun:
+    """Drive for so many seconds of simulated time and return the run."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults)).run(seconds)
+    finally:
+        cv2.setNumThreads(threads)
+
+
+class _Lockstep:
+    def __init__(self, world: World, robot: SimulatedRobot, drive: Drive, seed: int, config: Config,
+                 faults: tuple[Fault, ...]) -> None:
+        self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
+        self._rig = with_masks(robot.rig)
+        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed)
+        self._vehicle = Vehicle(world, robot, config, seed)
+        self._odometry: OdometryUpdate | None = None
+        self._T_odom_base = np.eye(4)
+        self._truth: dict[int, Array] = {}
+        self._poses: list[tuple[int, Array, str]] = []
+
+    def run(self, seconds: float) -> SimulatedRun:
+        """Drive; return the run."""
+        config, vehicle = self._config, self._vehicle
+        graph = Graph(threaded=False)
+        frames = graph.source("cameras", lambda: self._frames(seconds))
+        shape = geometry(self._rig, config.panorama)
+        pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
+        wire(graph, pairs, shape, config, Sinks(poses={"poses": _Take(self._take_pose)}))
+        graph.run()
+        return SimulatedRun(
+            np.array([stamp for stamp, _, _ in self._poses], np.int64),
+            np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
+            np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
+            tuple(state for _, _, state in self._poses), tuple(vehicle.log.ticks), tuple(vehicle.log.lines))
+
+    def _frames(self, seconds: float) -> Iterator[Frame]:
+        """Advance the robot from pair to pair; the stages work while the frames are yielded."""
+        vehicle, period_s = self._vehicle, 1.0 / self._robot.rate_hz
+        for seq in range(int(seconds / period_s)):
+            stamp_ns = START_NS + round(seq * period_s * 1e9)
+            vehicle.motor.cut = self._has("motor cut")
+            vehicle.advance(stamp_ns)
+            self._send()
+            self._truth[stamp_ns] = vehicle.T_world_base
+            yield from self._pair(seq, stamp_ns)
+        vehicle.controller.end()
+        vehicle.advance(vehicle.now_ns + 2_000_000_000)
+
+    def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
+        T_world_rig = self._vehicle.T_world_base @ self._rig.T_base_rig
+        brightness = 0.0 if self._has("dark") else 1.0
+        for camera in CAMERAS:
+            if not self._has(f"no {camera} image"):
+                yield self._cameras.frame(camera, seq, stamp_ns, T_world_rig, self._vehicle.people,
+                                          brightness=brightness)
+
+    def _has(self, kind: str) -> bool:
+        """True while there is a fault."""
+        return any(fault.kind == kind and fault.start_s <= self._vehicle.time_s < fault.end_s for fault in self._faults)
+
+    def _send(self) -> None:
+        """Send what the drive asks for now."""
+        vehicle, controller = self._vehicle, self._vehicle.controller
+        moment = Moment(vehicle.time_s, vehicle.T_world_base, self._odometry, self._T_odom_base, controller.state)
+        arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
+        for request in self._drive(moment):
+            if isinstance(request, Setpoint):
+                controller.set_command(TimedSetpoint(arrival_ns, request))
+            elif request == "arm":
+                controller.arm(ArmRequest(arrival_ns))
+            else:
+                controller.stop(arrival_ns)
+
+    def _take_pose(self, odometry: OdometryUpdate) -> None:
+        T_base_rig = self._rig.T_base_rig
+        self._odometry, self._T_odom_base = odometry, of_base(odometry, T_base_rig)[0]
+        self._poses.append((odometry.stamp_ns, self._T_odom_base, odometry.state))
+        pose = controller_pose(odometry, T_base_rig)
+        delay_ns = round(self._robot.pose_delay_s * 1e9)
+        self._vehicle.post(odometry.stamp_ns + delay_ns, lambda: self._vehicle.controller.set_pose(pose))
+
+
+class _Take:
+    """A sink that calls a function."""
+
+    def __init__(self, take: Callable[[OdometryUpdate], None]) -> None:
+        self._take = take
+
+    def process(self, message: OdometryUpdate) -> None:
+        """Take a message."""
+        self._take(message)
+
+
+def with_masks(rig: Rig) -> Rig:
+    """Return the rig with a mask of each camera: the whole image where none is known."""
+    lower, upper = (replace(mounted, mask=mounted.visible) for mounted in (rig.lower, rig.upper))
+    return replace(rig, lower=lower, upper=upper)

@@ -1,0 +1,75 @@
+"""People who walk along polylines, by themselves or when the robot comes near."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.models.camera import Array
+from omnid.simulation.rendering.surfaces import Rectangle
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """A box of a person's size that walks along a path and looks ahead."""
+
+    faces: tuple[Rectangle, ...]  # in a frame on the floor below the middle, x ahead
+    path: tuple[Point, ...]  # m
+    speed_mps: float
+    repeat: str = "once"  # once | loop | back and forth
+    start_s: float = 0.0
+    starts_within_m: float = 0.0  # waits until the robot is so near to the last point of the path; 0: does not wait
+
+    def place(self, walked_s: float) -> tuple[float, float, float]:
+        """Return x, y [m] and heading [rad] after so much time of walking."""
+        points = np.array(self.path)
+        reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        along_m, back, total_m = self.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])
+        if self.repeat != "once" and total_m > 0.0:
+            laps, along_m = divmod(along_m, total_m)
+            back = self.repeat == "back and forth" and laps % 2 == 1
+        along_m = min(along_m, total_m)
+        along_m = total_m - along_m if back else along_m
+        part = min(int(np.searchsorted(reached_m[1:], along_m)), len(points) - 2)
+        ahead = (points[part + 1] - points[part]) * (-1 if back else 1)
+        x_m, y_m = (float(np.interp(along_m, reached_m, points[:, axis])) for axis in (0, 1))
+        return x_m, y_m, math.atan2(ahead[1], ahead[0])
+
+
+class Walkers:
+    """The people of a world as time passes; those who wait for the robot begin when it is near enough."""
+
+    def __init__(self, people: tuple[Person, ...]) -> None:
+        self._people = people
+        self._started_s: list[float | None] = [None if person.starts_within_m else person.start_s for person in people]
+        self.time_s = 0.0
+
+    def advance(self, time_s: float, robot: Point) -> None:
+        """Set the time, with the robot at a point [m]."""
+        self.time_s = time_s
+        for number, person in enumerate(self._people):
+            if self._started_s[number] is None and time_s >= person.start_s and (
+                    math.dist(robot, person.path[-1]) <= person.starts_within_m):
+                self._started_s[number] = time_s
+
+    def faces(self) -> list[Rectangle]:
+        """Return the people's rectangles in the world now."""
+        return [moved(face, place) for person, place in zip(self._people, self.places(), strict=True)
+                for face in person.faces]
+
+    def places(self) -> list[tuple[float, float, float]]:
+        """Return x, y [m] and heading [rad] of each person now."""
+        return [person.place(0.0 if started_s is None else self.time_s - started_s)
+                for person, started_s in zip(self._people, self._started_s, strict=True)]
+
+
+def moved(face: Rectangle, place: tuple[float, float, float]) -> Rectangle:
+    """Return a rectangle of a frame on the floor in the world; its texture is shared."""
+    x_m, y_m, heading_rad = place
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    R: Array = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return replace(face, origin=R @ face.origin + (x_m, y_m, 0.0), edge_u=R @ face.edge_u, edge_v=R @ face.edge_v)

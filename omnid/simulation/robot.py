@@ -1,0 +1,92 @@
+"""A simulated robot: its cameras and sensors, and how its wheels move it over the ground."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from calib import se3
+from calib.rig import Rig
+from drivers.motors.simulated.simulated_base import MotionLimits, Traction
+from omnid.simulation.rendering.rigs import make_rig
+from omnid.simulation.rendering.sensor import Sensor
+
+CAMERA_HEIGHT_M: Final = 0.9  # of the lower viewpoint over the floor
+BASELINE_M: Final = 0.2
+IMAGE_PX: Final = 512
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """A time [s] in which the driven wheels move the robot by a smaller share of their travel."""
+
+    start_s: float
+    end_s: float
+    share: float  # that is lost
+
+
+@dataclass(frozen=True, slots=True)
+class WheelErrors:
+    """Deviation of the wheels from those of the configuration."""
+
+    left: float = 0.004  # share by which the left wheel rolls farther than configured
+    right: float = -0.002
+    noise: float = 0.01  # standard deviation of the travel of each wheel, per root of a metre [m]
+    slips: tuple[Slip, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class GyroErrors:
+    """Bias about base x, y, z, and noise of a sample, rad/s."""
+
+    bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)
+    noise_radps: float = 0.003
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRobot:
+    """A disc with two driven wheels and two cameras; the motor controller is that of the configuration."""
+
+    rig: Rig
+    sensor: Sensor = field(default_factory=Sensor)
+    radius_m: float = 0.2
+    height_m: float = 1.2
+    limits: MotionLimits = field(default_factory=lambda: MotionLimits(acceleration_mps2=1.5, lag_s=0.06))
+    wheels: WheelErrors = WheelErrors()
+    gyro: GyroErrors = GyroErrors()
+    rate_hz: float = 10.0  # of the cameras
+    pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
+
+
+def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobot:
+    """Return the default robot with images of that size, or with another rig."""
+    if rig is not None:
+        return SimulatedRobot(rig)
+    made = make_rig(size=size_px, baseline_m=BASELINE_M)
+    return SimulatedRobot(replace(made, T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, CAMERA_HEIGHT_M])))
+
+
+def traction(wheels: WheelErrors, seed: int) -> Traction:
+    """Return the travel of both wheels over the ground as time passes from 0 on; the noise follows from the seed."""
+    rng, passed_s = random.Random(seed), 0.0
+
+    def over_ground(dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
+        nonlocal passed_s
+        passed_s += dt_s
+        kept = 1.0 - max((slip.share for slip in wheels.slips if slip.start_s <= passed_s < slip.end_s), default=0.0)
+        left_m, right_m = (
+            kept * travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * rng.gauss(0.0, 1.0)
+            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right)))
+        return left_m, right_m
+
+    return over_ground
+
+
+def with_slips(robot: SimulatedRobot, slips: Sequence[Slip]) -> SimulatedRobot:
+    """Return the robot whose wheels slip at these times."""
+    return replace(robot, wheels=replace(robot.wheels, slips=tuple(slips)))

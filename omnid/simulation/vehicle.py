@@ -1,0 +1,112 @@
+"""The robot's body in simulated time: wheels, motor controller and the real controller, stepped at its ticks."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from drivers.motor import VelocityCommand
+from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
+from drivers.motors.simulated.simulated_base import Pose
+from omnid.config import Config
+from omnid.controller.controller import Controller
+from omnid.simulation.clearance import clearance_m, footprints
+from omnid.simulation.lockstep_motor import LockstepMotor
+from omnid.simulation.people import Walkers
+from omnid.simulation.robot import SimulatedRobot, traction
+from omnid.simulation.world import World
+
+Array = NDArray[np.float64]
+START_NS: Final = 1_000_000_000_000  # of the simulated clock
+
+
+class Tick(NamedTuple):
+    """The truth at a tick of the controller."""
+
+    time_s: float  # since the start
+    pose: Pose  # of the base in the world
+    command: VelocityCommand | None  # that was sent; None where the motor controller did not answer
+    reason: str  # why the wheels must stop; empty where they may turn
+    clearance_m: float  # of the robot's outline; 0 or less: contact
+
+
+@dataclass(slots=True)
+class DriveLog:
+    """All ticks, and lines that the controller has reported."""
+
+    ticks: list[Tick] = field(default_factory=list)
+    lines: list[tuple[float, str]] = field(default_factory=list)
+
+
+class Vehicle:
+    """A body that is advanced by its caller. Messages to the controller arrive at their times, in order."""
+
+    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int) -> None:
+        self.now_ns = START_NS
+        self.people = Walkers(world.people)
+        self.log = DriveLog()
+        drive = config.motor.drive.geometry()
+        self.twin = SIMULATED_CONTROLLERS[config.motor.protocol](drive)
+        base = self.twin.base
+        base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
+        self.motor = LockstepMotor(PROTOCOLS[config.motor.protocol](drive), self.twin, config.motor.watchdog_ms,
+                                   lambda: self.now_ns)
+        self.controller = Controller(self.motor, config.controller, 1.0 / config.motor.rate_hz, self._report,
+                                     clock_ns=lambda: self.now_ns, limited=drive.limited)
+        self._period_ns = round(1e9 / config.motor.rate_hz)
+        self._tick_ns = START_NS
+        self._waiting: list[tuple[int, int, Callable[[], None]]] = []
+        self._posted = 0
+        self._robot, self._standing = robot, footprints(world.standing, robot.height_m)
+
+    @property
+    def time_s(self) -> float:
+        """Return the time since the start."""
+        return (self.now_ns - START_NS) * 1e-9
+
+    @property
+    def T_world_base(self) -> Array:
+        """Return the true pose (4, 4) of the base."""
+        x_m, y_m, heading_rad = self.twin.base.pose
+        return se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [x_m, y_m, 0.0])
+
+    def post(self, due_ns: int, deliver: Callable[[], None]) -> None:
+        """Have a message delivered to the controller before its first tick at or after a time."""
+        heapq.heappush(self._waiting, (due_ns, self._posted, deliver))
+        self._posted += 1
+
+    def advance(self, until_ns: int) -> None:
+        """Advance to a time, with all ticks that are due until then."""
+        while self._tick_ns <= until_ns:
+            self._move(self._tick_ns)
+            while self._waiting and self._waiting[0][0] <= self.now_ns:
+                heapq.heappop(self._waiting)[2]()
+            self._tick()
+            self._tick_ns += self._period_ns
+        self._move(until_ns)
+
+    def _move(self, until_ns: int) -> None:
+        self.twin.base.advance((until_ns - self.now_ns) * 1e-9)
+        self.now_ns = until_ns
+        self.people.advance(self.time_s, self.twin.base.pose[:2])
+
+    def _tick(self) -> None:
+        report = self.controller.tick()
+        self.log.ticks.append(Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason,
+                                   self._clearance_m()))
+
+    def _clearance_m(self) -> float:
+        x_m, y_m, _ = self.twin.base.pose
+        walking = footprints(self.people.faces(), self._robot.height_m)
+        return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
+
+    def _report(self, line: str) -> None:
+        self.log.lines.append((self.time_s, line))
+

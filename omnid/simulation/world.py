@@ -1,0 +1,19 @@
+"""A simulated world: what stands in it, who walks in it, how light it is, where the robot starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omnid.simulation.people import Person
+from omnid.simulation.rendering.surfaces import Rectangle
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The floor is at z = 0 and the robot starts at x, y [m] with a heading [rad]."""
+
+    name: str
+    standing: tuple[Rectangle, ...]
+    people: tuple[Person, ...] = ()
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    brightness: float = 1.0  # factor on the grey of all images

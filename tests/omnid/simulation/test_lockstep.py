@@ -1,0 +1,62 @@
+"""A robot that drives in lock-step: reproducible to the byte, and what it is told changes what it sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.core.control.heading_controller import Setpoint
+from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
+from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.world_file import load_world
+
+SIZE = 160
+WORLD = load_world("room", 3)
+
+
+def forward(moment: Moment) -> Iterator[Request]:
+    """Arm, and drive ahead from the first pose on."""
+    if moment.odometry is not None and not moment.controller.armed:
+        yield "arm"
+    yield Setpoint(0.3, yaw_rate_radps=0.1)
+
+
+def drive(seed: int, seconds: float = 2.0, **options: object) -> SimulatedRun:
+    return simulate(WORLD, make_robot(SIZE), forward, seconds=seconds, seed=seed, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def run() -> SimulatedRun:
+    return drive(1)
+
+
+def test_same_seed_gives_the_same_bytes(run: SimulatedRun) -> None:
+    again, other = drive(1), drive(2)
+    assert run.ticks == again.ticks and run.T_odom_base.tobytes() == again.T_odom_base.tobytes()
+    assert run.ticks != other.ticks and run.T_odom_base.tobytes() != other.T_odom_base.tobytes()
+
+
+def test_the_robot_follows_its_setpoint_and_estimates_its_own_motion(run: SimulatedRun) -> None:
+    truth, estimate = run.truth_in_odom[-1], run.T_odom_base[-1]
+    assert 0.2 < truth[0, 3] < 0.6 and 0.02 < float(se3.yaw(truth)) < 0.2
+    np.testing.assert_allclose(estimate[:2, 3], truth[:2, 3], atol=0.03)
+    assert float(se3.yaw(estimate)) == pytest.approx(float(se3.yaw(truth)), abs=math.radians(1.5))
+    assert run.contacts == [] and run.clearance_m > 0.3
+
+
+def test_a_motor_that_is_cut_off_stops_by_its_own_watchdog() -> None:
+    run = drive(1, 3.0, faults=(Fault("motor cut", 1.5, 9.0),))
+    places = {round(tick.time_s, 2): tick.pose[0] for tick in run.ticks}
+    assert places[1.5] - places[1.4] > 0.02
+    assert places[2.9] == places[2.5]
+    assert any("no answer" in line for _, line in run.lines)
+
+
+def test_slipping_wheels_turn_farther_than_the_robot_drives() -> None:
+    robot = with_slips(make_robot(SIZE), [Slip(0.0, 9.0, 0.5)])
+    slipping = simulate(WORLD, robot, forward, seconds=2.0, seed=1).truth_in_odom[-1]
+    assert slipping[0, 3] < 0.6 * drive(1).truth_in_odom[-1][0, 3]
