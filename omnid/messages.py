@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.motion import MotionSample
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
@@ -28,6 +29,7 @@ class FramePair:
     lower: NDArray[np.uint8]  # (H, W)
     upper: NDArray[np.uint8]  # (H, W)
     skew_s: float = 0.0  # from the lower to the upper exposure
+    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +43,7 @@ class Panoramas:
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
     times: ExposureTimes | None = None  # of the pixels; None: all are exposed at the stamp
     light: Light = field(default_factory=Light)
+    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,6 +49,7 @@ ARROWS: Mapping[str, str] = {
     "drivers.events": "",
     "drivers.frame": "drivers.errors",
     "drivers.logs": "drivers.errors drivers.events drivers.frame",
+    "drivers.motion": "",
     "drivers.motor": "",
     "drivers.motors": "drivers.errors drivers.motor drivers.motors.protocols",
     "drivers.motors.protocols": "drivers.errors drivers.motor",
@@ -84,7 +85,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
     "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
-    "omnid.core.odometry": "calib.panorama calib.se3 omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
+    "omnid.core.odometry":
+        "calib.panorama calib.se3 drivers.motion omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places":
         "calib.panorama calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings "
@@ -103,7 +105,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.places omnid.errors",
     "omnid.messages":
-        "omnid.core.mapping omnid.core.obstacles omnid.core.odometry omnid.core.stereo omnid.tracking_state",
+        "drivers.motion omnid.core.mapping omnid.core.obstacles omnid.core.odometry omnid.core.stereo "
+        "omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
         "omnid.sinks omnid.transport",
@@ -140,7 +143,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame "
-        "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "
+        "drivers.motion drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.obstacles "
+        "omnid.core.odometry "
         "omnid.core.odometry.paper omnid.core.places omnid.core.rig omnid.core.stereo omnid.errors omnid.messages "
         "omnid.tracking_state",
     "omnid.tracking_state": "",

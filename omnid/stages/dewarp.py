@@ -55,7 +55,8 @@ class Dewarp:
         lower, lower_light = self._panorama(pair.lower, self._lower, "lower", measured)
         upper, upper_light = self._panorama(pair.upper, self._upper, "upper", measured)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s), dimmer)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s), dimmer,
+                         pair.motion)
 
     def _times(self, skew_s: float) -> ExposureTimes | None:
         """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""

@@ -12,6 +12,7 @@ from calib import se3
 from omnid.config import OdometryConfig
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.odometry.motion_sensors import MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -45,16 +46,21 @@ class OdometryStage:
         self._method = _method(self._model, config, features)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
+        self.sensors = MotionSensors(se3.inverse(geometry.rig.T_base_rig @ self._T_rig_rect))
         self._last_ns: int | None = None
 
     def process(self, depth: StereoDepth) -> OdometryUpdate:
         """Return the pose at a pair."""
-        dt_s = 0.0 if self._last_ns is None else (depth.stamp_ns - self._last_ns) * 1e-9
-        self._last_ns = depth.stamp_ns
+        last_ns, self._last_ns = self._last_ns, depth.stamp_ns
+        dt_s = 0.0 if last_ns is None else (depth.stamp_ns - last_ns) * 1e-9
         pair = depth.panoramas
+        self.sensors.add(pair.motion)
+        sensed = None if last_ns is None else self.sensors.between(last_ns, depth.stamp_ns)
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
-        frame = StereoFrame(depth.seq, pair.lower, pair.upper, depth.disparity_at, usable, pair.times)
+        frame = StereoFrame(depth.seq, pair.lower, pair.upper, depth.disparity_at, usable, pair.times, sensed)
         estimate = self._method.process(frame, dt_s)
+        if estimate.step is not None and last_ns is not None:
+            self.sensors.observe(*estimate.step, last_ns, depth.stamp_ns)
         motion = RigVelocity(estimate.velocity, estimate.velocity_covariance)
         depth.settle(None if pair.times is None else Exposure(pair.times, motion, self._model))
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)

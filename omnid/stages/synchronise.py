@@ -7,9 +7,11 @@ from statistics import median_low
 
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
+from drivers.motion import MotionSample
 from omnid.config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.decoder import Decoder, Image
+from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.repeated_images import RepeatedImages
 from omnid.stages.skew import Skew
 
@@ -128,6 +130,9 @@ class Synchronise:
 
     A pair with an image that repeats an earlier one of its camera is no new evidence: it is counted and not returned,
     unless pair.repeated_images is "use".
+
+    Samples of wheels and gyro go along with the next pair. Those of a log come in its order; live ones are added to
+    `motion` by their sources.
     """
 
     def __init__(self, rig: Rig, config: PairConfig) -> None:
@@ -137,6 +142,7 @@ class Synchronise:
         self._use_repeated = config.repeated_images == "use"
         self.repeated: dict[Camera, RepeatedImages] = {"lower": RepeatedImages(), "upper": RepeatedImages()}
         self.skew = Skew()
+        self.motion = MotionInbox()
         self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
 
     @property
@@ -178,8 +184,14 @@ class Synchronise:
         """The cameras whose newest images are repeated ones."""
         return [camera for camera, images in self.repeated.items() if images.frozen]
 
-    def process(self, frame: Frame) -> FramePair | None:
-        """Return the pair that this frame completes; None where the frame waits, is broken or shows nothing new."""
+    def process(self, message: Frame | MotionSample) -> FramePair | None:
+        """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
+        if isinstance(message, Frame):
+            return self._completed(message)
+        self.motion.add(message)
+        return None
+
+    def _completed(self, frame: Frame) -> FramePair | None:
         self.newest_ns[frame.camera] = frame.stamp_ns
         self._matcher.arrive(frame)
         waiting = self._matcher.couple()
@@ -223,7 +235,8 @@ class Synchronise:
             return None
         seq = self._pairs
         self._pairs += 1
-        return FramePair(seq, lower.stamp_ns, lower_image, upper_image, self.skew.exposure_ns * 1e-9)
+        return FramePair(seq, lower.stamp_ns, lower_image, upper_image, self.skew.exposure_ns * 1e-9,
+                         self.motion.take(lower.stamp_ns))
 
 
 def _gap_ns(frame: Frame, other: Frame) -> int:

@@ -60,6 +60,7 @@ class OdometryEstimate:
     tracked: int
     inliers: int
     features: Features = field(default_factory=Features)
+    step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
 
 
 def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:

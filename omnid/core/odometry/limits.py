@@ -32,3 +32,7 @@ class OdometryLimits:
         high=10_000,
     )
     max_gap_s: float = knob(0.5, "a pose after a longer time without frames is degraded, s", low=0.01, high=60)
+    bridge_s: float = knob(10.0, "longest time for which wheels and gyro carry the pose on while the cameras show "
+                           "nothing, as degraded; 0: never, s", low=0, high=600)
+    bridge_sigma_m: float = knob(0.15, "uncertainty of the position that ends that, standard deviation, m", low=0.001,
+                                 high=10)

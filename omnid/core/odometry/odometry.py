@@ -5,7 +5,6 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -16,13 +15,13 @@ from calib import se3
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate, is_jump, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY, ExposureVelocity
+from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.motion_model import MotionModel
 from omnid.core.odometry.patch_alignment import align_rows, disparity_slopes, view_noise
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.static_mask import StaticMask
@@ -34,13 +33,11 @@ from omnid.core.odometry.yaw_search import correlation_peaks, steps
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-SLOWING_S = 0.3  # time constant with which the predicted velocity decays while poses are refused
 UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while poses are refused, m/s and rad/s
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
 LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
-SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 degrees
 START_ROUNDS = 2  # of starting a map again, once the velocity is known
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.
@@ -59,14 +56,14 @@ class VisualOdometry:
         self._stereo_klt = replace(klt, levels=1)
         self._map = LocalMap(model, klt, limits.keyframes)
         self._frame_to_map = FrameToMap(self._map, model, klt)
-        self._filter = MotionFilter()
-        self._velocity = ExposureVelocity(self._filter)
+        self._motion = MotionModel(limits)
         self._static_mask = StaticMask()
         self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()
         self._resets = 0
+        self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
         self._most_inliers = 0  # since the last keyframe
         self._frames_since_keyframe = 0
         # The frame that started the map, if it was exposed at several times, until the velocity is known.
@@ -75,14 +72,15 @@ class VisualOdometry:
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
         dt_s = max(dt_s, 0.0)
+        self._step = None
         usable = self._static_mask.without(frame.usable)
         if self._previous is None:
-            return self._start_map(frame, usable, dt_s)
+            return self._start_without_map(frame, usable, dt_s)
 
-        # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10).
-        T_predicted = self._T_odom_rect @ self._filter.predict(min(dt_s, self._limits.max_gap_s))
+        # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
+        T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
 
-        exposure = self._exposure(frame, self._velocity.predicted(dt_s))
+        exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
 
         # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
         after_refusal = self._status.refused_frames > 0
@@ -117,7 +115,7 @@ class VisualOdometry:
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
-        new = self._update_map(frame, usable, estimate, self._exposure(frame, self._velocity.predicted(dt_s)))
+        new = self._update_map(frame, usable, estimate, self._exposure(frame, self._motion.at_exposure(dt_s)))
         features = Features(estimate.pixels, estimate.rejected, new)
         return self._result(estimate.tracked, estimate.inliers, features)
 
@@ -125,7 +123,7 @@ class VisualOdometry:
         """Return the exposure of a frame, None where one instant is shown; motion: None for that of the filter."""
         if frame.times is None:
             return None
-        return Exposure(frame.times, motion or RigVelocity(*self._filter.motion(0.0)), self._model)
+        return Exposure(frame.times, motion or self._motion.now(), self._model)
 
     def _refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None, dt_s: float
                 ) -> PoseEstimate | None:
@@ -134,18 +132,11 @@ class VisualOdometry:
         if refined is None or exposure is None or not 0 < dt_s <= self._limits.max_gap_s:
             return refined
         T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
-        if self._is_sudden(T_prev_curr, dt_s):
-            motion = UNKNOWN_VELOCITY
-        else:
-            motion = self._velocity.after(T_prev_curr, refined.covariance, dt_s)
+        is_sudden = self._motion.is_sudden(T_prev_curr, dt_s)
+        motion = UNKNOWN_VELOCITY if is_sudden else self._motion.after(T_prev_curr, refined.covariance, dt_s)
         exposure = self._exposure(frame, motion)
         coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
         return self._frame_to_map.refine(frame, coarse, exposure)
-
-    def _is_sudden(self, T_prev_curr: Array, dt_s: float) -> bool:
-        """True if a motion differs so much from the predicted one that it tells no velocity during the exposures."""
-        change = se3.log(T_prev_curr) - self._filter.velocity * dt_s
-        return bool(np.linalg.norm(change[3:]) > SUDDEN_RAD)
 
     def _start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float) -> PoseEstimate:
         """Start the map again at its first frame, whose motion the second one shows; return the second one's pose.
@@ -157,7 +148,7 @@ class VisualOdometry:
         for _ in range(START_ROUNDS if first is not None and 0 < dt_s <= self._limits.max_gap_s else 0):
             assert first is not None
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            motion = self._velocity.after(T_prev_curr, estimate.covariance, dt_s)
+            motion = self._motion.after(T_prev_curr, estimate.covariance, dt_s)
             self._map.clear()
             self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
             exposure = self._exposure(frame, motion)
@@ -208,54 +199,65 @@ class VisualOdometry:
 
     def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float) -> None:
         """Update the filter and set the pose; after a break the filter starts from standstill."""
-        if self._status.refused_frames or not 0 < dt_s <= self._limits.max_gap_s:
-            self._reset_motion()
-        else:
+        if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            is_sudden = frame.times is not None and self._is_sudden(T_prev_curr, dt_s)
-            self._filter.update(T_prev_curr, estimate.covariance, dt_s)
-            self._velocity.accept(T_prev_curr, dt_s)
-            if is_sudden:
-                self._reset_motion()
+            self._motion.accept(T_prev_curr, estimate.covariance, dt_s, exposed_at_once=frame.times is None)
+            if estimate.inliers >= self._limits.good_inliers:
+                self._step = T_prev_curr, estimate.covariance
+        elif frame.sensed is None:
+            self._motion.reset()
+        self._motion.found()
         self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
-    def _reset_motion(self) -> None:
-        self._filter.reset()
-        self._velocity.reset()
-
     def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: bool
                 ) -> OdometryEstimate:
-        """Continue with the predicted pose, slowing down, with a growing covariance; restart the map if need be.
+        """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
         elsewhere: the frame was recognised where the robot cannot have come by the predicted motion.
         """
-        A = se3.adjoint(se3.inverse(T_predicted) @ self._T_odom_rect)
-        self._T_odom_rect, self._covariance = T_predicted, A @ self._covariance @ A.T
-        self._filter.slow_down(math.exp(-dt_s / SLOWING_S))
-        textured = self._is_textured(frame, usable)
-        self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=elsewhere))
+        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not elsewhere
+        self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=self._is_textured(frame, usable),
+                                 elsewhere=elsewhere, carried=carried))
         if not self._status.restart:
             return self._result(0, 0)
         self._map.clear()
         self._previous = None
         self._relocaliser.clear()
-        self._reset_motion()
-        self._resets += 1
-        return self._start_map(frame, usable, 0.0)
+        if not carried:
+            self._motion.reset()
+            self._resets += 1
+        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, carried=carried))
 
-    def _start_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
-        """Start a map at the current pose if the frame has enough landmarks."""
+    def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
+        """Start a map where there is none, after the motion that wheels and gyro know of."""
+        carried = False
+        if frame.sensed is not None and dt_s > 0:
+            T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
+            carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s))
+        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, dt_s, carried=carried))
+
+    def _move(self, T_predicted: Array, growth: Array | None) -> bool:
+        """Go on to the predicted pose, with the covariance (6, 6) that it adds where wheels and gyro carry it."""
+        A = se3.adjoint(se3.inverse(T_predicted) @ self._T_odom_rect)
+        self._T_odom_rect, self._covariance = T_predicted, A @ self._covariance @ A.T
+        if growth is not None:
+            self._covariance = self._covariance + growth
+        return growth is not None
+
+    def _start_map(self, frame: StereoFrame, usable: Flags, failed: FrameFacts) -> OdometryEstimate:
+        """Start a map at the current pose if the frame has enough landmarks; failed: the facts where it has not."""
         new = self._add_keyframe(frame, usable, np.zeros((0, 2)), self._exposure(frame, None))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
-            self._advance(FrameFacts(FrameOutcome.NOT_STARTED, dt_s))
+            self._advance(failed)
             return self._result(0, 0)
         self._previous = frame.lower
         self._unmoved = frame if frame.times is not None else None
-        self._advance(FrameFacts(FrameOutcome.STARTED, dt_s))
+        self._motion.found()
+        self._advance(FrameFacts(FrameOutcome.STARTED, failed.dt_s))
         return self._result(len(self._map), len(self._map), Features(new=new))
 
     def _advance(self, facts: FrameFacts) -> None:
@@ -263,7 +265,7 @@ class VisualOdometry:
         before_s = self._status.time_since_fix_s
         self._status = next_status(self._status, facts, self._limits)
         after_s = self._status.time_since_fix_s
-        if after_s > before_s:
+        if after_s > before_s and not facts.carried:
             self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
 
     def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure | None
@@ -336,11 +338,12 @@ class VisualOdometry:
         return OdometryEstimate(
             self._T_odom_rect,
             self._covariance,
-            self._filter.velocity,
-            self._filter.velocity_covariance,
+            self._motion.velocity,
+            self._motion.velocity_covariance,
             self._status.state,
             self._resets,
             tracked,
             inliers,
             features or Features(),
+            self._step,
         )

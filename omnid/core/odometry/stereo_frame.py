@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
+from omnid.core.odometry.sensed_motion import SensedMotion
 from omnid.core.odometry.tracking import PaddedPanorama
 
 
@@ -23,6 +24,7 @@ class StereoFrame:
     disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
     times: ExposureTimes | None = None  # None: all pixels are exposed at the stamp
+    sensed: SensedMotion | None = None  # since the frame before, by wheels and gyro; None: not known
 
     @property
     def disparity(self) -> NDArray[np.float32]:

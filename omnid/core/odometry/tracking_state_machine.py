@@ -7,6 +7,7 @@
     REFUSED from then on -------------------------------------> LOST, and the map is started again when
                                                                 restart_after textured frames matched nothing,
                                                                 or one was recognised elsewhere
+    REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class FrameFacts:
     inliers: int = 0
     textured: bool = True  # the frame has enough corners for a map
     elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
+    carried: bool = False  # wheels and gyro carry the pose on
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class TrackingStatus:
 
     state: TrackingState = TrackingState.LOST
     refused_frames: int = 0  # consecutive
-    unmatched_frames: int = 0  # textured frames refused in the state LOST, since the last accepted one
+    unmatched_frames: int = 0  # textured frames refused after lost_after others, since the last accepted one
     time_since_fix_s: float = 0.0  # since the last accepted frame
     restart: bool = False  # the map is to be started again at this frame
 
@@ -57,7 +59,8 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
         return TrackingStatus(TrackingState.TRACKING)
 
     if facts.outcome is FrameOutcome.NOT_STARTED:
-        return TrackingStatus(TrackingState.LOST, time_since_fix_s=time_since_fix_s)
+        state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
+        return TrackingStatus(state, time_since_fix_s=time_since_fix_s)
 
     if facts.outcome is FrameOutcome.ACCEPTED:
         few_inliers = facts.inliers < limits.good_inliers
@@ -69,4 +72,5 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
         return TrackingStatus(TrackingState.DEGRADED, refused_frames, status.unmatched_frames, time_since_fix_s)
     unmatched_frames = status.unmatched_frames + int(facts.textured)
     restart = facts.elsewhere or unmatched_frames >= limits.restart_after
-    return TrackingStatus(TrackingState.LOST, refused_frames, unmatched_frames, time_since_fix_s, restart)
+    state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
+    return TrackingStatus(state, refused_frames, unmatched_frames, time_since_fix_s, restart)

@@ -1,0 +1,28 @@
+"""Motion of the base as sensors beside the cameras measure it: wheels and gyro."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSample:
+    """Velocity of the base by its wheels, on a straight line or an arc."""
+
+    stamp_ns: int  # of the measurement, by the clock of the images' stamps
+    velocity_mps: float  # forward
+    yaw_rate_radps: float  # counter-clockwise; NaN if unknown
+
+
+@dataclass(frozen=True, slots=True)
+class GyroSample:
+    """Angular velocity of the base about its axes: x forward, y left, z up."""
+
+    stamp_ns: int  # of the measurement, by the clock of the images' stamps
+    x_radps: float
+    y_radps: float
+    z_radps: float
+
+
+MotionSample: TypeAlias = WheelSample | GyroSample

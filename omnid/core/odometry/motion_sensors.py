@@ -1,0 +1,211 @@
+"""Wheels and gyro beside the cameras: the motion that they measure, and what they get wrong, estimated on the way.
+
+The motion of cameras is the reference while they track. A Kalman filter of seven states (scale of the wheels' distance
+and of their turn, clock offsets of wheels and gyro, bias of the gyro) takes the difference of both motions in each
+step. The motion by the sensors then predicts the next pose, and bridges darkness and plain walls.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.core.odometry.sensed_motion import RateHistory, SensedMotion
+
+Array = NDArray[np.float64]
+
+# States: what a wheel's metre and radian are worth, seconds to be added to stamps, and rad/s that the gyro reads at
+# rest. Standard deviations before anything is known, and of their random walks over one second.
+DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
+START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+START_SIGMA: Final = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
+WALK_SIGMA: Final = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
+LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # after many steps that do not agree
+# Errors of a step that are independent of those of other steps, by sigma.
+DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # of the wheels' distance and turn: roughness, slack
+WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # of the wheels: steps of the encoders
+SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # across, by distance and by turn of wheels that cannot move sideways
+GYRO_RADPS_SQRT_S = 1e-3  # of the gyro, for one second
+TILT_RAD = 1e-3  # about x and y without a gyro
+CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # of the cameras' motion in a step, beside their covariance
+STILL_M, STILL_RAD = 1e-4, 5e-5  # of a base that stands
+STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03  # m/s and rad/s below which they read nothing, beside a bias
+STILL_BEFORE_S = 0.2  # for which they must have stood before the step, so that none swings on
+OUTLIER_SIGMA = 5.0  # by which a step of a sensor differs from the cameras' when it slips or is wrong
+MOST_OUTLIERS = 40  # consecutive ones, after which the sensor counts as not calibrated
+SANE_SCALE = (0.5, 2.0)  # of wheels: beyond it their settings are wrong
+UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2  # sigma of what no sensor measures in a step
+
+
+class MotionSensors:
+    """The samples of wheels and gyro, and the estimate of their errors. The base moves along arcs, on a plane.
+
+    slips counts steps in which the wheels moved otherwise than the cameras; refused, those of the gyro.
+    """
+
+    def __init__(self, T_rect_base: Array) -> None:
+        from filterpy.kalman import KalmanFilter  # its import takes long, and only odometry needs it
+
+        self._to_rect, self._to_base = se3.adjoint(T_rect_base), se3.adjoint(se3.inverse(T_rect_base))
+        self._wheels, self._gyro = RateHistory(2), RateHistory(3)
+        self._filter: Any = KalmanFilter(dim_x=len(START), dim_z=1)
+        self._filter.x = START[:, None].copy()
+        self._filter.P = np.diag(START_SIGMA**2)
+        self._zero_ns: int | None = None  # stamp of time 0
+        self._outliers = {WheelSample: 0, GyroSample: 0}
+        self.slips = self.refused = self.steps = 0
+        self.is_slipping = False
+
+    @property
+    def values(self) -> Array:
+        """Estimates (7,): scales of distance and turn, offsets of wheels and gyro [s], bias of the gyro [rad/s]."""
+        return np.array(self._filter.x[:, 0])
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (7,) of the values."""
+        return np.asarray(np.sqrt(np.diag(self._filter.P)))
+
+    @property
+    def wheels_are_sane(self) -> bool:
+        """False if the wheels' scales are so far from 1 that their settings must be wrong."""
+        return bool(all(SANE_SCALE[0] < scale < SANE_SCALE[1] for scale in self.values[[DISTANCE, TURN]]))
+
+    def add(self, samples: Iterable[MotionSample]) -> None:
+        """Add samples; they may come late, and in any order."""
+        wheels: list[tuple[float, ...]] = []
+        gyro: list[tuple[float, ...]] = []
+        for sample in samples:
+            if isinstance(sample, WheelSample):
+                wheels.append((self._seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
+            else:
+                gyro.append((self._seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
+        for history, rows in ((self._wheels, wheels), (self._gyro, gyro)):
+            if rows:
+                table = np.array(rows)
+                history.add(table[:, 0], table[:, 1:])
+
+    def between(self, start_ns: int, end_ns: int) -> SensedMotion | None:
+        """Return the motion between two stamps, None where the sensors do not cover it.
+
+        Wheels that slipped in the last step that the cameras saw are left out.
+        """
+        start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
+        dt_s = end_s - start_s
+        trusted = self.wheels_are_sane and not self.is_slipping
+        wheels = self._of_wheels(start_s, end_s) if trusted else None
+        gyro = self._of_gyro(start_s, end_s)
+        if wheels is None and gyro is None:
+            return None
+        if wheels is not None and self._stands(start_s, end_s):
+            return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
+        twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
+        if wheels is not None:
+            distance, turn = wheels[0]
+            scale = self.values
+            twist[0], twist[5] = scale[DISTANCE] * distance, scale[TURN] * turn
+            sigma[:3] = (math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
+                         math.hypot(SIDE_SHARE * distance, SIDE_M), HEIGHT_M)
+            sigma[3:] = TILT_RAD, TILT_RAD, math.hypot(TURN_SHARE * turn, WHEEL_RAD)
+            slopes[0, DISTANCE], slopes[5, TURN] = distance, turn
+        if gyro is not None:
+            twist[3:] = gyro[0] - self.values[BIAS] * dt_s
+            sigma[3:] = GYRO_RADPS_SQRT_S * math.sqrt(dt_s)
+            slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
+        turns = gyro is not None or (wheels is not None and math.isfinite(twist[5]))
+        return self._in_rect(np.nan_to_num(twist), sigma, slopes, complete=wheels is not None and turns)
+
+    def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
+        """Learn from a step of the rectified frame that the cameras measured, with its covariance (6, 6)."""
+        start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
+        dt_s = end_s - start_s
+        seen = self._to_base @ se3.log(T_prev_curr)
+        variance = np.diag(self._to_base @ covariance @ self._to_base.T)
+        variance = variance + np.repeat([CAMERA_M**2, CAMERA_RAD**2], 3)
+        self._filter.predict(F=np.eye(len(START)), Q=np.diag(WALK_SIGMA**2 * dt_s))
+        self.steps += 1
+        wheels, gyro = self._of_wheels(start_s, end_s), self._of_gyro(start_s, end_s)
+        if wheels is not None:
+            self._learn_wheels(wheels, seen, variance)
+        if gyro is not None:
+            self._learn_gyro(gyro, seen[3:], variance[3:], dt_s)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        """Return the time since the first stamp: a number of seconds since 1970 has too few digits."""
+        if self._zero_ns is None:
+            self._zero_ns = stamp_ns
+        return (stamp_ns - self._zero_ns) * 1e-9
+
+    def _learn_wheels(self, wheels: tuple[Array, Array], seen: Array, variance: Array) -> None:
+        """Learn scales and offset of the wheels from the cameras' twist (6,) with variances (6,)."""
+        agree = True
+        rows = ((DISTANCE, seen[0], variance[0], DISTANCE_SHARE, WHEEL_M),
+                (TURN, seen[5], variance[5], TURN_SHARE, WHEEL_RAD))
+        for number, (state, truth, noise, share, least) in enumerate(rows):
+            amount, change = wheels[0][number], wheels[1][number]
+            if not math.isfinite(amount):
+                continue
+            H = np.zeros(len(START))
+            H[state], H[WHEEL_OFFSET] = amount, -self.values[state] * change
+            noise = noise + (share * amount) ** 2 + least**2
+            agree &= self._update(truth - self.values[state] * amount, H, noise)
+        self.is_slipping = not agree
+        self.slips += not agree
+        self._count(WheelSample, agree, np.array([DISTANCE, TURN, WHEEL_OFFSET]))
+
+    def _learn_gyro(self, gyro: tuple[Array, Array], seen: Array, variance: Array, dt_s: float) -> None:
+        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,)."""
+        agree = True
+        turned, change = gyro
+        for axis in range(3):
+            H = np.zeros(len(START))
+            H[BIAS.start + axis], H[GYRO_OFFSET] = -dt_s, -change[axis]
+            error = seen[axis] - (turned[axis] - self.values[BIAS][axis] * dt_s)
+            agree &= self._update(error, H, variance[axis] + GYRO_RADPS_SQRT_S**2 * dt_s)
+        self.refused += not agree
+        self._count(GyroSample, agree, np.array([GYRO_OFFSET, 4, 5, 6]))
+
+    def _update(self, error: float, H: Array, variance: float) -> bool:
+        """Update the states with one error, of which H (7,) are the derivatives; False if it is an outlier."""
+        expected = float(H @ self._filter.P @ H) + variance
+        if error**2 > OUTLIER_SIGMA**2 * expected:
+            return False
+        self._filter.update(np.array([[error + float(H @ self.values)]]), R=np.array([[variance]]), H=H[None])
+        self._filter.P = (self._filter.P + self._filter.P.T) / 2
+        return True
+
+    def _count(self, sensor: type[MotionSample], agrees: bool, states: NDArray[np.int64]) -> None:
+        """Forget what is known of a sensor that has not agreed for long: its settings may be wrong."""
+        self._outliers[sensor] = 0 if agrees else self._outliers[sensor] + 1
+        if self._outliers[sensor] > MOST_OUTLIERS:
+            self._outliers[sensor] = 0
+            self._filter.P[states] = self._filter.P[:, states] = 0.0
+            self._filter.P[states, states] = LOST_SIGMA[states] ** 2
+
+    def _of_wheels(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
+        offset_s = self.values[WHEEL_OFFSET]
+        return self._wheels.integral(start_s - offset_s, end_s - offset_s)
+
+    def _of_gyro(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
+        offset_s = self.values[GYRO_OFFSET]
+        return self._gyro.integral(start_s - offset_s, end_s - offset_s)
+
+    def _stands(self, start_s: float, end_s: float) -> bool:
+        """True if the wheels read nothing in a step and shortly before, and the gyro, if there is one, too."""
+        wheels = self._wheels.largest(start_s - STILL_BEFORE_S, end_s, np.zeros(2))
+        gyro = self._gyro.largest(start_s - STILL_BEFORE_S, end_s, self.values[BIAS])
+        if wheels is None or not (wheels < STILL_WHEELS).all():
+            return False
+        return gyro is None or bool((gyro < STILL_GYRO).all())
+
+    def _in_rect(self, twist: Array, sigma: Array, slopes: Array, *, complete: bool) -> SensedMotion:
+        """Return a motion of the base, with slopes (6, 7) by the states, as one of the rectified frame."""
+        A = self._to_rect
+        systematic = slopes @ self._filter.P @ slopes.T
+        return SensedMotion(A @ twist, A @ np.diag(sigma**2) @ A.T, A @ systematic @ A.T, complete)
