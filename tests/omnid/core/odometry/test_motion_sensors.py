@@ -142,7 +142,7 @@ def test_a_base_that_stands_does_not_move_at_all() -> None:
     sensors, _ = driven(replace(WRONG, noise=0.3), 30)
     rng, end_s = np.random.default_rng(9), 12 * np.pi + 2 * np.pi + 0.5  # velocity(t) is 0 for the next six seconds
     sensed: SensedMotion | None = None
-    for k in range(10):
+    for _ in range(10):
         end_s += PAIR_S
         sensors.add(samples(replace(WRONG, noise=0.3), end_s - PAIR_S, end_s, rng))
         sensed = sensors.between(*stamps(end_s - 0.02))
