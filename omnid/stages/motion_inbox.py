@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from drivers.motion import GyroSample, MotionSample, WheelSample
+from drivers.motion import MotionSample, WheelSample
 
 MOST_WAITING: Final = 4096  # samples: ten seconds of a gyro of 400 Hz
-AHEAD_NS: Final = 10**10  # a sample so far after a pair has a stamp of another clock
+AHEAD_NS: Final = 5 * 10**9  # a sample so far after a pair has a stamp of another clock
 
 
 class MotionInbox:
@@ -34,14 +34,11 @@ class MotionInbox:
 
     def take(self, stamp_ns: int) -> tuple[MotionSample, ...]:
         """Return the samples up to a stamp and the first ones after it, which end the step there; others wait."""
-        waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
-        due = [sample for sample in waiting if sample.stamp_ns <= stamp_ns]
-        later = sorted((sample for sample in waiting if sample.stamp_ns > stamp_ns), key=lambda each: each.stamp_ns)
+        waiting = sorted((self._waiting.popleft() for _ in range(len(self._waiting))), key=lambda each: each.stamp_ns)
+        sane = [sample for sample in waiting if sample.stamp_ns - stamp_ns <= AHEAD_NS]
+        self.dropped += len(waiting) - len(sane)
+        due = [sample for sample in sane if sample.stamp_ns <= stamp_ns]
+        later = sane[len(due):]
+        self._waiting.extendleft(reversed(later))
         first = {type(sample): sample for sample in reversed(later)}
-        for sample in reversed(later):
-            if sample.stamp_ns - stamp_ns > AHEAD_NS:
-                self.dropped += 1
-            else:
-                self._waiting.appendleft(sample)
-        due += [first[kind] for kind in (WheelSample, GyroSample) if kind in first]
-        return tuple(sorted(due, key=lambda sample: sample.stamp_ns))
+        return (*due, *(sample for sample in later if sample is first[type(sample)]))

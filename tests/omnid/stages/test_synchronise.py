@@ -12,8 +12,10 @@ import pytest
 
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
+from drivers.motion import GyroSample, WheelSample
 from omnid.config import PairConfig
 from omnid.messages import FramePair
+from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.synchronise import MAX_WAITING, Synchronise
 from tests.simulation import build
 
@@ -154,6 +156,27 @@ def test_decodes_only_frames_with_a_partner(pair: Synchronise) -> None:
     made(pair, *(shot("lower", index, data=b"no image") for index in range(20)))
     pair.finish()
     assert pair.counts["broken"] == 0 and unpaired(pair) == (20, 0)
+
+
+def test_samples_go_along_with_the_pair_that_ends_their_step(pair: Synchronise) -> None:
+    """Up to its stamp and one after it; the others wait, and late ones are not lost."""
+    start_ns = shot("lower", 0).stamp_ns
+    wheels = [WheelSample(start_ns + k * 10 * MS, 0.1 * k, 0.0) for k in (0, 2, 1, 4, 3)]
+    gyro = GyroSample(start_ns + 35 * MS, 0.0, 0.0, 0.5)
+    assert [pair.process(sample) for sample in (*wheels, gyro)] == [None] * 6
+    first, second = made(pair, *(shot(camera, index) for index in range(2) for camera in ("lower", "upper")))
+    assert first.motion == (wheels[0], wheels[2], gyro)
+    assert second.motion == (wheels[2], wheels[1], wheels[4], gyro, wheels[3])
+
+
+def test_samples_of_another_clock_and_too_many_are_dropped_and_counted() -> None:
+    inbox = MotionInbox()
+    for k in range(5000):
+        inbox.add(WheelSample(k, 0.0, 0.0))
+    assert inbox.dropped == 5000 - 4096 and len(inbox.take(10**4)) == 4096
+    inbox.add(WheelSample(10**12, 0.0, 0.0))
+    assert not inbox.take(10**4) and not inbox.take(10**12)
+    assert inbox.dropped == 5000 - 4096 + 1
 
 
 def test_skew_statistics(pair: Synchronise) -> None:
