@@ -20,7 +20,7 @@ from omnid.core.odometry.sensed_motion import RateHistory, SensedMotion
 
 Array = NDArray[np.float64]
 
-# States: what a wheel's metre and radian are worth, seconds to be added to stamps, and rad/s that the gyro reads at
+# States: the worth of a wheel's metre and radian, seconds to be added to stamps, and rad/s that the gyro reads at
 # rest. Standard deviations before anything is known, and of their random walks over one second.
 DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
 START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])

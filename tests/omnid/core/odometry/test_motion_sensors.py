@@ -23,7 +23,7 @@ START_NS = 1_795_000_000_000_000_000
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """What the sensors get wrong."""
+    """Errors of the sensors."""
 
     distance: float = 1.0  # metres of the base per metre of the wheels
     turn: float = 1.0
