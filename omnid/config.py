@@ -12,6 +12,7 @@ from drivers.cameras.v4l2_settings import PIXEL_FORMATS, POWER_LINE, SWITCH, V4l
 from drivers.logs.log_folder import RotationSettings
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
+from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking import KltSettings
@@ -238,6 +239,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     obstacles: ObstaclesConfig = field(default_factory=ObstaclesConfig)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
+    navigation: NavigationSettings = field(default_factory=NavigationSettings)
     motor: MotorSettings = field(default_factory=MotorSettings)
     live: LiveConfig = field(default_factory=LiveConfig)
     bus: BusConfig = field(default_factory=BusConfig)
@@ -303,6 +305,7 @@ USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
     "live": "run",
     "log": "replay",
     "places.save_s": "run",
+    "navigation": "run",
     "realtime": "run",
     "record": "run",
     "record.cloud_points": "",

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.motion import MotionSample
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light
+from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -182,3 +186,41 @@ class MapUpdate:
     stamp_ns: int
     points: MapPoints  # m, in the rig frame of the first pair
     path_xy: Array  # (N, 2) m, in the same frame, thinned in a long run
+
+
+class RequestAnswer(NamedTuple):
+    """Answer to the newest request to the navigation."""
+
+    number: int  # rises with each request
+    stamp_ns: int  # of the request, by the sender's clock; 0: it has none
+    request: str  # in a word
+    refusal: str  # the reason, with the remedy; empty: it is accepted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavigationPlan:
+    """The path that is driven."""
+
+    frame: str  # map or odom
+    xy: Array  # (N, 2) m
+    heading_rad: float | None  # at the end; None: as it comes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavigationUpdate:
+    """State of the navigation after a pose or a request, and the motion that it wants."""
+
+    seq: int
+    stamp_ns: int
+    setpoint: Setpoint | None  # heading in odom; None: nothing is sent, and the wheels stop
+    state: NavigationState
+    reason: str = ""  # of a halt or an end, in words
+    task: str = ""  # such as "goal" or "route NAME"
+    command_ns: int = 0  # stamp of the request that it follows from
+    left_m: float = math.nan  # way to the end of the path
+    offset_m: float = math.nan  # of the base to the left of the path
+    loops_left: int = 0  # of a route, this one included
+    teaching: str = ""  # name of the route that is recorded
+    taught_m: float = 0.0  # its length so far
+    answer: RequestAnswer | None = None  # to the newest request; None: there was none
+    plan: NavigationPlan | None = None  # where it differs from that of the message before

@@ -75,15 +75,17 @@ ARROWS: Mapping[str, str] = {
         "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages "
         "omnid.viewer omnid.web",
     "omnid.config":
-        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.obstacles omnid.core.odometry "
-        "omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings omnid.settings_migration "
-        "omnid.transport",
+        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation omnid.core.obstacles "
+        "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "
+        "omnid.settings_migration omnid.transport",
     "omnid.controller":
         "drivers.errors drivers.motor drivers.motors drivers.motors.protocols drivers.motors.simulated "
         "omnid.core.control omnid.engine omnid.errors omnid.settings",
     "omnid.core": "",
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
+    "omnid.core.navigation":
+        "omnid.core.control omnid.core.places omnid.errors omnid.navigation_state omnid.settings omnid.tracking_state",
     "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
     "omnid.core.odometry":
         "calib.panorama calib.se3 drivers.motion omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
@@ -103,26 +105,28 @@ ARROWS: Mapping[str, str] = {
     "omnid.engine": "drivers.frame omnid.core omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
-    "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.places omnid.errors",
+    "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.navigation omnid.core.places omnid.errors",
     "omnid.messages":
-        "drivers.motion omnid.core.mapping omnid.core.obstacles omnid.core.odometry omnid.core.stereo "
-        "omnid.tracking_state",
+        "drivers.motion omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "
+        "omnid.core.stereo omnid.navigation_state omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
         "omnid.sinks omnid.transport",
+    "omnid.navigation_state": "",
     "omnid.recordings":
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
+        "omnid.tracking_state omnid.transport",
+    "omnid.refinement":
+        "calib.errors calib.fit calib.rig omnid.calibration omnid.config omnid.messages omnid.stages "
         "omnid.tracking_state omnid.transport",
     "omnid.report":
         "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
-    "omnid.refinement":
-        "calib.errors calib.fit calib.rig omnid.calibration omnid.config omnid.messages omnid.stages "
-        "omnid.tracking_state omnid.transport",
     "omnid.runs":
-        "calib.rig calib.rig_file drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
-        "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.places "
+        "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
+        "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.navigation "
+        "omnid.core.places "
         "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.messages omnid.refinement "
         "omnid.settings_dump omnid.sinks "
         "omnid.stages omnid.tracking_state omnid.transport",
@@ -140,16 +144,15 @@ ARROWS: Mapping[str, str] = {
     "omnid.sinks":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
         "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.errors omnid.formats "
-        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
+        "omnid.messages omnid.navigation_state omnid.stages omnid.tracking_state omnid.transport",
     "omnid.stages":
-        "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame "
-        "drivers.motion drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.obstacles "
-        "omnid.core.odometry "
-        "omnid.core.odometry.paper omnid.core.places omnid.core.rig omnid.core.stereo omnid.errors omnid.messages "
-        "omnid.tracking_state",
+        "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame drivers.motion "
+        "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.navigation omnid.core.obstacles "
+        "omnid.core.odometry omnid.core.odometry.paper omnid.core.places omnid.core.rig omnid.core.stereo "
+        "omnid.errors omnid.messages omnid.tracking_state",
     "omnid.tracking_state": "",
     "omnid.transport":
-        "calib.se3 drivers.frame drivers.logs omnid.core.control omnid.errors omnid.settings "
+        "calib.se3 drivers.frame drivers.logs omnid.core.control omnid.core.navigation omnid.errors omnid.settings "
         "omnid.tracking_state",
     "omnid.version": "",
     "omnid.viewer":

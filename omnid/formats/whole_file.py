@@ -22,4 +22,4 @@ def write_whole(path: Path, content: bytes) -> None:
         finally:
             partial.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
+        raise OmnidError(f"{path}: cannot write the file: {error}: choose another file") from error

@@ -20,6 +20,8 @@ from drivers.frame import Camera, Frame, FrameSource
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.core.control.arming import MANUAL
+from omnid.core.control.command_sources import PLANNER
+from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.places_status import places_status
@@ -31,17 +33,18 @@ from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
+from omnid.formats.route_file import RouteFolder
 from omnid.messages import OdometryUpdate
 from omnid.refinement.rig_refinement import RigRefinement
 from omnid.runs.map_saver import MapSaver
-from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.pipeline import NavigationParts, Sinks, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import command_recorder
-from omnid.sinks.drive import LiveDrive
+from omnid.sinks.drive import LiveDrive, PlannerDrive
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry
@@ -50,6 +53,8 @@ from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
+from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
 from omnid.transport.topics import command_topics
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
@@ -83,7 +88,7 @@ class LiveRun:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
         prepare_kernels(self._report)
-        compile_serialisers()
+        compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
         offset_ns = time.time_ns() - time.monotonic_ns()
         with ExitStack() as outputs:
             session = Session(self._config, self._graph, outputs, lambda text: self._report(logging.WARNING, text),
@@ -148,8 +153,13 @@ class LiveRun:
         refinement = self._refinement(session, geometry, ladder) if config.rig.refine != "off" else None
         if refinement is not None:
             poses["refine"] = refinement
+        requests = RequestQueue()
+        receiver = NavigationReceiver(requests.put, config.controller.deadlines.command_s,
+                                      synchronised=config.bus.command_clock == "synchronised",
+                                      report=partial(self._report, logging.WARNING))
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
+                      navigation=self._navigation(session, controller, requests) if controller else None,
                       rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
                       features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
                       ring_period_s=lambda: ladder.level.ring_period_s,
@@ -164,7 +174,7 @@ class LiveRun:
             if stages.places and run_places.is_extended else None
         if saver is not None:
             graph.ticker("save", saver.PERIOD_S, saver)
-        commands = self._commands(session, bus, controller, recorder) if controller else None
+        commands = self._commands(session, bus, controller, recorder, receiver) if controller else None
         sources = StatusSources(
             graph.telemetry,
             {name: camera.state for name, camera in cameras.items()},
@@ -175,6 +185,7 @@ class LiveRun:
             commands,
             TICKERS,
             (ladder.status, partial(start_status, stages.rig_gate),
+             *([receiver.status] if controller else ()),
              *([partial(places_status, stages.places)] if stages.places else ()),
              *(part.status for part in (bus, recorder, rig_monitor, refinement, saver) if part)),
         )
@@ -206,8 +217,22 @@ class LiveRun:
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None
-                  ) -> CommandReceiver:
+    def _navigation(self, session: Session, controller: ControllerLink, requests: RequestQueue
+                    ) -> NavigationParts | None:
+        """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
+        if PLANNER not in self._config.controller.sources.names:
+            session.warn(f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off")
+            return None
+
+        def wheels() -> WheelState:
+            state = controller.statistics.state
+            return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source)
+
+        routes = RouteFolder(Path(self._config.navigation.routes))
+        return NavigationParts(requests, wheels, PlannerDrive(controller), routes, self._config.places.map)
+
+    def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None,
+                  navigation: NavigationReceiver) -> CommandReceiver:
         settings = self._config.controller
         commands = CommandReceiver(controller, settings.deadlines.command_s, sources=settings.sources.names,
                                    synchronised=self._config.bus.command_clock == "synchronised",
@@ -216,7 +241,10 @@ class LiveRun:
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns, topics)
 
         def receive(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
-            commands.receive(key, payload, sender, sent_ns)  # before it is recorded: a stop must not wait
+            if navigation.handles(key):
+                navigation.receive(key, payload, sent_ns)
+            else:
+                commands.receive(key, payload, sender, sent_ns)  # before it is recorded: a stop must not wait
             record(key, payload)
 
         bus.subscribe_commands(receive, topics)

@@ -10,21 +10,26 @@ from typing import Any, NamedTuple
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.sinks.drive import LiveDrive, ReplayDrive
+from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.runs.route_map import RunRouteMap
+from omnid.sinks.drive import LiveDrive, PlannerDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping, no_wait
+from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
 from omnid.stages.odometry import OdometryStage, all_features
 from omnid.stages.places import Places
 from omnid.stages.rig_gate import RigGate, never
+from omnid.stages.routes import Routes, RouteStore
 from omnid.stages.stereo import Stereo
+from omnid.transport.navigation_commands import RequestQueue
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +48,23 @@ class Sinks:
     replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
     rig_monitor: Sink[OdometryUpdate] | None = None
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
+    navigation: NavigationParts | None = None
     features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
     map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
     ring_period_s: Callable[[], float] = no_wait  # least time between two obstacle rings, under overload
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     recorded_frames: tuple[Stream[Frame], ...] = ()
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
+
+
+class NavigationParts(NamedTuple):
+    """The surroundings of the navigation of a run with wheels."""
+
+    requests: RequestQueue
+    wheels: Callable[[], WheelState]
+    drive: PlannerDrive
+    routes: RouteStore
+    map_name: str  # of the file of the map; empty: it is not saved
 
 
 class WiredStages(NamedTuple):
@@ -91,6 +107,9 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         outgoing["bus-scan"] = rings
         for name, ring_sink in sinks.rings.items():
             graph.sink(name, ring_sink, rings)
+    if sinks.navigation:
+        inputs = (odometry,) if places is None else (odometry, outgoing["bus-places"])
+        outgoing["bus-navigation"] = _navigation(graph, inputs, geometry, config, sinks.navigation, places)
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
     if sinks.recorder:
@@ -99,6 +118,18 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
     return WiredStages(rig_gate, mapping, places)
+
+
+def _navigation(graph: Graph, poses: tuple[Stream[Any], ...], geometry: Geometry, config: Config,
+                parts: NavigationParts, places: Places | None) -> Stream[NavigationUpdate]:
+    """Join the navigation, whose setpoints go to the controller."""
+    T_base_rig = geometry.rig.T_base_rig
+    requests = graph.source("requests", parts.requests.batches, wake=parts.requests.end)
+    route_map = None if places is None else RunRouteMap(places, T_base_rig, parts.map_name)
+    stage = NavigationStage(config.navigation, T_base_rig, parts.wheels, Routes(parts.routes, route_map))
+    updates: Stream[NavigationUpdate] = graph.stage("navigation", stage, *poses, requests)
+    graph.sink("planner", parts.drive, updates, policy=NEWEST, depth=1)
+    return updates
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

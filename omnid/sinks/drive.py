@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerLink
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
-from omnid.messages import OdometryUpdate
+from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 
+NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
 FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a replay
 
 
@@ -42,6 +43,18 @@ class LiveDrive:
     def end(self) -> None:
         """Have the wheels slow down to a stop and `commands` end; from any thread."""
         self._link.end()
+
+
+class PlannerDrive:
+    """Pass the setpoints of the navigation on; those of a source of higher priority keep them out."""
+
+    def __init__(self, link: ControllerLink) -> None:
+        self._link = link
+
+    def process(self, update: NavigationUpdate) -> None:
+        """Send a setpoint, if there is one."""
+        if update.setpoint is not None:
+            self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
 
 
 class ReplayDrive:

@@ -12,14 +12,15 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.sinks.navigation_status import navigation_status
 from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport import codec
+from omnid.transport import codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
-Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | ObstacleRing
+Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | ObstacleRing | NavigationUpdate
 
 
 class OutgoingMessage(NamedTuple):
@@ -67,6 +68,8 @@ class Encoder:
                 yield OutgoingMessage("scan", SCAN_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
+            case NavigationUpdate():
+                yield from self._navigation(message)
 
     def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
@@ -97,6 +100,15 @@ class Encoder:
                          self._map_encoding.heights_m, self._map_encoding.cell_m)
         payload = codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m, grid.corner)
         yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
+
+    def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
+        stamp_ns = update.stamp_ns + self.offset_ns
+        status = navigation_status(update)
+        yield OutgoingMessage("navigation", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]))
+        if update.plan is not None:
+            plan = update.plan
+            payload = navigation_codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
+            yield OutgoingMessage("plan", navigation_codec.PATH_SCHEMA, payload)
 
     def _in_base(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return points (N, 3) of the rig's first frame in the base's; float32 is enough for a grid of large cells."""

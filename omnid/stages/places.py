@@ -76,6 +76,18 @@ class Places:
         return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
                            pose.keyframe, T_keyframe_rig)
 
+    def keyframe(self, id: int) -> tuple[int, Array] | None:
+        """Return stamp and T_map_rig (4, 4) of a keyframe as the map knows it now; from any thread."""
+        places = self._localiser.places
+        keyframe, T_map_rect = places.keyframes.get(id), places.poses.get(id)
+        if keyframe is None or T_map_rect is None:
+            return None
+        return keyframe.stamp_ns, np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig)
+
+    def keyframe_ids(self) -> list[int]:
+        """Return the keyframes, in ascending order; from any thread."""
+        return sorted(self._localiser.places.keyframes.copy())
+
     def corrected(self, update: PlaceUpdate) -> Array:
         """Return T_map_rig (4, 4) of an earlier pose as the map knows it now; as it was where its keyframe is gone."""
         T_map_rect = self._localiser.places.poses.get(update.keyframe)

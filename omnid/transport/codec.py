@@ -105,13 +105,14 @@ def _typestore() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def compile_serialisers() -> None:
+def compile_serialisers(*more: str) -> None:
     """Compile all serialisers now: compilation at first use would delay all threads, that of the motor included."""
-    for schema in SCHEMAS:
+    for schema in (*SCHEMAS, *more):
         _typestore().get_msgdef(schema)
 
 
-def _cdr(message: object, schema: str) -> bytes:
+def message_cdr(message: object, schema: str) -> bytes:
+    """Encode a message in the type of rosbags."""
     return bytes(_typestore().serialize_cdr(message, schema))
 
 
@@ -122,7 +123,8 @@ def _time(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
     return ros.builtin_interfaces__msg__Time(seconds, nanoseconds)
 
 
-def _header(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
+def header_message(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
+    """Return a header. Raise OmnidError for a stamp that is no ROS time."""
     return ros.std_msgs__msg__Header(_time(stamp_ns), frame)
 
 
@@ -140,7 +142,8 @@ def _xyzw(R: bytes) -> list[float]:
     return list(se3.quaternion(np.frombuffer(R).reshape(3, 3)).tolist())
 
 
-def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
+def pose_message(T: Array) -> ros.geometry_msgs__msg__Pose:
+    """Return the message of a transform (4, 4)."""
     position = ros.geometry_msgs__msg__Point(*(float(v) for v in T[:3, 3]))
     return ros.geometry_msgs__msg__Pose(position, _quaternion(T[:3, :3]))
 
@@ -158,38 +161,36 @@ def odometry_cdr(stamp_ns: int, T_odom_base: Array, covariance: Array, velocity:
     parent, child = frames
     twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
     message = ros.nav_msgs__msg__Odometry(
-        _header(stamp_ns, parent),
-        child,
-        ros.geometry_msgs__msg__PoseWithCovariance(_pose(T_odom_base), _covariance(covariance)),
-        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)),
-    )
-    return _cdr(message, ODOMETRY_SCHEMA)
+        header_message(stamp_ns, parent), child,
+        ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_odom_base), _covariance(covariance)),
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)))
+    return message_cdr(message, ODOMETRY_SCHEMA)
 
 
 def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") -> bytes:
     """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
-    message = ros.geometry_msgs__msg__PoseStamped(_header(stamp_ns, frame), _pose(T_frame_body))
-    return _cdr(message, POSE_SCHEMA)
+    message = ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, frame), pose_message(T_frame_body))
+    return message_cdr(message, POSE_SCHEMA)
 
 
 def pose_with_covariance_cdr(stamp_ns: int, T_frame_body: Array, covariance: Array, frame: str = "map") -> bytes:
     """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in `frame`, its covariance in its axes.
     """
-    pose = ros.geometry_msgs__msg__PoseWithCovariance(_pose(T_frame_body), _covariance(covariance))
-    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(_header(stamp_ns, frame), pose)
-    return _cdr(message, MAP_POSE_SCHEMA)
+    pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_frame_body), _covariance(covariance))
+    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, frame), pose)
+    return message_cdr(message, MAP_POSE_SCHEMA)
 
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
     """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
     edges = [_edge(stamp_ns, edge) for edge in transforms]
-    return _cdr(ros.tf2_msgs__msg__TFMessage(edges), TRANSFORM_SCHEMA)
+    return message_cdr(ros.tf2_msgs__msg__TFMessage(edges), TRANSFORM_SCHEMA)
 
 
 def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__TransformStamped:
     T = edge.T_parent_child
     motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
-    return ros.geometry_msgs__msg__TransformStamped(_header(stamp_ns, edge.parent), edge.child, motion)
+    return ros.geometry_msgs__msg__TransformStamped(header_message(stamp_ns, edge.parent), edge.child, motion)
 
 
 def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *,
@@ -202,17 +203,15 @@ def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: Ar
     number = ros.sensor_msgs__msg__PointField.FLOAT32
     fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
     message = ros.sensor_msgs__msg__PointCloud2(
-        header=_header(stamp_ns, frame),
-        height=1,
-        width=len(packed),
-        fields=fields,
+        header=header_message(stamp_ns, frame),
+        height=1, width=len(packed), fields=fields,
         is_bigendian=False,
         point_step=16,
         row_step=16 * len(packed),
         data=packed.reshape(-1).view(np.uint8),
         is_dense=bool(np.isfinite(packed).all()),
     )
-    return _cdr(message, POINT_CLOUD_SCHEMA)
+    return message_cdr(message, POINT_CLOUD_SCHEMA)
 
 
 def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArray[np.float32]:
@@ -232,14 +231,16 @@ def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, 
     """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
     height, width = cells.shape
     T_frame_corner = se3.transform(np.eye(3), (*corner, 0.0))
-    info = ros.nav_msgs__msg__MapMetaData(_time(stamp_ns), cell_m, width, height, _pose(T_frame_corner))
-    return _cdr(ros.nav_msgs__msg__OccupancyGrid(_header(stamp_ns, frame), info, cells.reshape(-1)), GRID_SCHEMA)
+    info = ros.nav_msgs__msg__MapMetaData(_time(stamp_ns), cell_m, width, height, pose_message(T_frame_corner))
+    message = ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1))
+    return message_cdr(message, GRID_SCHEMA)
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
     entries = [_status(status) for status in statuses]
-    return _cdr(ros.diagnostic_msgs__msg__DiagnosticArray(_header(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA)
+    return message_cdr(ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries),
+                       DIAGNOSTICS_SCHEMA)
 
 
 def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
@@ -253,20 +254,20 @@ def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticSta
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
     """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
     twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
-    return _cdr(ros.geometry_msgs__msg__TwistStamped(_header(stamp_ns, frame), twist), TWIST_SCHEMA)
+    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist), TWIST_SCHEMA)
 
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
     """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
     vector = _vector((velocity_mps, 0, heading_rad))
-    return _cdr(ros.geometry_msgs__msg__Vector3Stamped(_header(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
+    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
 
 
 def twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, TWIST_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
-    return TwistRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
+    return TwistRecord(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
                  message.twist.angular.z)
 
 
@@ -286,20 +287,20 @@ def heading_from_cdr(payload: bytes) -> HeadingRecord:
     """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, VECTOR_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
-    return HeadingRecord(_unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
+    return HeadingRecord(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
                           message.vector.z)
 
 
 def header_cdr(stamp_ns: int, frame: str = "") -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return _cdr(_header(stamp_ns, frame), HEADER_SCHEMA)
+    return message_cdr(header_message(stamp_ns, frame), HEADER_SCHEMA)
 
 
 def stamp_from_cdr(payload: bytes) -> int:
     """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, HEADER_SCHEMA)
     assert isinstance(message, ros.std_msgs__msg__Header)
-    return _unchecked_stamp_ns(message.stamp)
+    return unchecked_stamp_ns(message.stamp)
 
 
 def message_from_cdr(payload: bytes, schema: str) -> object:
@@ -310,7 +311,7 @@ def message_from_cdr(payload: bytes, schema: str) -> object:
         raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
-def _unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
     """Return a stamp that may be invalid; callers check it."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 

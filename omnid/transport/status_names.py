@@ -23,6 +23,8 @@ RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
 PLACES: Final = f"{PREFIX}places"
 MAP_FILE: Final = f"{PREFIX}map file"
+NAVIGATION: Final = f"{PREFIX}navigation"
+REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
 RIG_REFINEMENT: Final = f"{PREFIX}rig refinement"
@@ -73,6 +75,19 @@ class Key(StrEnum):
     REMEDY = "remedy"  # the way to arm, no key where none is needed
     ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
     ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
+    # Navigation, on its own topic
+    TASK = "task"  # such as "goal" or "route NAME"; no key without one
+    REASON = "reason"  # of a halt or an end
+    COMMAND_NS = "command_ns"  # stamp of the request that the task follows from; no key without one
+    LEFT_M = "left_m"  # way to the end of the path
+    OFFSET_M = "offset_m"  # of the base to the left of the path
+    LOOPS_LEFT = "loops_left"  # of a route, with the one that is driven
+    TEACHING = "teaching"  # name of the route that is recorded
+    TAUGHT_M = "taught_m"
+    REQUEST = "request"  # the newest one, in a word
+    REQUEST_NUMBER = "request_number"  # rises with each request
+    REQUEST_STAMP_NS = "request_stamp_ns"  # of its sender; no key without one
+    REFUSAL = "refusal"  # why it is refused; no key where it was accepted
 
 
 # Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.

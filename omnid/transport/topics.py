@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from omnid.transport import codec
+from omnid.transport import codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA
 
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
@@ -31,9 +31,17 @@ PUBLISHED: Final = {
     "scan": Topic(SCAN_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(IMAGE_SCHEMA),
+    "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
+    "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
 }
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
+GOAL: Final = "cmd/goal"
+PATH: Final = "cmd/path"
+NAVIGATION: Final = "cmd/navigation"
+ROUTE: Final = "cmd/route"
+NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH_SCHEMA,
+                            NAVIGATION: navigation_codec.STRING_SCHEMA, ROUTE: navigation_codec.STRING_SCHEMA}
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
@@ -43,7 +51,7 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
     setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **named}
+    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **named}
 
 
 def ros_name(robot: str, topic: str) -> str:

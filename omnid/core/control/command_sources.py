@@ -15,7 +15,7 @@ OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
 MOST_SOURCES: Final = 8
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_RESERVED: Final = ("twist", "heading", "stop", "arm")  # topics below cmd/
+_RESERVED: Final = ("twist", "heading", "stop", "arm", "goal", "path", "navigation", "route")  # topics below cmd/
 
 # Reasons to refuse a command, which are counted.
 UNKNOWN_SOURCE: Final = "unknown source"

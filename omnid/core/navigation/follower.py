@@ -1,0 +1,111 @@
+"""Following of a whole path: leg by leg, then the heading of the goal, then what is missing to it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
+from omnid.core.navigation.path import DrivePath, straight_leg
+from omnid.core.navigation.pursuit import Pursuit
+from omnid.core.navigation.settings import NavigationSettings
+
+Array = NDArray[np.float64]
+
+SETTLED: Final = 3  # poses one after the other that must be within the tolerance, standing
+SETTLED_RADPS: Final = 0.1
+SETTLED_MPS: Final = 0.03
+CORNER_M: Final = 0.03  # from the end of a leg that is not the last
+CORRECTIONS: Final = 3  # drives of what is missing to the goal
+BEHIND_RAD: Final = math.pi / 2  # what is missing lies behind: it is driven backwards
+STAND: Final = Setpoint(0.0, None, 0.0)
+
+
+class Following(NamedTuple):
+    """Progress on a path, and the motion."""
+
+    setpoint: Setpoint  # its heading is in the frame of the path
+    left_m: float  # way to the end of the path
+    offset_m: float  # to the left of the path
+    turning: bool
+    done: bool = False
+    missed_m: float = 0.0  # distance to the goal, where done
+
+
+class Follower:
+    """Drive a path to its end; poses are in the frame of the path."""
+
+    def __init__(self, path: DrivePath, settings: NavigationSettings, leg: int = 0, s_m: float = 0.0) -> None:
+        """leg, s_m: where on the path to begin."""
+        self.path = path
+        self._settings = settings
+        self._legs = list(path.legs)
+        self._number = leg
+        at_goal = path.length_m <= settings.goal_cm * 0.01
+        self._pursuit = None if at_goal else Pursuit(self._legs[leg], settings.pursuit, s_m)
+        self._settled = 0
+        self._corrections = 0
+
+    @property
+    def pursuit(self) -> Pursuit | None:
+        """The leg that is followed; None while the base turns at the end."""
+        return self._pursuit
+
+    def step(self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
+             ) -> Following:
+        """Return the motion at a pose (3,) with its measured speeds."""
+        predicted = ahead(pose, speed_mps, yaw_rate_radps, self._settings.pursuit.delay_s)
+        if self._pursuit is not None:
+            following = self._follow(self._pursuit, stamp_ns, predicted, speed_mps, obstacle_m)
+            if following is not None:
+                return following
+        return self._align(pose, speed_mps, yaw_rate_radps)
+
+    def _follow(self, pursuit: Pursuit, stamp_ns: int, predicted: Array, speed_mps: float, obstacle_m: float
+                ) -> Following | None:
+        """Follow the leg; None at the end of the last one."""
+        approach = pursuit.step(stamp_ns, predicted, speed_mps, obstacle_m=obstacle_m)
+        is_last = self._number == len(self._legs) - 1
+        end_m = 0.25 * self._settings.goal_cm * 0.01 if is_last else CORNER_M
+        if approach.left_m > end_m or approach.turning:
+            left_m = approach.left_m + sum(leg.length_m for leg in self._legs[self._number + 1:])
+            return Following(approach.setpoint, left_m, approach.offset_m, approach.turning)
+        if is_last:
+            self._pursuit = None
+            return None
+        self._number += 1
+        self._pursuit = Pursuit(self._legs[self._number], self._settings.pursuit)
+        left_m = sum(leg.length_m for leg in self._legs[self._number:])
+        return Following(STAND, left_m, approach.offset_m, True)
+
+    def _align(self, pose: Array, speed_mps: float, yaw_rate_radps: float) -> Following:
+        """Turn to the heading of the goal, standing; then drive what is missing, or end."""
+        goal_rad, missing = self.path.final_heading_rad, self.path.goal - pose[:2]
+        missing_m = float(np.hypot(*missing))
+        error_rad = 0.0 if goal_rad is None else wrap_angle(goal_rad - float(pose[2]))
+        stands = abs(speed_mps) < SETTLED_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
+        within = abs(error_rad) <= math.radians(self._settings.goal_deg)
+        self._settled = self._settled + 1 if stands and within else 0
+        setpoint = STAND if goal_rad is None else Setpoint(0.0, goal_rad)
+        if self._settled < SETTLED:
+            return Following(setpoint, missing_m, 0.0, True)
+        if missing_m <= self._settings.goal_cm * 0.01 or self._corrections >= CORRECTIONS:
+            return Following(STAND, 0.0, 0.0, False, True, missing_m)
+        self._corrections += 1
+        self._settled = 0
+        aside_rad = abs(wrap_angle(math.atan2(missing[1], missing[0]) - float(pose[2])))
+        self._legs = [straight_leg(pose, self.path.goal, backwards=aside_rad > BEHIND_RAD)]
+        self._number, self._pursuit = 0, Pursuit(self._legs[0], self._settings.pursuit)
+        return Following(STAND, missing_m, 0.0, True)
+
+
+def ahead(pose: Array, speed_mps: float, yaw_rate_radps: float, after_s: float) -> Array:
+    """Return the pose (3,) after a time at constant speeds."""
+    turned_rad = yaw_rate_radps * after_s
+    middle_rad = float(pose[2]) + 0.5 * turned_rad
+    way_m = speed_mps * after_s
+    return np.array([pose[0] + way_m * math.cos(middle_rad), pose[1] + way_m * math.sin(middle_rad),
+                     pose[2] + turned_rad])

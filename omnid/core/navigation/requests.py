@@ -1,0 +1,129 @@
+"""Requests to the navigation: goals, paths, routes, and words such as cancel. The parsers take any text."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.errors import OmnidError
+
+MAX_LOOPS: Final = 10_000
+LONGEST_TEXT: Final = 200  # characters of a request
+LONGEST_NAME: Final = 64
+_NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
+_LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
+ROUTE_USAGE: Final = '"teach NAME", "finish", "repeat NAME [reverse] [loops=N]" or "stop"'
+
+
+class NavigationFrame(StrEnum):
+    """Frame of a goal or a path."""
+
+    MAP = "map"
+    ODOM = "odom"
+
+
+class NavigationVerb(StrEnum):
+    """Requests about what is under way."""
+
+    CANCEL = "cancel"
+    PAUSE = "pause"
+    RESUME = "resume"
+
+
+class RouteAction(StrEnum):
+    """Requests about routes."""
+
+    TEACH = "teach"  # begin to record
+    FINISH = "finish"  # the recording, and write it
+    REPEAT = "repeat"
+    STOP = "stop"  # the repetition, or the recording without a file
+
+
+@dataclass(frozen=True, slots=True)
+class GoalRequest:
+    """Drive to a pose of the base."""
+
+    frame: NavigationFrame
+    x_m: float
+    y_m: float
+    heading_rad: float | None = None  # None: as it comes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathRequest:
+    """Drive along a path."""
+
+    frame: NavigationFrame
+    xy: NDArray[np.float64]  # (N, 2) m
+    heading_rad: float | None = None  # at the end; None: as it comes
+
+
+@dataclass(frozen=True, slots=True)
+class RouteRequest:
+    """Teach or repeat a route."""
+
+    action: RouteAction
+    name: str = ""
+    reverse: bool = False
+    loops: int = 1
+
+
+Request: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
+
+
+class NavigationCommand(NamedTuple):
+    """A request and its times."""
+
+    request: Request
+    arrival_ns: int  # of Unix time
+    stamp_ns: int = 0  # of the sender, of Unix time; 0: it has none
+
+
+def navigation_verb(text: str) -> NavigationVerb:
+    """Return the verb of a text. Raise OmnidError for any other text."""
+    word = text.strip() if len(text) <= LONGEST_TEXT else ""
+    if word not in list(NavigationVerb):
+        raise OmnidError(f"{_shown(text)} is no request to the navigation: expected {', '.join(NavigationVerb)}")
+    return NavigationVerb(word)
+
+
+def route_name(text: str) -> str:
+    """Return a name that is one, so that it can be a part of a file name. Raise OmnidError for any other text."""
+    if not _NAME.fullmatch(text):
+        raise OmnidError(f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
+                         f"digit first, at most {LONGEST_NAME}")
+    return text
+
+
+def route_request(text: str) -> RouteRequest:
+    """Parse "teach NAME", "finish", "repeat NAME [reverse] [loops=N]" or "stop". Raise OmnidError for any other text.
+    """
+    words = text.split() if len(text) <= LONGEST_TEXT else []
+    match words:
+        case ["finish" | "stop" as action]:
+            return RouteRequest(RouteAction(action))
+        case ["teach", name]:
+            return RouteRequest(RouteAction.TEACH, route_name(name))
+        case ["repeat", name, *options] if len(options) == len({option.partition("=")[0] for option in options}):
+            return _repeat(route_name(name), options, text)
+    raise OmnidError(f"{_shown(text)} is no request about routes: expected {ROUTE_USAGE}")
+
+
+def _repeat(name: str, options: list[str], text: str) -> RouteRequest:
+    loops = 1
+    for option in options:
+        found = _LOOPS.fullmatch(option)
+        if found and int(found[1]) <= MAX_LOOPS:
+            loops = int(found[1])
+        elif option != "reverse":
+            raise OmnidError(f"{_shown(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
+    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops)
+
+
+def _shown(text: str) -> str:
+    return ascii(text[:60])

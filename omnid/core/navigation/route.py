@@ -1,0 +1,174 @@
+"""Routes: taught once by driving, repeated along the same way in the map.
+
+A route is tied to keyframes of the map: where an optimisation of the map moves them, the route moves with them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.navigation.path import MAX_LENGTH_M, DrivePath, drive_path
+from omnid.core.places.planar import composed, relative, wrapped
+from omnid.errors import OmnidError
+
+Array = NDArray[np.float64]
+
+SPACING_M, SPACING_RAD = 0.1, math.radians(10)  # between the points of a recording
+MOST_POINTS: Final = 15_000
+SHORTEST_ROUTE_M: Final = 0.5
+LEAST_MPS: Final = 0.1  # where it was driven more slowly, it is repeated at that speed
+STANDING_MPS: Final = 0.02
+NO_KEYFRAME: Final = -1
+SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be in the map
+CLOSED_M: Final = 1.0  # from the end to the start of a route that is driven in rounds
+ENTRY_M: Final = 1.5  # from the robot to the route
+ENTRY_M_PER_RAD: Final = 0.5  # of heading, where several pieces of a route are near
+FarKeyframe = Callable[[int], "KeyframePose | None"]
+
+
+class KeyframePose(NamedTuple):
+    """A keyframe of the map."""
+
+    stamp_ns: int  # of its images, which tells it apart from one of the same number in another map
+    pose: Array  # x, y, yaw (3,) of the base in the map
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """A recorded way; all points in the frame map as it was at the end of the recording."""
+
+    name: str
+    poses: Array  # (N, 3) x, y, yaw of the base
+    speeds: Array  # (N,) m/s with which each point was reached, below 0 with the back ahead
+    keyframes: NDArray[np.int64]  # (N,) that the points are tied to, NO_KEYFRAME without
+    in_keyframe: Array  # (N, 3) pose in it
+    stamps_ns: Mapping[int, int]  # of keyframes of the map, those of the points and others
+    created_s: int = 0  # of Unix time
+    map_name: str = ""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the way."""
+        return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
+
+    @property
+    def is_closed(self) -> bool:
+        """True if it ends where it began, so that it is driven in rounds."""
+        return math.dist(self.poses[0, :2], self.poses[-1, :2]) <= CLOSED_M
+
+    def fits(self, keyframe: FarKeyframe) -> bool:
+        """True if a map holds the keyframes that were noted, by their stamps."""
+        found = sum((now := keyframe(id)) is not None and now.stamp_ns == stamp for id, stamp in self.stamps_ns.items())
+        return found > 0 and found >= SAME_MAP * len(self.stamps_ns)
+
+    def in_map(self, keyframe: FarKeyframe) -> Array:
+        """Return the poses (N, 3) in the map as it is now; where a keyframe is gone, moved as its neighbours are."""
+        moved = np.full((len(self.poses), 3), np.nan)
+        for id in np.unique(self.keyframes):
+            now = keyframe(int(id)) if id != NO_KEYFRAME else None
+            if now is not None and now.stamp_ns == self.stamps_ns.get(int(id)):
+                at = self.keyframes == id
+                moved[at] = composed(np.repeat(now.pose[None], at.sum(), 0), self.in_keyframe[at])
+        known = np.isfinite(moved[:, 0])
+        if not known.any():
+            return self.poses
+        points = np.arange(len(self.poses))
+        shift = moved - self.poses
+        shift[:, 2] = wrapped(shift[:, 2])
+        filled = np.column_stack([np.interp(points, points[known], shift[known, axis]) for axis in range(3)])
+        return np.asarray(self.poses + filled)
+
+    def reversed(self) -> Route:
+        """Return the route from its end to its start; the base turns round and drives it the same way ahead."""
+        half_turn = np.array([0.0, 0.0, math.pi])
+        speeds = np.concatenate([self.speeds[1:], self.speeds[-1:]])[::-1]  # a speed belongs to the step before it
+        return replace(self, poses=composed(self.poses[::-1], half_turn), speeds=speeds,
+                       keyframes=self.keyframes[::-1], in_keyframe=composed(self.in_keyframe[::-1], half_turn))
+
+
+class RouteRecorder:
+    """Collects the points of a route while it is driven."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.length_m = 0.0
+        self._points: list[tuple[Array, float, int, Array]] = []
+
+    def add(self, pose: Array, speed_mps: float, keyframe: int, keyframe_pose: Array) -> None:
+        """Add a pose (3,) of the base in the map where it has moved; keyframe_pose (3,): of its keyframe.
+
+        Raise OmnidError for a route that gets too long.
+        """
+        if self._points:
+            step = relative(self._points[-1][0], pose)
+            moved_m = math.hypot(step[0], step[1])
+            if moved_m < SPACING_M and abs(float(wrapped(step[2]))) < SPACING_RAD:
+                return
+            self.length_m += moved_m
+        if len(self._points) >= MOST_POINTS or self.length_m > MAX_LENGTH_M:
+            raise OmnidError(f"the route {self.name} is too long: {len(self._points)} points, {self.length_m:.0f} m")
+        if abs(speed_mps) < STANDING_MPS and self._points:
+            speed_mps = math.copysign(STANDING_MPS, self._points[-1][1])
+        self._points.append((pose, speed_mps, keyframe, relative(keyframe_pose, pose)))
+
+    def route(self, keyframe: FarKeyframe, noted: Mapping[int, int], created_s: int, map_name: str) -> Route:
+        """Return the route in the map as it is now; noted: stamps of keyframes that tell the map.
+
+        Raise OmnidError for one that is too short.
+        """
+        if self.length_m < SHORTEST_ROUTE_M:
+            raise OmnidError(f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
+                             "and more: drive it, then finish")
+        poses, speeds, keyframes, in_keyframe = zip(*self._points, strict=True)
+        stamps = dict(noted)
+        for id in set(keyframes):
+            found = keyframe(id) if id != NO_KEYFRAME else None
+            if found is not None:
+                stamps[id] = found.stamp_ns
+        route = Route(self.name, np.array(poses), np.array(speeds), np.array(keyframes, np.int64),
+                      np.array(in_keyframe), stamps, created_s, map_name)
+        return replace(route, poses=route.in_map(keyframe))
+
+
+def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool) -> list[DrivePath]:
+    """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
+
+    A closed route is driven in rounds, any other there and back, `loops` times in all. Raise OmnidError where the
+    robot is not near it.
+    """
+    there = route.reversed() if reverse else route
+    back = there if route.is_closed else there.reversed()
+    poses = there.in_map(keyframe)
+    first = _entry(poses, pose)
+    paths = [_path(there, poses, first, pose)]
+    whole = {True: _path(there, poses, 0, None), False: _path(back, back.in_map(keyframe), 0, None)}
+    return paths + [whole[k % 2 == 0] for k in range(1, loops)]
+
+
+def _entry(poses: Array, pose: Array) -> int:
+    """Return the point of a route at which the robot begins."""
+    away_m = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
+    cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
+    near = away_m <= ENTRY_M
+    if not near.any():
+        raise OmnidError(f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within "
+                         f"{ENTRY_M:g} m, anywhere on it")
+    return int(np.argmin(np.where(near, cost, np.inf)))
+
+
+def _path(route: Route, poses: Array, first: int, pose: Array | None) -> DrivePath:
+    """Return the path from a point of the route on, from the pose of the robot if one is given."""
+    first = min(first, len(poses) - 2)
+    xy, speeds = poses[first:, :2], np.maximum(np.abs(route.speeds[first:]), LEAST_MPS)
+    backwards = route.speeds[first:] < 0
+    if pose is not None and math.dist(pose[:2], xy[0]) > CLOSED_M / 4:
+        xy = np.vstack([pose[None, :2], xy])
+        speeds, backwards = np.append(speeds[:1], speeds), np.append(backwards[:1], backwards)
+        backwards[:2] = False
+    return drive_path(xy, float(poses[-1, 2]), speeds=speeds, backwards=[bool(b) for b in backwards])

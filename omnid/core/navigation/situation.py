@@ -1,0 +1,87 @@
+"""Inputs of the navigation at a pose, and reasons to refuse or to wait that follow from them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.places.planar import composed
+from omnid.tracking_state import MapState, TrackingState
+
+Array = NDArray[np.float64]
+
+
+class WheelState(NamedTuple):
+    """State of the controller of the wheels."""
+
+    armed: bool
+    needs_request: bool  # only cmd/arm lets the wheels turn again
+    disarmed_by: str = ""  # empty while armed
+    reason: str = ""  # why the wheels must stop now; empty: they may turn
+    source: str = ""  # of the commands that drive; empty while none does
+
+
+class MapPosition(NamedTuple):
+    """Pose of odom in the map."""
+
+    T_map_odom: Array  # x, y, yaw (3,), of the base's frames
+    state: MapState
+    sigma_m: float  # of the base's position in the map
+
+
+class Situation(NamedTuple):
+    """The newest pose, and what else decides about motion."""
+
+    stamp_ns: int
+    pose: Array  # x, y, yaw (3,) of the base in odom
+    speed_mps: float  # forwards
+    yaw_rate_radps: float
+    state: TrackingState
+    resets: int  # how often odometry has begun again
+    wheels: WheelState
+    in_map: MapPosition | None = None  # None: nothing is known yet
+    obstacle_m: float = math.inf  # from the outline of the base to the nearest one
+
+    def T_frame_odom(self, frame: NavigationFrame) -> Array:
+        """Return the pose of odom in a frame (3,)."""
+        if frame is NavigationFrame.MAP and self.in_map is not None:
+            return self.in_map.T_map_odom
+        return np.zeros(3)
+
+    def map_pose(self) -> Array:
+        """Return the pose of the base in the map (3,)."""
+        return self.pose_in(NavigationFrame.MAP)
+
+    def pose_in(self, frame: NavigationFrame) -> Array:
+        """Return the pose of the base in a frame (3,)."""
+        return np.asarray(composed(self.T_frame_odom(frame)[None], self.pose)[0])
+
+
+def refusal_to_drive(situation: Situation | None, frame: NavigationFrame, map_sigma_m: float) -> str:
+    """Return why no drive can begin now, with the remedy; empty if it can."""
+    if situation is None:
+        return "there is no pose yet: wait until the robot is ready (`omnid listen`)"
+    wheels = situation.wheels
+    if not wheels.armed:
+        return f"not armed ({wheels.disarmed_by}): arm it first (`omnid arm`)"
+    if situation.state is TrackingState.LOST:
+        return "odometry is lost: check the images and the light (`omnid listen`)"
+    if frame is NavigationFrame.MAP:
+        return refusal_of_map(situation, map_sigma_m)
+    return ""
+
+
+def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
+    """Return why the pose in the map cannot be used, with the remedy; empty if it can."""
+    in_map = situation.in_map
+    if in_map is None or in_map.state is not MapState.LOCALIZED:
+        return ("not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
+                "was made, or use the frame odom")
+    if not in_map.sigma_m <= map_sigma_m:
+        return (f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than navigation.map_sigma_m = "
+                f"{map_sigma_m:g}: drive it a little where the map was made")
+    return ""

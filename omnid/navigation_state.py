@@ -1,0 +1,24 @@
+"""State of the navigation: one enum for planner, messages, status, bus and programs. Imports no numpy."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class NavigationState(StrEnum):
+    """State of a goal, a path or a route. The values are the words used on the bus and in logs."""
+
+    IDLE = "idle"  # there is nothing to do since the start
+    DRIVING = "driving"
+    AVOIDING = "avoiding"  # beside the path, around an obstacle
+    BLOCKED = "blocked"  # it waits for the way to become free
+    PAUSED = "paused"  # by a command, or by a fault that a person must look at; `resume` goes on
+    NOT_LOCALISED = "not localised"  # it waits for the pose in the map
+    REACHED = "reached"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+
+    @property
+    def is_end(self) -> bool:
+        """True if nothing is under way: the wheels are given no setpoint."""
+        return self in (self.IDLE, self.REACHED, self.CANCELLED, self.FAILED)

@@ -1,0 +1,212 @@
+"""Navigation stage: poses, places, obstacles and requests in; setpoints and the state of the navigation out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.navigation.follower import STAND
+from omnid.core.navigation.navigator import Navigation, Navigator
+from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationCommand,
+    NavigationFrame,
+    NavigationVerb,
+    PathRequest,
+    Request,
+    RouteAction,
+    RouteRequest,
+)
+from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.places.planar import planar
+from omnid.errors import OmnidError
+from omnid.messages import NavigationPlan, NavigationUpdate, OdometryUpdate, PlaceUpdate, RequestAnswer
+from omnid.stages.odometry import base_pose, of_base
+from omnid.stages.routes import KeyframeTie, Routes
+
+Array = NDArray[np.float64]
+NavigationInput: TypeAlias = "OdometryUpdate | PlaceUpdate | NavigationCommand | Iterable[NavigationCommand]"
+
+REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
+FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
+
+
+class NavigationStage:
+    """Drive to goals, along paths and routes. Its frames are those of the base, as on the bus."""
+
+    def __init__(self, settings: NavigationSettings, T_base_rig: Array, wheels: Callable[[], WheelState],
+                 routes: Routes) -> None:
+        """wheels: returns the controller's state; called at each pose and request."""
+        self._settings, self._T_base_rig, self._routes = settings, T_base_rig, routes
+        self._T_rig_base = se3.inverse(T_base_rig)
+        self._wheels = wheels
+        self._navigator = Navigator(settings)
+        self._now: Situation | None = None
+        self._in_map: MapPosition | None = None
+        self._tie: KeyframeTie | None = None
+        self._seq = 0
+        self._answer: RequestAnswer | None = None
+        self._plan: NavigationPlan | None = None  # that was not given yet
+        self._given: tuple[object, ...] = ()  # the state that was given last
+        self._given_ns = -REPEAT_NS
+
+    def process(self, message: NavigationInput) -> NavigationUpdate | None:
+        """Return the motion at a pose, or the answer to a request; None where nothing is to be sent or has changed."""
+        match message:
+            case OdometryUpdate():
+                return self._at_pose(message)
+            case PlaceUpdate():
+                self._place(message)
+                return None
+            case NavigationCommand():
+                return self._request(message)
+        update = None
+        for command in message:
+            update = self._request(command)
+        return update
+
+    def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
+        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
+        self._seq = odometry.seq
+        self._now = now = Situation(
+            odometry.stamp_ns, planar(T_odom_base), float(velocity[0]), float(velocity[5]), odometry.state,
+            odometry.reset_counter, self._wheels(), self._in_map)
+        ended = self._routes.record(now, self._tie)
+        if ended:
+            self._refuse(ended)
+        return self._update(self._navigator.step(now))
+
+    def _place(self, update: PlaceUpdate) -> None:
+        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
+        T_map_odom = self._T_base_rig @ update.T_map_odom @ self._T_rig_base
+        sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
+        self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m)
+        T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
+        self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))
+
+    def _request(self, command: NavigationCommand) -> NavigationUpdate:
+        """Execute a request; return the new state with the answer."""
+        number = 1 if self._answer is None else self._answer.number + 1
+        try:
+            word = self._execute(command)
+            self._answer = RequestAnswer(number, command.stamp_ns, word, "")
+        except OmnidError as error:
+            self._answer = RequestAnswer(number, command.stamp_ns, _word(command.request), str(error))
+        navigator = self._navigator
+        setpoint = STAND if navigator.stopping else None
+        update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
+        assert update is not None
+        return update
+
+    def _execute(self, command: NavigationCommand) -> str:
+        """Execute a request; return it in a word. Raise OmnidError with the reason to refuse it."""
+        request, navigator = command.request, self._navigator
+        match request:
+            case NavigationVerb.CANCEL:
+                navigator.cancel("cancelled by a request")
+            case NavigationVerb.PAUSE:
+                navigator.pause("paused by a request")
+            case NavigationVerb.RESUME:
+                _raise_if(navigator.resume(self._situation()))
+            case GoalRequest():
+                self._start("goal", request.frame, [self._goal_path(request)], command)
+            case PathRequest():
+                self._start("path", request.frame, [self._given_path(request)], command)
+            case RouteRequest():
+                self._route(request, command)
+        return _word(request)
+
+    def _route(self, request: RouteRequest, command: NavigationCommand) -> None:
+        routes = self._routes
+        match request.action:
+            case RouteAction.TEACH:
+                if self._navigator.task.startswith("route") and self._navigator.drive is not None:
+                    raise OmnidError("a route is being repeated: stop it first")
+                routes.teach(request.name, self._situation())
+            case RouteAction.FINISH:
+                routes.finish(command.arrival_ns // 1_000_000_000)
+            case RouteAction.STOP:
+                if not routes.drop():
+                    self._navigator.cancel("stopped by a request")
+            case RouteAction.REPEAT:
+                if routes.teaching:
+                    raise OmnidError(f"the route {routes.teaching} is being taught: finish or stop it first")
+                self._require_ready(NavigationFrame.MAP)
+                paths = routes.paths(request, self._situation())
+                self._start(f"route {request.name}", NavigationFrame.MAP, paths, command)
+
+    def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
+        self._require_ready(frame)
+        self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
+        xy = np.vstack([leg.xy for leg in paths[0].legs])
+        self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
+
+    def _goal_path(self, goal: GoalRequest) -> DrivePath:
+        self._require_ready(goal.frame)
+        pose = self._situation().pose_in(goal.frame)
+        self._require_near(math.dist(pose[:2], (goal.x_m, goal.y_m)))
+        return DrivePath((straight_leg(pose, (goal.x_m, goal.y_m)),), goal.heading_rad)
+
+    def _given_path(self, path: PathRequest) -> DrivePath:
+        self._require_ready(path.frame)
+        pose = self._situation().pose_in(path.frame)
+        away_m = math.dist(pose[:2], path.xy[0])
+        self._require_near(away_m)
+        if away_m > FIRST_LEG_M:
+            raise OmnidError(f"the path begins {away_m:.1f} m away from the robot, expected at most {FIRST_LEG_M:g} m: "
+                             "drive to its start (`omnid goto`), or let it begin here")
+        return drive_path(np.vstack([pose[None, :2], path.xy]), path.heading_rad)
+
+    def _require_near(self, away_m: float) -> None:
+        if not away_m <= self._settings.reach_m:
+            raise OmnidError(f"{away_m:.1f} m away: farther than navigation.reach_m = {self._settings.reach_m:g}")
+
+    def _require_ready(self, frame: NavigationFrame) -> None:
+        _raise_if(refusal_to_drive(self._situation(), frame, self._settings.map_sigma_m))
+
+    def _situation(self) -> Situation:
+        if self._now is None:
+            raise OmnidError(refusal_to_drive(None, NavigationFrame.ODOM, 0.0))
+        return self._now._replace(in_map=self._in_map, wheels=self._wheels())
+
+    def _refuse(self, reason: str) -> None:
+        number = 1 if self._answer is None else self._answer.number + 1
+        self._answer = RequestAnswer(number, 0, "teach", reason)
+
+    def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
+        navigator, routes = self._navigator, self._routes
+        stamp_ns = 0 if self._now is None else self._now.stamp_ns
+        plan, self._plan = self._plan, None
+        state = (now.state, now.reason, navigator.task, routes.teaching, self._answer)
+        same = state == self._given and now.setpoint is None and plan is None
+        if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
+            return None
+        self._given, self._given_ns = state, stamp_ns
+        drive = navigator.drive
+        return NavigationUpdate(
+            self._seq, stamp_ns, now.setpoint, now.state, now.reason, navigator.task, navigator.command_ns, now.left_m,
+            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, self._answer, plan)
+
+
+def _word(request: Request) -> str:
+    """Return a request in a word."""
+    match request:
+        case GoalRequest():
+            return "goal"
+        case PathRequest():
+            return "path"
+        case RouteRequest():
+            return f"{request.action} {request.name}".strip()
+    return str(request)
+
+
+def _raise_if(refusal: str) -> None:
+    if refusal:
+        raise OmnidError(refusal)

@@ -1,0 +1,148 @@
+"""Requests to the navigation from the network, validated: `cmd/goal`, `cmd/path`, `cmd/navigation`, `cmd/route`.
+
+goal is a geometry_msgs/msg/PoseStamped, path a nav_msgs/msg/Path, both in the frame map or odom; a quaternion of zeros
+asks for no heading. navigation and route are std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME", "finish",
+"repeat NAME [reverse] [loops=N]", "stop".
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from queue import SimpleQueue
+from typing import Final
+
+from omnid.core.navigation.path import FARTHEST_M
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationCommand,
+    NavigationFrame,
+    NavigationVerb,
+    PathRequest,
+    Request,
+    RouteAction,
+    RouteRequest,
+    navigation_verb,
+    route_request,
+)
+from omnid.errors import OmnidError
+from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.navigation_codec import goal_from_cdr, path_from_cdr, string_from_cdr
+from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
+from omnid.transport.topics import GOAL, NAVIGATION, NAVIGATION_TOPICS, PATH
+
+LONGEST_PAYLOAD: Final = 1 << 20  # bytes
+LONGEST_TEXT_PAYLOAD: Final = 4096
+MOST_WAITING: Final = 64  # requests
+_CLOCKS: Final = 'synchronise the clocks, or set bus.command_clock = "arrival"'
+
+
+class NavigationReceiver:
+    """Passes valid requests on and counts the others; called from threads of the bus, never raises.
+
+    A halt (cancel, pause, stop) is obeyed whatever its age. A goal or a path needs a stamp of the sender's clock,
+    unless clocks are not synchronised: one that waited in a network must not start a drive minutes later.
+    """
+
+    def __init__(self, target: Callable[[NavigationCommand], None], stale_s: float, *, synchronised: bool = True,
+                 report: Callable[[str], None] | None = None) -> None:
+        """target: may be called from any thread. stale_s: as of CommandReceiver. report: takes lines for the log."""
+        self._target, self._stale_ns, self._synchronised = target, round(stale_s * 1e9), synchronised
+        self._report = report
+        self.accepted = 0
+        self.refused: Counter[str] = Counter()  # by topic
+
+    def handles(self, key: str) -> bool:
+        """True if a topic is one of the navigation's."""
+        return key in NAVIGATION_TOPICS
+
+    def status(self) -> DiagnosticStatus:
+        """Return how many requests were accepted, and how many were not valid, by topic."""
+        refused = {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(self.refused.items())}
+        return DiagnosticStatus(REQUESTS, OK, "", {"accepted": str(self.accepted), **refused})
+
+    def receive(self, key: str, payload: bytes, sent_ns: int = 0) -> None:
+        """Handle one message; sent_ns: when, for a message without stamp, 0 if unknown."""
+        arrival_ns = time.time_ns()
+        try:
+            request, stamp_ns = self._parsed(key, payload)
+            if not _is_halt(request):
+                self._check_age(stamp_ns or sent_ns, needed=key in (GOAL, PATH))
+        except OmnidError as error:
+            self.refused[key] += 1
+            if self._report is not None:
+                self._report(f"a request on {key} is refused: {error}")
+            return
+        self.accepted += 1
+        self._target(NavigationCommand(request, arrival_ns, stamp_ns))
+
+    def _parsed(self, key: str, payload: bytes) -> tuple[Request, int]:
+        longest = LONGEST_PAYLOAD if key == PATH else LONGEST_TEXT_PAYLOAD
+        if len(payload) > longest:
+            raise OmnidError(f"{len(payload)} bytes: expected at most {longest}")
+        if key == GOAL:
+            goal = goal_from_cdr(payload)
+            _check_near(goal.x_m, goal.y_m)
+            return GoalRequest(_frame(goal.frame), goal.x_m, goal.y_m, goal.heading_rad), goal.stamp_ns
+        if key == PATH:
+            path = path_from_cdr(payload)
+            _check_near(*path.xy.ravel())
+            return PathRequest(_frame(path.frame), path.xy, path.heading_rad), path.stamp_ns
+        text = string_from_cdr(payload)
+        return (navigation_verb(text) if key == NAVIGATION else route_request(text)), 0
+
+    def _check_age(self, stamp_ns: int, *, needed: bool) -> None:
+        if not self._synchronised or not (stamp_ns or needed):
+            return
+        if not stamp_ns:
+            raise OmnidError("it has no stamp: fill in the stamp (`ros2 topic pub` needs `header: auto`), or set "
+                             'bus.command_clock = "arrival"')
+        if not abs(time.time_ns() - stamp_ns) <= self._stale_ns:
+            raise OmnidError(f"its stamp differs from this clock by more than {self._stale_ns * 1e-9:g} s: {_CLOCKS}")
+
+
+def _is_halt(request: Request) -> bool:
+    if isinstance(request, RouteRequest):
+        return request.action in (RouteAction.STOP, RouteAction.FINISH)
+    return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)
+
+
+def _frame(name: str) -> NavigationFrame:
+    if name not in list(NavigationFrame):
+        raise OmnidError(f"the frame {name[:40]!a}: expected map or odom")
+    return NavigationFrame(name)
+
+
+def _check_near(*positions_m: float) -> None:
+    if not all(abs(value) <= FARTHEST_M for value in positions_m):
+        raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
+
+
+class RequestQueue:
+    """Requests from threads of the bus to the graph: a source that loses none but the oldest of too many."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[NavigationCommand] = deque(maxlen=MOST_WAITING)
+        self._wake: SimpleQueue[bool] = SimpleQueue()  # True: there is a request; False: the end
+
+    def put(self, command: NavigationCommand) -> None:
+        """Add a request; from any thread."""
+        self._waiting.append(command)
+        self._wake.put(True)
+
+    def end(self) -> None:
+        """End `batches`; from any thread."""
+        self._wake.put(False)
+
+    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
+        """Yield for each request all that wait; taking them removes them.
+
+        An inbox may drop a batch: the next one has its requests.
+        """
+        while self._wake.get():
+            yield self._taken()
+
+    def _taken(self) -> Iterator[NavigationCommand]:
+        while self._waiting:
+            yield self._waiting.popleft()

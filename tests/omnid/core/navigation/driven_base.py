@@ -1,0 +1,120 @@
+"""A base that the real control law drives on the floor: inertia, unequal wheels, noise, delayed poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.control.arming import AUTOMATIC
+from omnid.core.control.command_sources import PLANNER, TimedSetpoint
+from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.motion_monitor import MotionSettings
+from omnid.core.navigation.navigator import Navigation, Navigator
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState
+from omnid.core.places.planar import composed, relative
+from omnid.tracking_state import MapState, TrackingState
+
+Array = NDArray[np.float64]
+TICK_S = 0.02
+TRACK_M = 0.4
+LAG_S = 0.1
+AGE_S = 0.08  # of a pose when it is known
+
+
+class Sample(NamedTuple):
+    """The base at one pose."""
+
+    t_s: float
+    pose: Array  # true, in odom
+    speed_mps: float
+    yaw_rate_radps: float
+    navigation: Navigation
+
+
+class DrivenBase:
+    """Poses in, commands out; odom is the true frame, and the map may lie elsewhere."""
+
+    def __init__(self, navigator: Navigator, seed: int, *, start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+                 pose_hz: float = 10.0, T_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        self.navigator = navigator
+        self.rng = np.random.default_rng(seed)
+        self.pose = np.array(start)
+        self.v = self.w = self.t_s = 0.0
+        self.samples: list[Sample] = []
+        self.localised = True
+        self.state = TrackingState.TRACKING
+        self.resets = 0
+        self.slip = 1.0  # share of the commanded motion that happens
+        self.T_map_odom = np.array(T_map_odom)
+        self.law = ControlLaw(ControllerSettings(arming=AUTOMATIC, motion=MotionSettings(check=False)), -1)
+        self.law.set_pose(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
+        self.law.step(0, 0.0)
+        self._gain = 1.0 + 0.02 * self.rng.standard_normal(2)
+        self._every = round(1.0 / pose_hz / TICK_S)
+        self._ticks = 0
+        self._coming: list[tuple[float, Situation]] = []
+        self.obstacle_m = math.inf
+
+    @property
+    def wheels(self) -> WheelState:
+        arming, law = self.law.arming, self.law
+        source = "" if law.reason or law.commands.current is None else law.commands.current.source
+        return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source)
+
+    def seen(self) -> Situation:
+        """Return the pose as it is estimated now."""
+        noisy = self.pose + self.rng.normal(0, [0.003, 0.003, 0.002])
+        state = MapState.LOCALIZED if self.localised else MapState.ODOMETRY_ONLY
+        return Situation(round(self.t_s * 1e9), noisy, self.v + self.rng.normal(0, 0.01),
+                         self.w + self.rng.normal(0, 0.01), self.state, self.resets, self.wheels,
+                         MapPosition(self.T_map_odom, state, 0.02), self.obstacle_m)
+
+    def tick(self) -> Navigation | None:
+        """Advance by TICK_S; return the answer of the navigation where a pose has come."""
+        answer = None
+        if self._ticks % self._every == 0:
+            self._coming.append((self.t_s + AGE_S, self.seen()))
+        while self._coming and self._coming[0][0] <= self.t_s:
+            _, now = self._coming.pop(0)
+            answer = self._at_pose(now)
+        now_ns = round(self.t_s * 1e9)
+        motion = self.law.step(now_ns, TICK_S).motion
+        left, right = (gain * (motion.velocity_mps + side * motion.yaw_rate_radps * TRACK_M / 2)
+                       for gain, side in zip(self._gain, (-1, 1), strict=True))
+        self.v += (0.5 * (left + right) * self.slip - self.v) * TICK_S / LAG_S
+        self.w += ((right - left) / TRACK_M * self.slip - self.w) * TICK_S / LAG_S
+        v = self.v * (1 + 0.03 * self.rng.standard_normal())
+        self.pose = composed(self.pose[None], np.array([v * TICK_S, 0.0, self.w * TICK_S]))[0]
+        self.t_s += TICK_S
+        self._ticks += 1
+        return answer
+
+    def _at_pose(self, now: Situation) -> Navigation:
+        answer = self.navigator.step(now._replace(wheels=self.wheels))
+        self.law.set_pose(ControllerPose(now.stamp_ns, float(now.pose[2]), now.yaw_rate_radps, now.state,
+                                         now.speed_mps, resets=now.resets))
+        if answer.setpoint is not None:
+            self.law.set_command(TimedSetpoint(round(self.t_s * 1e9), answer.setpoint, PLANNER))
+        self.samples.append(Sample(self.t_s, self.pose.copy(), self.v, self.w, answer))
+        return answer
+
+    def run(self, seconds: float, until: Callable[[Navigation], bool] = lambda answer: answer.state.is_end,
+            rest_s: float = 1.0) -> Navigation:
+        """Drive until the navigation ends, then rest_s on; return the last answer. AssertionError after the time."""
+        end_s = self.t_s + seconds
+        while self.t_s < end_s:
+            answer = self.tick()
+            if answer is not None and until(answer):
+                for _ in range(round(rest_s / TICK_S)):
+                    self.tick()
+                return answer
+        raise AssertionError(f"no end within {seconds} s: {self.samples[-1]}")
+
+    def error(self, goal: tuple[float, float, float]) -> tuple[float, float]:
+        """Return the true distance and heading error to a goal in odom, m and rad."""
+        missing = relative(self.pose, np.array(goal))
+        return math.hypot(missing[0], missing[1]), abs(math.remainder(missing[2], math.tau))
