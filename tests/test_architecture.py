@@ -63,7 +63,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
         "calib.rig_covariance calib.se3 drivers.errors drivers.frame drivers.logs omnid.config omnid.core.rig "
-        "omnid.core.stereo omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state",
+        "omnid.core.stereo omnid.errors omnid.messages omnid.report omnid.stages omnid.tracking_state omnid.transport",
     "omnid.cli": "calib.errors drivers.errors omnid.commands omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
@@ -73,7 +73,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.controller omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics "
         "omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings "
         "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages "
-        "omnid.viewer omnid.web",
+        "omnid.transport omnid.viewer omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation omnid.core.obstacles "
         "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "

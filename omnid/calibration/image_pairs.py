@@ -8,6 +8,7 @@ from pathlib import Path
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
+from drivers.logs.log_formats import LOG_SUFFIXES
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
 from omnid.errors import OmnidError
@@ -33,7 +34,8 @@ class PairedImages:
 
 def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
     """Read the images of a folder or a log; lower and upper: a log's topics. Raises OmnidError without any pair."""
-    is_log = source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
+    is_log = source.suffix in LOG_SUFFIXES or (
+        source.is_dir() and any(path.suffix in LOG_SUFFIXES for path in source.iterdir()))
     if not is_log and (lower or upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     pairs = _of_log(source, lower, upper) if is_log else _of_folder(source)
@@ -49,8 +51,8 @@ def _counted(pairs: PairedImages) -> str:
 
 def _of_folder(folder: Path) -> PairedImages:
     if not folder.is_dir():
-        raise OmnidError(f"{folder}: expected a log (.mcap) or a folder with images lower_*, upper_*; found "
-                         f"{'a file' if folder.exists() else 'nothing'}")
+        raise OmnidError(f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
+                         f"found {'a file' if folder.exists() else 'nothing'}")
     lower, upper = (_of_side(folder, side) for side in SIDES)
     return PairedImages((lower, upper))
 

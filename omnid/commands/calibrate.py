@@ -16,7 +16,14 @@ from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
-from omnid.commands import calibrate_board, calibrate_camera, calibrate_check, calibrate_drive, calibrate_rig
+from omnid.commands import (
+    calibrate_board,
+    calibrate_camera,
+    calibrate_check,
+    calibrate_drive,
+    calibrate_live,
+    calibrate_rig,
+)
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -24,9 +31,11 @@ from omnid.sinks.files import check_outputs
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `calibrate` to the command line."""
     parser = subparsers.add_parser("calibrate", help="make a camera.toml or a rig.toml, or other programs' files")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="board|camera|rig|check|import|export")
+    actions = parser.add_subparsers(dest="action", required=True,
+                                    metavar="board|live|camera|rig|check|drive|import|export")
     calibrate_board.add_parser(actions)
     calibrate_camera.add_parser(actions)
+    calibrate_live.add_parser(actions)
     calibrate_rig.add_parser(actions)
     calibrate_check.add_parser(actions)
     calibrate_drive.add_parser(actions)

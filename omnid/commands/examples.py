@@ -20,6 +20,8 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "calibrate board": ("calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
                         "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 "
                         "--dictionary 5X5_100 -o board.pdf"),
+    "calibrate live": ("calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml",
+                       "calibrate live --log boards.mcap --corners 6x7 --square-mm 30"),
     "calibrate camera": ("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),
     "calibrate rig": ("calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml",
                       "calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml"),

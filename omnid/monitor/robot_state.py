@@ -113,7 +113,9 @@ class RobotState:
     @property
     def state(self) -> str:
         """Tracking state of the newest pose, or the time since it and whether the daemon is still there."""
-        if self.pose is None or self.time_since_pose_s > NO_POSE_S:
+        if self.pose is None:
+            return "no pose yet"
+        if self.time_since_pose_s > NO_POSE_S:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
         return plain(self.pose.state)

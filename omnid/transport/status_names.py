@@ -28,6 +28,7 @@ REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
 RIG_REFINEMENT: Final = f"{PREFIX}rig refinement"
+CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
 
@@ -65,6 +66,12 @@ class Key(StrEnum):
     BROKEN = "broken"
     UNPAIRED_LOWER = "unpaired_lower"
     UNPAIRED_UPPER = "unpaired_upper"
+    # Calibration
+    PAIRS = "pairs"  # that are kept
+    NEEDED = "needed"  # pairs
+    MISSING = "missing"  # in words; no key where there is enough
+    LOWER_COVERAGE = "lower_coverage"  # views from the hub to the rim, 12 clockwise digits a ring, 9: nine or more
+    UPPER_COVERAGE = "upper_coverage"
     # Wheels
     EXPIRIES = "expiries"
     COMMANDS = "commands"

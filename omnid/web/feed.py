@@ -7,6 +7,7 @@ event loop. Nothing that a browser does can reach that far.
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
@@ -18,17 +19,21 @@ from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import Pose, decode_map
+from omnid.transport.scan_codec import decode_scan
 from omnid.transport.status_names import WHEELS
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
-from omnid.web.snapshot import MOST_CELLS, map_message, parts_message, state_message
+from omnid.web.snapshot import MOST_CELLS, map_message, parts_message, scan_message, state_message
 
 PERIOD_S: Final = 0.03  # least time between two messages of the state
 QUIET_S: Final = 0.5  # without a message of the robot, after which the state is sent all the same
 RETRY_S: Final = 0.5
 REQUEST_S: Final = 0.2  # between two looks for channels that browsers ask for
 PANORAMA: Final = "panorama"
-_LARGEST: Final = {"odom": 1 << 16, "status": 1 << 20, "map": MOST_CELLS + (1 << 16), PANORAMA: 1 << 23}  # bytes
+SCAN: Final = "scan"
+MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
+_LARGEST: Final = {"odom": 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
+                   PANORAMA: 1 << 23}  # bytes
 _JPEG: Final = b"\xff\xd8"
 Receiver = Callable[[str, bytes, bytes], None]
 
@@ -46,15 +51,18 @@ class RobotFeed:
         self.inbox = Inbox()
         self._map: Encoded = b""
         self._panorama: Encoded = b""
-        self._large: dict[str, bytes] = {}  # newest map and panorama that are not processed yet
+        self._scan: Encoded = ""
+        self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
+        self._large: dict[str, bytes] = {}  # newest map, panorama and scan that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
         self._state_channel = Newest("state", self._encode_state)
         self._parts_channel = Newest("parts", lambda: parts_message(self.state))
         self._map_channel = Newest("map", lambda: self._map)
         self._panorama_channel = Newest(PANORAMA, lambda: self._panorama)
+        self._scan_channel = Newest(SCAN, lambda: self._scan)
         self._end_panorama: Callable[[], None] | None = None
         self.browsers = Browsers((self._state_channel, self.path, self._parts_channel, self._map_channel,
-                                  self._panorama_channel), on_request=frozenset((PANORAMA,)))
+                                  self._panorama_channel, self._scan_channel), on_request=frozenset((PANORAMA,)))
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
@@ -86,7 +94,7 @@ class RobotFeed:
                 self.link = str(error)
                 await asyncio.sleep(RETRY_S)
         self.link = ""
-        for topic in ("odom", "status", "map"):
+        for topic in ("odom", "status", "map", SCAN):
             self.robot.on_message(self._receiver(loop), topic)
         self.robot.on_alive(self.state.set_alive)
         diagnostics, grid = await asyncio.to_thread(_latched, self.robot)
@@ -106,7 +114,7 @@ class RobotFeed:
             if len(payload) > _LARGEST.get(topic, 0):
                 self.state.broken += 1
                 return
-            if topic in ("map", PANORAMA):
+            if topic in ("map", PANORAMA, SCAN):
                 self._large[topic] = payload  # in place of one that was not processed yet
             else:
                 self.inbox.put(topic, payload, attachment)
@@ -137,6 +145,8 @@ class RobotFeed:
         """Add a pose; a smaller sequence number than before means that the daemon, and so odom, has begun again."""
         if before is not None and pose.attachment.seq < before.attachment.seq:
             self.path.clear()
+            self._poses.clear()
+        self._poses.append(pose)
         gap = before is not None and pose.attachment.resets != before.attachment.resets
         self.path.add(pose.x_m, pose.y_m, gap)
 
@@ -145,7 +155,7 @@ class RobotFeed:
         while True:
             await self._large_wake.wait()
             self._large_wake.clear()
-            for topic in ("map", PANORAMA):
+            for topic in (SCAN, "map", PANORAMA):
                 payload = self._large.pop(topic, None)
                 if payload is not None:
                     await self._take_large(topic, payload)
@@ -153,7 +163,10 @@ class RobotFeed:
 
     async def _take_large(self, topic: str, payload: bytes) -> None:
         try:
-            if topic == "map":
+            if topic == SCAN:
+                self._scan = scan_message(decode_scan(payload), self._poses)
+                self._scan_channel.changed()
+            elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
             else:
                 self._panorama = _panorama_message(payload)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -13,11 +13,15 @@ from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, plain
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.decode import Map, Pose
+from omnid.transport.scan_codec import Scan
 from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
 from omnid.web.remedies import remedy_of
 
 PATH_FRAME: Final = "odom"
+BASE_FRAME: Final = "base_link"
+MOST_SECTORS: Final = 720  # of a scan
+_LARGEST_M: Final = 1e4  # range of a scan
 MOST_WARNINGS: Final = 20
 MOST_VALUES: Final = 60  # of a part
 LONGEST_VALUE: Final = 100  # characters
@@ -63,6 +67,27 @@ def map_message(grid: Map) -> bytes:
     header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "frame": PATH_FRAME,
               "cell_m": step * grid.cell_m, "x_m": grid.corner[0], "y_m": grid.corner[1]}
     return with_header(header, zlib.compress(cells.tobytes(), 1))
+
+
+def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
+    """Return the message `scan`: the nearest obstacles around the robot, in odom, and the nearest of all.
+
+    poses: the last ones; that nearest in time to the scan is its place. Without points if there is none, or if the scan
+    is not in the robot's own frame.
+    """
+    place = min(poses, key=lambda pose: abs(pose.stamp_ns - scan.stamp_ns), default=None)
+    seen = np.isfinite(scan.ranges_m) & (scan.ranges_m > 0) & (scan.ranges_m < _LARGEST_M)
+    ranges_m, azimuths_rad = scan.ranges_m[seen].astype(float), scan.azimuths_rad[seen].astype(float)
+    if place is None or scan.frame != BASE_FRAME or not ranges_m.size or not math.isfinite(place.yaw_rad):
+        return compact({"type": "scan", "points": [], "nearest": None})
+    nearest = int(ranges_m.argmin())
+    chosen = np.unique(np.append(np.arange(0, len(ranges_m), -(-len(ranges_m) // MOST_SECTORS)), nearest))
+    angles = azimuths_rad[chosen] + place.yaw_rad
+    points = np.column_stack([place.x_m + ranges_m[chosen] * np.cos(angles),
+                              place.y_m + ranges_m[chosen] * np.sin(angles)])
+    turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
+    return compact({"type": "scan", "points": [[finite(x), finite(y)] for x, y in points.round(3)],
+                    "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)]})
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:

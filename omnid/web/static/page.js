@@ -2,6 +2,7 @@
 import { Connection } from "./connection.js";
 import { Plan } from "./plan.js";
 import { wireCommands } from "./commands.js";
+import { showCalibration } from "./calibration.js";
 import { wireRecordings } from "./recordings.js";
 import { byId, element, fixed } from "./elements.js";
 
@@ -13,6 +14,7 @@ const plan = new Plan(byId("plan"));
 const connection = new Connection(onMessage, onConnection);
 const commands = wireCommands();
 let imageUrl = "";
+let nearest = null; // distance in m and direction in degrees of the nearest obstacle
 
 function onMessage(message, body) {
   switch (message.type) {
@@ -21,7 +23,12 @@ function onMessage(message, body) {
     case "map":
       byId("map-note").textContent = message.frame === "odom" ? "" : `a map in the frame ${message.frame} is not drawn`;
       return plan.setMap(message, body);
-    case "parts": return showParts(message.parts);
+    case "parts":
+      showCalibration(message.parts.find((part) => part.name === "calibration"));
+      return showParts(message.parts);
+    case "scan":
+      nearest = message.nearest;
+      return plan.setObstacles(message.points);
     case "panorama": return showPanorama(body);
   }
   return undefined;
@@ -79,12 +86,21 @@ function showPose(state) {
     ["uncertainty, 1 sigma", `${fixed(pose.sigma_mm, 1)} mm, ${fixed(pose.sigma_deg, 2)}°`],
     ["landmarks", `${pose.inliers} of ${pose.tracked}`],
     ...(state.in_map === null ? [] : [["in the map", state.in_map]]),
+    ...(nearest === null || !plan.obstacles.length ? [] : [["nearest obstacle", `${fixed(nearest[0], 2)} m, ${direction(nearest[1])}`]]),
     ["resets", `${pose.resets}`],
     ["image to here, p50 / p99", `${fixed(state.age_ms[0], 0)} / ${fixed(state.age_ms[1], 0)} ms`],
     ["missed poses", `${state.missed}`],
   ];
   byId("pose").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("td", {}, name),
     element("td", {}, value))));
+}
+
+// The direction of an angle counter-clockwise from ahead.
+function direction(degrees) {
+  const turn = Math.round(Math.abs(degrees));
+  if (turn < 10) return "ahead";
+  if (turn > 170) return "behind";
+  return `${turn}° to the ${degrees > 0 ? "left" : "right"}`;
 }
 
 function showParts(parts) {

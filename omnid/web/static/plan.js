@@ -5,6 +5,8 @@ const SMALLEST_M = 4; // width of the plan at least, when fitted
 const ROBOT_PX = 11;
 const NEAREST_PX = 2000; // per metre
 const WIDEST_PX = 0.05;
+const OBSTACLES_MS = 2000; // for which obstacles are shown
+const OBSTACLE_PX = 2.5;
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
 export class Plan {
@@ -15,6 +17,7 @@ export class Plan {
     this.pose = null;
     this.fresh = false;
     this.map = null;
+    this.obstacles = [];
     this.fits = true;
     this.onFit = () => {};
     this.view = { x: 0, y: 0, scale: 50 }; // the centre in m, px per m
@@ -45,6 +48,14 @@ export class Plan {
     const usable = pose !== null && [pose.x_m, pose.y_m, pose.yaw_rad].every(Number.isFinite);
     this.pose = usable ? pose : null;
     this.fresh = fresh;
+    this.draw();
+  }
+
+  // The nearest obstacles around the robot, m; they go when no news comes.
+  setObstacles(points) {
+    clearTimeout(this.forgetting);
+    this.obstacles = points;
+    this.forgetting = setTimeout(() => this.setObstacles([]), OBSTACLES_MS);
     this.draw();
   }
 
@@ -142,6 +153,7 @@ export class Plan {
       height / 2 - (y - this.view.y) * this.view.scale];
     this.paintMap(toScreen);
     this.paintPath(toScreen);
+    this.paintObstacles(toScreen);
     if (this.pose !== null) this.paintRobot(toScreen);
     this.paintScale(width, height);
   }
@@ -153,6 +165,7 @@ export class Plan {
       low = Math.min(low, y); high = Math.max(high, y);
     };
     for (const point of this.points) if (point !== null) add(point[0], point[1]);
+    for (const point of this.obstacles) add(point[0], point[1]);
     if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
     if (this.map !== null) {
       add(this.map.x_m, this.map.y_m);
@@ -193,6 +206,17 @@ export class Plan {
     }
     if (this.pose !== null && !begins) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
     context.stroke();
+  }
+
+  paintObstacles(toScreen) {
+    this.context.fillStyle = this.colour("--warn");
+    this.context.beginPath();
+    for (const point of this.obstacles) {
+      const [x, y] = toScreen(point[0], point[1]);
+      this.context.moveTo(x + OBSTACLE_PX, y);
+      this.context.arc(x, y, OBSTACLE_PX, 0, 2 * Math.PI);
+    }
+    this.context.fill();
   }
 
   paintRobot(toScreen) {

@@ -15,12 +15,15 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.scan_codec import scan_cdr
+from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
 from tests.omnid.web.servers import PATIENCE_S, WebServer, served
 from tests.omnid.web.test_fleet_page import Robots
@@ -164,6 +167,35 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, s
             assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
             screenshot(new.value, "report")
             screenshot(page, "ended")
+
+
+def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
+    endpoint = free_endpoint()
+    ranges = (1.5 + np.abs(np.sin(np.linspace(0, 9, 360)))).astype(np.float32)
+    digits = "".join(str(number % 5) for number in range(36))
+    coverage = {"pairs": "7", "needed": "15", "lower_coverage": digits, "upper_coverage": digits[::-1],
+                "missing": "8 more positions; both cameras: no board at 1 to 4 o'clock"}
+    calibration = DiagnosticStatus(CALIBRATION, 0, "hold it still", coverage)
+    with contextlib.ExitStack() as ends:
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
+        server = ends.enter_context(served("--connect", endpoint))
+        for size, scheme in (("phone", "light"), ("desk", "dark")):
+            with opened(browser, server, size, scheme) as page:
+                end_s = time.monotonic() + PATIENCE_S
+                while not ("nearest obstacle" in page.inner_text("#pose")
+                           and page.locator("#calibration-upper path.seen").count()):
+                    assert time.monotonic() < end_s
+                    pose = PoseAttachment(8, "tracking", 0, 50, 60, time.time_ns())
+                    bus.publish("odom", odometry(8), pose.to_bytes())
+                    bus.publish("scan", scan_cdr(10**9 + 8, "base_link", ranges, ranges, (0.1, 6.0)))
+                    bus.publish("status", codec.diagnostics_cdr(10**18, [calibration]))
+                    page.wait_for_timeout(100)
+                assert page.locator("#calibration-lower path").count() == 36
+                assert page.locator("#calibration-lower path.none").count() == digits.count("0")
+                shows(page, "calibration-pairs", "7 of 15 pairs: hold it still")
+                shows(page, "pose", "1.50 m")
+                expect_it_fits(page, size)
+                screenshot(page, f"{size}-calibration")
 
 
 def test_the_page_of_all_robots(browser: Any) -> None:

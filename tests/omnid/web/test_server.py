@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import shutil
 import signal
 import socket
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from calib import se3
 from drivers.frame import Frame
 from omnid.core.control.safety_rules import ASKED
 from omnid.transport import codec
@@ -28,6 +30,7 @@ from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
 from tests.omnid.transport.test_access import authority
@@ -163,6 +166,25 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         other = codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
         received = shown.until("map", lambda: bus.publish("map", other), lambda found: found["frame"] == "elsewhere")
         assert (received["width"], received["body"]) == (0, b"")
+
+
+def test_obstacles_arrive_at_their_places_in_odom(server: WebServer, bus: Bus) -> None:
+    ranges = np.full(360, np.nan, np.float32)
+    ranges[270], ranges[180], ranges[0] = 1.0, 2.0, np.inf  # to the left, ahead, free behind
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, math.pi / 2]), [5.0, 6.0, 0.0])
+    odom = codec.odometry_cdr(10**9 + 77, T, np.eye(6), np.zeros(6), np.eye(6))
+
+    def run() -> None:
+        bus.publish("odom", odom, PoseAttachment(3, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
+        bus.publish("scan", scan_cdr(10**9 + 77, "base_link", ranges, ranges, (0.1, 6.0)))
+
+    with server.live(server.bearer) as live:
+        shown = Shown(live)
+        scan = shown.until("scan", run, lambda found: found["points"] and found["points"][0][1] > 5)
+        np.testing.assert_allclose(sorted(scan["points"]), [[4.0, 6.0], [5.0, 8.0]], atol=0.05)
+        assert scan["nearest"] == [1.0, pytest.approx(90.5)]
+        other = scan_cdr(10**9 + 77, "laser", ranges, ranges, (0.1, 6.0))
+        assert shown.until("scan", lambda: bus.publish("scan", other), lambda found: not found["points"])
 
 
 def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> None:

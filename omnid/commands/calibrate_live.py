@@ -1,0 +1,176 @@
+"""`omnid calibrate live`: boards before the cameras, with the coverage so far and what is missing."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shlex
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from omnid.commands.board_options import add_board_options, board_of, options_of
+from omnid.commands.config import add_settings
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+
+    from omnid.calibration.images import Image
+    from omnid.calibration.live_boards import LiveBoards, PairOutcome
+    from omnid.config import Config
+    from omnid.transport.bus import Bus
+
+PUBLISH_S: Final = 0.5
+
+
+def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `live` to `omnid calibrate`."""
+    parser = actions.add_parser("live", help="images of a board, with its coverage so far and what is missing",
+                                description="Search the board in the images of both cameras as they come. Pairs in "
+                                "which it stands still at a new place are written to DIR; the terminal and the page "
+                                "(`omnid web`) show where it has been, what is missing, and when it is enough. Stop "
+                                "the daemon first: it holds the cameras. Exit code 1: not enough yet.")
+    parser.add_argument("images", type=Path, nargs="?", metavar="DIR", help="folder of the images, lower_*.png and "
+                        "upper_*.png; what is there counts, so that it goes on where it ended")
+    add_board_options(parser)
+    parser.add_argument("--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are "
+                        "only judged")
+    for camera in ("lower", "upper"):
+        parser.add_argument(f"--{camera}", metavar="DEVICE|TOPIC", help=f"device of the {camera} camera; default: "
+                            f"cameras.{camera} of the settings; of --log the topic, default: found by name")
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
+    from omnid.calibration.live_boards import LiveBoards
+    from omnid.config import load_config
+    from omnid.errors import OmnidError
+
+    board = board_of(args)
+    if args.images is None and args.log is None:
+        raise OmnidError("calibrate live: expected the DIR of the images, found none: name a folder, or a --log")
+    named = {} if args.log else {"cameras.lower": args.lower, "cameras.upper": args.upper}
+    config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    boards = LiveBoards(board)
+    with ExitStack() as closing:
+        closing.callback(boards.close)
+        number = _taken_before(args.images, boards)
+        pairs = _of_log(args) if args.log else _of_cameras(config, closing)
+        show = _Progress(boards, _bus(config, closing))
+        with suppress(KeyboardInterrupt):
+            for pair in pairs:
+                outcome = boards.process(pair, need_still=args.log is None)
+                if outcome == "kept" and args.images is not None:
+                    number += 1
+                    _write(args.images, number, pair)
+                show(outcome)
+    return _finish(args, boards)
+
+
+def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
+    """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
+    from omnid.calibration.image_pairs import read_pairs
+    from omnid.errors import OmnidError
+
+    if folder is None:
+        return 0
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OmnidError(f"{folder}: {error.strerror}; name a folder that can be made") from error
+    if not any(folder.glob("lower_*")):
+        return 0
+    pairs = read_pairs(folder)
+    for name in pairs.names:
+        if all(name in side for side in pairs.sides):
+            boards.process((pairs.sides[0][name], pairs.sides[1][name]), need_still=False)
+    return max((int(name) for name in pairs.names if name.isascii() and name.isdigit()), default=0)
+
+
+def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
+    from omnid.calibration.image_pairs import read_pairs
+
+    pairs = read_pairs(args.log, args.lower, args.upper)
+    return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
+
+
+def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Image]]:
+    from drivers.cameras.v4l2_camera import V4l2Camera
+    from omnid.calibration.camera_pairs import newest_pairs
+    from omnid.engine.logging_setup import log
+
+    sources = []
+    for camera in ("lower", "upper"):
+        sources.append(V4l2Camera(config.cameras.settings(camera), camera, on_event=log))
+        closing.callback(sources[-1].close)
+    return newest_pairs(sources[0], sources[1])
+
+
+def _bus(config: Config, closing: ExitStack) -> Bus | None:
+    """Return the bus for the page; None where another program holds the endpoint."""
+    from omnid.engine.logging_setup import log
+    from omnid.errors import OmnidError
+    from omnid.transport.bus import Bus
+
+    try:
+        bus = Bus(config.bus)
+    except OmnidError as error:
+        log(logging.WARNING, f"the page will not show it: {error}")
+        return None
+    closing.callback(bus.close)
+    return bus
+
+
+class _Progress:
+    """Shows the newest outcome: a screen on a terminal, else a line for each pair that is kept."""
+
+    def __init__(self, boards: LiveBoards, bus: Bus | None) -> None:
+        self._boards, self._bus = boards, bus
+        self._published_s = -PUBLISH_S
+
+    def __call__(self, outcome: PairOutcome) -> None:
+        from omnid.calibration.coverage_screen import table
+        from omnid.monitor.screen import CLEAR, fitted
+
+        if sys.stdout.isatty():
+            size = shutil.get_terminal_size()
+            lines = fitted(table(self._boards, outcome, "Ctrl-C ends"), size.columns, size.lines)
+            print(CLEAR + "\n".join(lines), flush=True)
+        elif outcome == "kept":
+            print(f"{self._boards.pairs}: {'; '.join(self._boards.missing()) or 'enough'}", flush=True)
+        self._publish(outcome)
+
+    def _publish(self, outcome: PairOutcome) -> None:
+        from omnid.calibration.coverage_screen import status
+        from omnid.transport.codec import diagnostics_cdr
+
+        if self._bus is None or time.monotonic() < self._published_s + PUBLISH_S:
+            return
+        self._published_s = time.monotonic()
+        if self._bus.needs_router:
+            self._bus.connect()
+        self._bus.publish("status", diagnostics_cdr(time.time_ns(), [status(self._boards, outcome)]))
+
+
+def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
+    import cv2
+
+    from calib.rig_file import write_file
+
+    for side, image in zip(("lower", "upper"), pair, strict=True):
+        write_file(folder / f"{side}_{number:03d}.png", cv2.imencode(".png", image)[1].tobytes())
+
+
+def _finish(args: argparse.Namespace, boards: LiveBoards) -> int:
+    missing = boards.missing()
+    source = shlex.quote(str(args.images or args.log))
+    if missing:
+        print(f"omnid: {boards.pairs} pairs, not enough yet: {'; '.join(missing)}", file=sys.stderr)
+        return 1
+    print(f"{boards.pairs} pairs, enough: omnid calibrate rig {source} {shlex.join(options_of(args))} -o rig.toml")
+    return 0
