@@ -16,7 +16,7 @@ PAIRS = 24
 
 @pytest.fixture(scope="session", autouse=True)
 def kernels() -> None:
-    """Compile the functions of core once, or read them from the cache folder, before the first test."""
+    """Compile the functions of omnid once, or read them from the cache folder, before the first test."""
     prepare_kernels(lambda level, line: None)
 
 

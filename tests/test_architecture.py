@@ -139,7 +139,7 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.errors drivers.frame drivers.motor "
         "drivers.motors.protocols drivers.motors.simulated omnid.config omnid.controller omnid.core.control "
         "omnid.engine omnid.errors omnid.messages omnid.runs omnid.simulation.rendering omnid.stages",
-    "omnid.simulation.rendering": "calib.models calib.rig calib.se3",
+    "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "

@@ -94,8 +94,8 @@ def cache_folder() -> Path:
 
 def _kernel_files() -> dict[str, Path]:
     """Return the files with compiled functions by the names of their modules."""
-    root = Path(omnid.core.__path__[0])
-    return {f"omnid.core.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path
+    root = Path(omnid.core.__path__[0]).parent
+    return {f"omnid.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path
             for path in sorted(root.rglob(KERNEL_FILES))}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,16 +61,6 @@ class Rectangle:
     def brightness(self) -> float:
         """Return the factor of the texture's grey by the angle to the light; the same on both sides."""
         return float(AMBIENT + DIFFUSE * abs(self.normal @ LIGHT))
-
-    @cached_property
-    def pyramid(self) -> list[NDArray[np.float32]]:
-        """Return the texture at halved sizes, all with the same outline (box filter), until a side is below 8 px."""
-        levels = [self.texture.astype(np.float32)]
-        while min(levels[-1].shape) >= 8:
-            height, width = levels[-1].shape
-            half = cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-            levels.append(half.astype(np.float32))
-        return levels
 
     def poster(self, texture: Texture, area_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
         """Return a poster just in front of this wall; area_m = (left, top, width, height) along the edges."""

@@ -126,5 +126,6 @@ def test_a_ray_traced_mirror_sees_what_all_tiles_would_show(monkeypatch: pytest.
     run = build("rooms", 3, SIZE, 5)
     mounted = with_real_mirrors(run.rig, 3).lower
     culled = render(run.scene, mounted, run.poses[2])
-    monkeypatch.setattr(ray_caster, "_tiles_that_see", lambda table, *_: np.ones(len(table.angles), bool))
+    monkeypatch.setattr(ray_caster, "tiles_that_see", lambda table, corners, *_: np.ones(
+        (len(table.angles), len(corners)), bool))
     np.testing.assert_array_equal(culled, render(run.scene, mounted, run.poses[2]))
