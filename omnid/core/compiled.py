@@ -27,7 +27,7 @@ class Kernel(Generic[P, R]):
     """A function that is compiled before it is called first; callable with what its signature allows."""
 
     def __init__(self, function: Callable[P, R], signature: str, writes: tuple[str, ...]) -> None:
-        self._function, self._signature, self._writes = function, signature, writes
+        self.function, self.signature, self.writes = function, signature, writes
         self._compiled: Any = None
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
@@ -50,16 +50,16 @@ class Kernel(Generic[P, R]):
     def _dispatcher(self) -> Any:
         import numba
 
-        return numba.njit(**OPTIONS)(self._function)
+        return numba.njit(**OPTIONS)(self.function)
 
     def _types(self) -> tuple[Any, ...]:
         """Return the types of the arguments: arrays that are not written may be read-only ones."""
         from numba.core import sigutils, types
 
-        arguments, _ = sigutils.normalize_signature(self._signature)
-        names = self._function.__code__.co_varnames
+        arguments, _ = sigutils.normalize_signature(self.signature)
+        names = self.function.__code__.co_varnames
         return tuple(
-            types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self._writes)
+            types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self.writes)
             if isinstance(kind, types.Array) else kind for kind, name in zip(arguments, names, strict=False)
         )
 
@@ -68,13 +68,13 @@ class Inner(Generic[P, R]):
     """A function that only compiled functions call; it becomes part of them."""
 
     def __init__(self, function: Callable[P, R]) -> None:
-        self._function = function
+        self.function = function
         self._dispatcher: Any = None
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function as it is written in Python, as a test does."""
-        return self._function(*args, **kwargs)
+        return self.function(*args, **kwargs)
 
     @property
     def _numba_type_(self) -> Any:
@@ -82,7 +82,7 @@ class Inner(Generic[P, R]):
         import numba
 
         if self._dispatcher is None:
-            self._dispatcher = numba.njit(**OPTIONS)(self._function)
+            self._dispatcher = numba.njit(**OPTIONS)(self.function)
         return self._dispatcher._numba_type_
 
 

@@ -11,6 +11,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -19,13 +20,14 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry import pose_estimation
+from omnid.core.compiled import Kernel, inner
+from omnid.core.odometry import pose_kernels
 from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
 from omnid.core.stereo.triangulation import point_covariance, view
 from tests.benchmark.accuracy import HEAD, row
 
 Array = NDArray[np.float64]
-Weigh = Callable[[Array], Array]
+Weigh = Callable[[float], float]
 
 DIMENSIONS: Final = 3  # of a view
 OUTLIERS: Final = 0.1  # share of the wide component
@@ -36,24 +38,39 @@ THRESHOLD_PX: Final = 2.0
 RUNS: Final = 200
 
 
-def mixture_weight(squared: Array) -> Array:
-    """Return the weights (N,) of views by that component which explains them best."""
+def mixture_weight(squared: float) -> float:
+    """Return the weight of a view by that component which explains it best."""
     gain = 2 * (math.log((1 - OUTLIERS) / OUTLIERS) + DIMENSIONS * math.log(WIDTH))
-    return np.where(squared * (1 - WIDTH**-2) < gain, 1.0, WIDTH**-2)
+    return 1.0 if squared * (1 - WIDTH**-2) < gain else WIDTH**-2
 
 
-KERNELS: Final[Mapping[str, Weigh]] = {"Cauchy": pose_estimation.robust_weight, "mixture": mixture_weight}
+KERNELS: Final[Mapping[str, Weigh]] = {"Cauchy": pose_kernels.robust_weight, "mixture": mixture_weight}
+
+
+@cache
+def gauss_newton_with(weigh: Weigh) -> Kernel[..., None]:
+    """Return Gauss-Newton, compiled with another kernel."""
+    before = pose_kernels.robust_weight, pose_kernels.accumulate
+    of_cauchy = pose_kernels.gauss_newton
+    pose_kernels.robust_weight, pose_kernels.accumulate = inner(weigh), inner(before[1].function)
+    compiled = Kernel(of_cauchy.function, of_cauchy.signature, of_cauchy.writes)
+    try:
+        compiled.compile()
+    finally:
+        pose_kernels.robust_weight, pose_kernels.accumulate = before
+    return compiled
 
 
 @contextmanager
 def kernel(weigh: Weigh) -> Iterator[None]:
     """Let Gauss-Newton weigh by another kernel in this block."""
-    before = pose_estimation.robust_weight
-    pose_estimation.robust_weight = weigh
+    before = pose_kernels.gauss_newton
+    if weigh is not pose_kernels.robust_weight:
+        pose_kernels.gauss_newton = gauss_newton_with(weigh)
     try:
         yield
     finally:
-        pose_estimation.robust_weight = before
+        pose_kernels.gauss_newton = before
 
 
 def clean(rng: np.random.Generator, views: Array) -> Array:

@@ -19,16 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry import landmark_kernels
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import PaddedPanorama
-from omnid.core.stereo.triangulation import point_covariance, triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import point_covariance, triangulate
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
-
-CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
-OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,29 +154,15 @@ class LandmarkStore:
 
         variance (M,) [px^2] of the disparities; NaN disparities are ignored. A Kalman update of each point in its
         anchor's frame, by the disparity alone: that depends on the depth, and hardly on the error of the pose. The
-        errors of one texture are alike from frame to frame, so each counts as CORRELATED_FRAMES times as uncertain.
+        errors of one texture are alike from frame to frame, so each counts as several times as uncertain.
         """
-        known = np.isfinite(disparity)
-        rows, disparity = rows[known], disparity[known]
-        T_rect_odom = se3.inverse(T_odom_rect)
-        T_curr_anchor = self.from_anchors(T_rect_odom, rows)
-        points = self.table.anchor_points[rows]
-        seen = se3.apply(T_curr_anchor, points[:, None])[:, 0]
-        predicted = view(seen, self._model.cylinder, self._model.baseline_m)
-        J = view_jacobian(seen, self._model.cylinder, self._model.baseline_m)
-        H = np.einsum("ni,nij->nj", J[:, 2] - J[:, 1], T_curr_anchor[:, :3, :3])
-        P = self.table.anchor_covariance[rows]
-        PH = np.einsum("nij,nj->ni", P, H)
-        R = CORRELATED_FRAMES * (variance[known] + 2 * self._model.sigma_px**2)
-        S = np.einsum("ni,ni->n", H, PH) + R
-        innovation = disparity - (predicted[:, 2] - predicted[:, 1])
-        gain = np.where(innovation**2 < OUTLIER_SQUARED * S, 1 / S, 0.0)
-        corrected, spread = self.table.anchor_points.copy(), self.table.anchor_covariance.copy()
-        corrected[rows] = points + PH * (gain * innovation)[:, None]
-        spread[rows] = P - gain[:, None, None] * PH[:, :, None] * PH[:, None, :]
-        self.table = replace(self.table, anchor_points=corrected, anchor_covariance=spread)
-        for seq in np.unique(self.table.anchor[rows]).tolist():
-            self.move_keyframe(seq, self.keyframes[seq].T_odom_rect, self.keyframes[seq].covariance)
+        before, (T_odom_keyframe, keyframe) = self.table, self._anchors(rows)
+        corrected = (before.anchor_points.copy(), before.anchor_covariance.copy(), before.points.copy(),
+                     before.covariance.copy())
+        landmark_kernels.update_depths(rows, disparity, variance, keyframe, se3.inverse(T_odom_rect) @ T_odom_keyframe,
+                                       T_odom_keyframe, self._model.camera, self._model.sigma_px, *corrected)
+        self.table = replace(before, anchor_points=corrected[0], anchor_covariance=corrected[1], points=corrected[2],
+                             covariance=corrected[3])
 
     def update_tracked(self, rows: Indices, pixels: Array) -> None:
         """Record the inliers (rows of the table) of an accepted frame with their pixels (M, 2).
@@ -190,14 +174,19 @@ class LandmarkStore:
         misses = self.table.misses + 1
         misses[rows] = 0
         self.table = replace(self.table, pixels=seen, misses=misses)
-        self._select(misses < self._max_misses)
+        if (misses >= self._max_misses).any():
+            self._select(misses < self._max_misses)
 
     def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
         """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
-        seqs = np.array(list(self.keyframes), np.intp)
-        T_odom_anchor = np.array([keyframe.T_odom_rect for keyframe in self.keyframes.values()]).reshape(-1, 4, 4)
-        order = np.argsort(seqs)
-        return np.asarray((T_rect_odom @ T_odom_anchor)[order[np.searchsorted(seqs[order], self.table.anchor[rows])]])
+        T_odom_anchor, keyframe = self._anchors(rows)
+        return np.asarray((T_rect_odom @ T_odom_anchor)[keyframe])
+
+    def _anchors(self, rows: Indices) -> tuple[Array, Indices]:
+        """Return the poses (K, 4, 4) of the keyframes, and which (M,) of them anchor landmarks (rows of the table)."""
+        seqs = sorted(self.keyframes)
+        poses = np.array([self.keyframes[seq].T_odom_rect for seq in seqs]).reshape(-1, 4, 4)
+        return poses, np.searchsorted(np.array(seqs, np.intp), self.table.anchor[rows])
 
     def anchor_shares(self, rows: Indices) -> dict[int, float]:
         """Return for each keyframe the share of the landmarks (rows of the table) that it anchors."""
@@ -220,8 +209,9 @@ class LandmarkStore:
 
 def _in_odom(keyframe: Keyframe, points: Array, covariance: Array) -> tuple[Array, Array]:
     """Return points (N, 3) [m] and covariances (N, 3, 3) [m^2] of a keyframe's rectified frame in odom."""
-    R = keyframe.T_odom_rect[:3, :3]
-    return se3.apply(keyframe.T_odom_rect, points), R @ covariance @ R.T
+    found = np.empty(points.shape), np.empty(covariance.shape)
+    landmark_kernels.place_all(points, covariance, keyframe.T_odom_rect, *found)
+    return found
 
 
 def _selected(table: Table, kept: Flags) -> Table:

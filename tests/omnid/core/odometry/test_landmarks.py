@@ -52,8 +52,8 @@ def test_points_are_kept_relative_to_their_keyframe_and_in_odom(store: LandmarkS
     table, R = store.table, POSE[:3, :3]
     np.testing.assert_array_equal(table.anchor_points, points)
     np.testing.assert_array_equal(table.anchor_covariance, covariance)
-    np.testing.assert_array_equal(table.points, se3.apply(POSE, points))
-    np.testing.assert_array_equal(table.covariance, R @ covariance @ R.T)
+    np.testing.assert_allclose(table.points, se3.apply(POSE, points), rtol=1e-12)
+    np.testing.assert_allclose(table.covariance, R @ covariance @ R.T, rtol=1e-9, atol=1e-18)
     assert len(store) == len(seen) > 40
 
 

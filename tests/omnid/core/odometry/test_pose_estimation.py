@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac, rigid_fit, whitening
+from omnid.core.odometry.pose_kernels import linearise, rigid_motion, triple
 from omnid.core.stereo.triangulation import point_covariance, view
 from tests.omnid.core.scenery import motion_errors
 
@@ -49,12 +50,30 @@ def test_a_rigid_fit_never_reflects() -> None:
     assert np.linalg.det(rigid_fit(flat, se3.apply(MOTION, flat))[:3, :3]) == pytest.approx(1)
 
 
-def test_residuals_wrap_at_the_seam_and_keep_nan() -> None:
-    behind = np.array([[-2.0, 0.001, 0.1], [-2.0, 0.001, 0.1]])
-    views = np.array([[0.0, 0, 0], [1303.5, 0, np.nan]])
-    error = MODEL.residual(behind, views)
-    assert (np.abs(error[:, 0]) < 2).all()
-    assert np.isnan(error[1, 2]) and np.isfinite(error[0]).all()
+def test_the_motion_of_three_points_is_that_of_least_squares() -> None:
+    rng, T = np.random.default_rng(2), np.eye(4)
+    for _ in range(20):
+        points = rng.normal(0, 1, (3, 3))
+        seen = se3.apply(se3.exp(rng.normal(0, 1, 6)), points) + 0.1 * rng.standard_normal((3, 3))
+        assert rigid_motion(points, seen, 0, 1, 2, T)
+        np.testing.assert_allclose(T, rigid_fit(points, seen), atol=1e-9)
+    assert not rigid_motion(points, np.outer([0.0, 1, 2], seen[0]), 0, 1, 2, T)
+
+
+def test_triples_are_of_different_landmarks_each_as_often() -> None:
+    count, state = np.zeros((4, 4, 4), int), np.uint64(7)
+    with np.errstate(over="ignore"):
+        for _ in range(2400):
+            a, b, c, state = triple(4, state)
+            count[a, b, c] += 1
+    assert (count > 0).sum() == 24 and count[count > 0].min() > 60 and count.max() < 140
+
+
+def test_errors_wrap_at_the_seam() -> None:
+    T, J, error = np.eye(4), np.zeros((3, 6)), np.zeros(3)
+    for column in (0.0, 1303.5):
+        linearise(np.array([-2.0, 0.001, 0.1]), np.array([column, 0, np.nan]), MODEL.camera, T, J, error)
+        assert abs(error[0]) < 2 and error[2] == 0
 
 
 def test_ransac_finds_the_motion_among_outliers() -> None:
@@ -123,7 +142,8 @@ def test_whitened_errors_have_unit_variance() -> None:
     views = views_of(points) + MODEL.sigma_px * rng.standard_normal((4000, 3))
     views[::4, 2] = np.nan
     W = whitening(points, covariance, views, MOTION, MODEL)
-    error = np.nan_to_num(MODEL.residual(se3.apply(MOTION, noisy), views))
+    error = np.nan_to_num(views - views_of(noisy))
+    error[:, 0] = MODEL.cylinder.wrap(error[:, 0])
     white = (W @ error[:, :, None])[:, :, 0]
     both, lower_only = np.delete(white, slice(None, None, 4), axis=0), white[::4]
     np.testing.assert_allclose(both.T @ both / len(both), np.eye(3), atol=0.1)
