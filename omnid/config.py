@@ -78,10 +78,11 @@ class LiveConfig:
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """Refinement of the rig while `omnid run` drives; the rig's file is never written."""
+    """Refinement of the rig while `omnid run` drives; the rig's file is written by `apply` alone."""
 
     refine: str = knob("report", "all parameters of the rig from windows of keyframes, in a process of low priority, "
-                       "told in the status with their sigmas", choices=("off", "report"))
+                       "told in the status with their sigmas; 'apply': also used once the robot stands, and written to "
+                       "the rig's file, beside which the calibration is kept", choices=("off", "report", "apply"))
     refine_keyframes: int = knob(20, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
     refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
 

@@ -48,6 +48,7 @@ class Panoramas:
     times: ExposureTimes | None = None  # of the pixels; None: all are exposed at the stamp
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    rig_version: int = 0  # counts the refined rigs that this run has begun to use before this pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -117,8 +117,8 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
         "omnid.tracking_state omnid.transport",
     "omnid.refinement":
-        "calib.errors calib.fit calib.rig omnid.calibration omnid.config omnid.messages omnid.stages "
-        "omnid.tracking_state omnid.transport",
+        "calib.errors calib.fit calib.rig calib.rig_covariance calib.rig_file calib.se3 omnid.calibration omnid.config "
+        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.report":
         "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "

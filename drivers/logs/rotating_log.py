@@ -47,7 +47,9 @@ class RotatingLog:
         *, on_event: EventCallback = ignore_event,
     ) -> None:  # fmt: skip
         self.state = RotatingLogState()
-        self._folder, self._rotation, self._attachments, self._on_event = folder, rotation, attachments, on_event
+        self._folder, self._rotation, self._on_event = folder, rotation, on_event
+        self._attachments = dict(attachments)
+        self._begun_with: Mapping[str, bytes] = self._attachments  # those of the current file
         self._writer: LogWriter | None = None
         self._path = folder.path
         self._number = 1
@@ -75,6 +77,10 @@ class RotatingLog:
             else:
                 self._stop(error)
 
+    def attach(self, name: str, data: bytes) -> None:
+        """Replace or add an attachment; the next message begins a file with it. From any thread."""
+        self._attachments = {**self._attachments, name: data}
+
     def close(self) -> None:
         """Complete the file and end the recording."""
         self._end()
@@ -82,7 +88,8 @@ class RotatingLog:
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
         """Return the file for a message with this stamp, None where none can be created."""
-        if self._writer is not None and self._is_full(self._writer, stamp_ns):
+        outdated = self._attachments is not self._begun_with
+        if self._writer is not None and (outdated or self._is_full(self._writer, stamp_ns)):
             self._end()
         if self._writer is None and time.monotonic() >= self._retry_at_s:
             self._begin(stamp_ns)
@@ -113,7 +120,8 @@ class RotatingLog:
             path, number = self._folder.unused_path(stamp_ns, self._number)
             self._number, self._path = number + 1, path
             try:
-                writer = LogWriter(path, self._attachments, compression="none", exclusive=True)
+                self._begun_with = self._attachments
+                writer = LogWriter(path, self._begun_with, compression="none", exclusive=True)
             except DriverError as error:
                 if isinstance(error.__cause__, FileExistsError):
                     continue

@@ -56,7 +56,7 @@ class RigMonitor:
         self._cylinder, self._every_ns = cylinder, every_s * 1e9
         self._views: deque[_View] = deque(maxlen=VIEWS)
         self._used_ns: float = math.inf
-        self._new = 0
+        self._new = self._version = 0
         self._newest_ns = 0
         # With its stamp, set in one assignment: status() runs in another thread.
         self._found: tuple[RigFinding, int] | None = None
@@ -77,6 +77,9 @@ class RigMonitor:
         exposure: the motion between the exposures of a pair that is not synchronised, which is used only with it.
         """
         self._newest_ns = panoramas.stamp_ns
+        if panoramas.rig_version != self._version:  # views by the rig of before tell nothing about this one
+            self._version, self._new, self._found = panoramas.rig_version, 0, None
+            self._views.clear()
         if panoramas.times is not None and (exposure is None or not exposure.is_known):
             return
         if self._used_ns <= panoramas.stamp_ns < self._used_ns + self._every_ns:

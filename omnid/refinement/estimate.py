@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.fit.drive_bundle import adjust_drive, observation_sigma
-from calib.fit.drive_parameters import RigParameters
-from calib.fit.drive_prior import prior_information
+from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, observation_sigma
+from calib.fit.drive_parameters import TRANSFORM_NAMES, RigParameters
+from calib.fit.drive_prior import baseline_by_prior, prior_information
 from calib.fit.drive_problem import DriveObservations, DriveState
 from calib.fit.rig_fit import has_wavefront
 from calib.rig import Rig
+from calib.rig_covariance import RigCovariance
 from omnid.calibration.drive_scale import scale_change, scale_gradient
 
 Array = NDArray[np.float64]
@@ -20,6 +21,9 @@ Array = NDArray[np.float64]
 # A change counts if landmarks fit that much better, and if one parameter changes by so many sigmas. A right rig of
 # rendered rooms keeps 0.96 to 1.00 of its error, one with centres 0.3 px off has 4 to 8 times that of the new one.
 MAX_ERROR_RATIO, MIN_SIGMAS = 0.85, 5.0
+# Larger changes of lengths and of the upper camera's pose are told, but not applied: keyframes of before would no
+# longer fit those of after, and a rig that is so wrong was knocked, or is another one.
+MAX_APPLIED_LENGTHS, MAX_APPLIED_RAD = 0.05, np.deg2rad(1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +37,8 @@ class RefinementRequest:
 
 @dataclass(frozen=True, slots=True)
 class RigChange:
-    """The rig that a window asks for, beside the one of the run; values (P,) in the parameters' own units."""
+    """The rig that a window asks for, with its covariance, beside the one of the run; values (P,) in their own units.
+    """
 
     rig: Rig
     names: tuple[str, ...]
@@ -53,6 +58,13 @@ class RigChange:
         sigmas = float(np.max(np.abs(self.after - self.before) / self.sigmas))
         return self.refined_error_px < MAX_ERROR_RATIO * self.error_px and sigmas > MIN_SIGMAS
 
+    @property
+    def is_small(self) -> bool:
+        """True if a run may go on with the rig."""
+        moved = [abs(after - before) for name, before, after in zip(self.names, self.before, self.after, strict=True)
+                 if name in TRANSFORM_NAMES]
+        return abs(self.lengths) <= MAX_APPLIED_LENGTHS and max(moved) <= MAX_APPLIED_RAD
+
 
 def estimate(request: RefinementRequest) -> RigChange:
     """Return the rig that fits a window best; CalibError where it does not tell."""
@@ -61,8 +73,17 @@ def estimate(request: RefinementRequest) -> RigChange:
     prior, none = prior_information(parameters, rig), np.zeros(len(parameters.names))
     found = adjust_drive(parameters, replace(request.state, steps=none), request.observations, prior)
     gradient = scale_gradient(found)
-    return RigChange(found.rig, parameters.names, parameters.values,
+    return RigChange(_with_covariance(found, rig), parameters.names, parameters.values,
                      parameters.values + found.state.steps * parameters.units, found.sigmas * parameters.units,
                      scale_change(found, rig), float(np.sqrt(gradient @ found.covariance @ gradient)),
                      observation_sigma(rig, found), found.sigma_px, len(found.state.T_rig_odom),
                      len(found.state.points))
+
+
+def _with_covariance(found: DriveAdjustment, before: Rig) -> Rig:
+    """Return the adjusted rig with the covariance of its parameters and of its baseline, whose length stays."""
+    names, units = found.parameters.rig_names, found.parameters.units[:len(found.parameters.rig_names)]
+    change = found.state.steps[:len(names)] * units
+    covariance = found.covariance[:len(names), :len(names)] * np.outer(units, units)
+    _, matrix = baseline_by_prior(before, names, change, covariance)
+    return replace(found.rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))

@@ -35,6 +35,7 @@ from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import OdometryUpdate
+from omnid.refinement.rig_application import RigApplication
 from omnid.refinement.rig_refinement import RigRefinement
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, Sinks, wire
@@ -47,7 +48,7 @@ from omnid.sinks.command_log import command_recorder
 from omnid.sinks.drive import LiveDrive, PlannerDrive
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import Geometry, GeometryVersions
 from omnid.stages.rig_gate import never
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
@@ -150,7 +151,13 @@ class LiveRun:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         ladder = LoadLadder()
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
-        refinement = self._refinement(session, geometry, ladder) if config.rig.refine != "off" else None
+        versions = GeometryVersions(geometry)
+        application = self._rig_application(session, versions, bus, recorder) if config.rig.refine == "apply" else None
+        refinement = None
+        if config.rig.refine != "off":
+            has_time = partial(_has_time, ladder)
+            refinement = session.outputs.enter_context(closing(
+                RigRefinement(versions, config.rig, has_time, application)))
         if refinement is not None:
             poses["refine"] = refinement
         requests = RequestQueue()
@@ -161,8 +168,8 @@ class LiveRun:
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       navigation=self._navigation(session, controller, requests) if controller else None,
                       rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
-                      features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
-                      ring_period_s=lambda: ladder.level.ring_period_s,
+                      versions=versions, features=lambda: ladder.level.features,
+                      map_period_s=lambda: ladder.level.map_period_s, ring_period_s=lambda: ladder.level.ring_period_s,
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         sinks = run_places.known_to(sinks)
@@ -191,10 +198,17 @@ class LiveRun:
         )
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
 
-    def _refinement(self, session: Session, geometry: Geometry, ladder: LoadLadder) -> RigRefinement:
-        refinement = RigRefinement(geometry, self._config.rig, lambda: ladder.level.features >= 1)
-        session.outputs.callback(refinement.close)
-        return refinement
+    def _rig_application(self, session: Session, versions: GeometryVersions, bus: Bus, recorder: Recorder | None
+                         ) -> RigApplication:
+        """Return what lets the run go on with refined rigs; those of a log's attachment are not written."""
+
+        def publish(rig: Rig) -> None:
+            bus.serve("rig", rig_toml(rig))
+            if recorder is not None:
+                recorder.attach("rig.toml", rig_toml(rig).encode())
+
+        path = Path(self._config.cameras.rig) if self._rig is None else None
+        return RigApplication(versions, path, publish, session.warn)
 
     def _add_tickers(self, session: Session, report: StatusCollector, bus: Bus, recorder: Recorder | None) -> None:
         publishers = [_status_on_bus(bus)]
@@ -257,6 +271,11 @@ def _ready(config: Config) -> str:
     wheels = "; no motor" if not config.motor.port else \
         "; the wheels turn after `omnid arm`" if config.controller.arming == MANUAL else ""
     return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
+
+
+def _has_time(ladder: LoadLadder) -> bool:
+    """True if the computer keeps up with all landmarks."""
+    return ladder.level.features >= 1
 
 
 def _broken(monitor: RigMonitor | None) -> Callable[[], bool]:

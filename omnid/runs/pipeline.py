@@ -19,7 +19,7 @@ from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, PlannerDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import Geometry, GeometryVersions
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping, no_wait
 from omnid.stages.navigation import NavigationStage
@@ -49,6 +49,7 @@ class Sinks:
     rig_monitor: Sink[OdometryUpdate] | None = None
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
     navigation: NavigationParts | None = None
+    versions: GeometryVersions | None = None  # of a run that refines its rig; None: the rig stays
     features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
     map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
     ring_period_s: Callable[[], float] = no_wait  # least time between two obstacle rings, under overload
@@ -78,9 +79,10 @@ class WiredStages(NamedTuple):
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
     rig_gate = RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
-    stereo = Stereo(geometry, config.stereo_settings(), rig_gate)
-    panoramas = graph.stage("dewarp", Dewarp(geometry, config.panorama, config.camera), pairs, direct=True)
-    poses = Chain(stereo, OdometryStage(geometry, config.odometry, sinks.features))
+    versions = sinks.versions or GeometryVersions(geometry)
+    stereo = Stereo(versions, config.stereo_settings(), rig_gate)
+    panoramas = graph.stage("dewarp", Dewarp(versions, config.panorama, config.camera), pairs, direct=True)
+    poses = Chain(stereo, OdometryStage(versions, config.odometry, sinks.features))
     odometry = graph.stage("odometry", poses, panoramas)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, odometry, policy=NEWEST, depth=1)

@@ -35,6 +35,9 @@ class MessageLog(Protocol):
     def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
         """Add a message."""
 
+    def attach(self, name: str, data: bytes) -> None:
+        """Replace or add an attachment of the files that begin from now on."""
+
     def close(self) -> None:
         """Complete the last file."""
 
@@ -48,7 +51,7 @@ class SingleLog:
     def __init__(self, path: Path, attachments: Mapping[str, bytes]) -> None:
         """attachments: name -> content, written at the start of the file."""
         self.state = RotatingLogState()
-        self._path, self._attachments = path, attachments
+        self._path, self._attachments = path, dict(attachments)
         self._writer: LogWriter | None = None
 
     def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
@@ -58,6 +61,10 @@ class SingleLog:
             self.state.files, self.state.file, self.state.status = 1, str(self._path), "recording"
         self._writer.write(topic, schema_name, data, stamp_ns)
         self.state.messages += 1
+
+    def attach(self, name: str, data: bytes) -> None:
+        """Replace or add an attachment, if the file has not begun."""
+        self._attachments = {**self._attachments, name: data}
 
     def close(self) -> None:
         """Complete the file; a second call does nothing."""
@@ -129,6 +136,10 @@ class Recorder:
         The state of the odometry is recorded at the time of its images: statuses in the log keep the order of time.
         """
         self._added.append((message, stamp_ns))
+
+    def attach(self, name: str, data: bytes) -> None:
+        """Replace or add an attachment of the files that begin from now on; from any thread."""
+        self._log.attach(name, data)
 
     def finish(self) -> None:
         """Write the final status and complete the last file."""

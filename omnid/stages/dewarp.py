@@ -15,7 +15,7 @@ from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import Geometry, GeometryVersions
 
 NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
 BLUR_SHARE = 0.6  # sigma of the blur by the pixels that a pixel of the panorama covers beside its own
@@ -23,25 +23,32 @@ MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 
 
 class Dewarp:
-    """Rectifies both images of a pair; the remap tables are computed once."""
+    """Rectifies both images of a pair; the remap tables are computed once for each version of the geometry."""
 
-    def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
+    def __init__(self, geometry: Geometry | GeometryVersions, config: PanoramaConfig,
+                 timing: TimingConfig | None = None) -> None:
+        self._versions = geometry if isinstance(geometry, GeometryVersions) else GeometryVersions(geometry)
+        self._config, self._timing = config, timing or TimingConfig()
+        self._noise_grey: dict[str, float] = {}  # of each camera before its gain
+        self._pairs = 0
         self._pad_px = config.pad_px
-        rig, cylinder = geometry.rig, geometry.cylinder
+        self._use(self._versions.newest)
+
+    def _use(self, version: int) -> None:
+        """Compute the tables of a version of the geometry."""
+        self._version, config, timing = version, self._config, self._timing
+        rig, cylinder = self._versions[version].rig, self._versions[version].cylinder
         self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
         self._blur_px = _blur_px((self._lower, self._upper))
         both = visible(rig.lower, self._lower, config.rim_margin_px)
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
-        timing = timing or TimingConfig()
         self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
         line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
         tables = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper)]
         self._rows_s = tables if line_s else [None, None]
-        self._noise_grey: dict[str, float] = {}  # of each camera before its gain
-        self._pairs = 0
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(
                 f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
@@ -50,13 +57,15 @@ class Dewarp:
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
+        if self._versions.newest != self._version:
+            self._use(self._versions.newest)
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
         lower, lower_light = self._panorama(pair.lower, self._lower, "lower", measured)
         upper, upper_light = self._panorama(pair.upper, self._upper, "upper", measured)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s), dimmer,
-                         pair.motion)
+                         pair.motion, self._version)
 
     def _times(self, skew_s: float) -> ExposureTimes | None:
         """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""

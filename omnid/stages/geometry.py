@@ -42,6 +42,30 @@ class Geometry:
         return StereoModel(self.cylinder, self.rig.baseline_m, noise_px)
 
 
+class GeometryVersions:
+    """The geometries of a run, the newest last: a run that refines its rig begins a new one while the robot stands.
+
+    The panoramas name theirs by its number. The cylinder of all is that of the first, so that panoramas, thumbnails and
+    keyframes of different versions can be compared. Any thread may read; one thread adds.
+    """
+
+    def __init__(self, first: Geometry) -> None:
+        self._versions = [first]
+
+    def __getitem__(self, number: int) -> Geometry:
+        """Return the geometry of a version."""
+        return self._versions[number]
+
+    @property
+    def newest(self) -> int:
+        """Number of the newest version."""
+        return len(self._versions) - 1
+
+    def add(self, rig: Rig) -> None:
+        """Begin a version with another rig; the next pair that is dewarped uses it."""
+        self._versions.append(Geometry(rig, self._versions[0].cylinder))
+
+
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
     """Return the geometry of a rig; of a camera without a mask the whole image is used."""
     return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg, config.scale))

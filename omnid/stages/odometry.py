@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.messages import OdometryUpdate, StereoDepth
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import Geometry, GeometryVersions
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -36,14 +37,35 @@ class OdometryMethod(Protocol):
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
 
 
-class OdometryStage:
-    """Estimate poses in odom, which is the rig frame of the first pair."""
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """The pose at which a version of the geometry begins."""
 
-    def __init__(self, geometry: Geometry, config: OdometryConfig, features: Callable[[], float] = all_features
-                 ) -> None:
+    T_odom_rig: Array  # (4, 4)
+    covariance: Array  # (6, 6) in the axes of the rig
+    resets: int
+
+
+class OdometryStage:
+    """Estimate poses in odom, which is the rig frame of the first pair.
+
+    A new version of the geometry begins while the robot stands: the local map begins again at the last pose, which is
+    then known as well as before.
+    """
+
+    def __init__(self, geometry: Geometry | GeometryVersions, config: OdometryConfig,
+                 features: Callable[[], float] = all_features) -> None:
         """features: called for each keyframe, the share of the landmarks that it is to have."""
-        self._model = geometry.model(config.noise_px)
-        self._method = _method(self._model, config, features)
+        self._versions = geometry if isinstance(geometry, GeometryVersions) else GeometryVersions(geometry)
+        self._config, self._features = config, features
+        self._newest = _Start(np.eye(4), np.zeros((6, 6)), 0)
+        self._use(0)
+
+    def _use(self, version: int) -> None:
+        """Begin at the last pose with a version of the geometry."""
+        geometry, self._version, self._start = self._versions[version], version, self._newest
+        self._model = geometry.model(self._config.noise_px)
+        self._method = _method(self._model, self._config, self._features)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self.sensors = MotionSensors(se3.inverse(geometry.rig.T_base_rig @ self._T_rig_rect))
@@ -51,6 +73,8 @@ class OdometryStage:
 
     def process(self, depth: StereoDepth) -> OdometryUpdate:
         """Return the pose at a pair."""
+        if depth.panoramas.rig_version != self._version:
+            self._use(depth.panoramas.rig_version)
         last_ns, self._last_ns = self._last_ns, depth.stamp_ns
         dt_s = 0.0 if last_ns is None else (depth.stamp_ns - last_ns) * 1e-9
         pair = depth.panoramas
@@ -63,12 +87,15 @@ class OdometryStage:
             self.sensors.observe(*estimate.step, last_ns, depth.stamp_ns)
         motion = RigVelocity(estimate.velocity, estimate.velocity_covariance)
         depth.settle(None if pair.times is None else Exposure(pair.times, motion, self._model))
-        T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
-        covariance = in_axes(T_odom_rig, self._in_rig(estimate.covariance))
-        velocity = self._to_rig @ estimate.velocity
+        T_start_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
+        since_start = se3.adjoint(se3.inverse(T_start_rig))
+        covariance = since_start @ self._start.covariance @ since_start.T + self._in_rig(estimate.covariance)
+        newest = self._newest = _Start(self._start.T_odom_rig @ T_start_rig, covariance,
+                                       self._start.resets + estimate.resets)
         return OdometryUpdate(
-            depth.seq, depth.stamp_ns, T_odom_rig, covariance, velocity, self._in_rig(estimate.velocity_covariance),
-            _state(estimate.state, depth), estimate.resets, estimate.inliers, estimate.tracked, depth,
+            depth.seq, depth.stamp_ns, newest.T_odom_rig, in_axes(newest.T_odom_rig, covariance),
+            self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
+            _state(estimate.state, depth), newest.resets, estimate.inliers, estimate.tracked, depth,
             estimate.features, depth.panoramas.light,
         )
 

@@ -95,9 +95,10 @@ class Bus:
             raise OmnidError(f"bus cannot publish {topic}: {reason(error)}; restart") from error
 
     def serve(self, name: str, text: str) -> None:
-        """Answer queries for `<robot>/<name>` with a text, such as the configuration."""
+        """Answer queries for `<robot>/<name>` with a text, such as the configuration; a second text replaces it."""
+        is_new = name not in self._newest
         self._newest[name] = (text.encode(), zenoh.Encoding.TEXT_PLAIN, None)
-        if self._session is not None:
+        if is_new and self._session is not None:
             self._declare_queryable(self._session, name)
 
     def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str]) -> None:
