@@ -11,6 +11,7 @@ from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing, remedy
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
@@ -60,6 +61,10 @@ class Controller:
         """Replace the pose."""
         self._law.set_pose(pose)
 
+    def set_ring(self, ring: ControllerRing) -> None:
+        """Replace the obstacle ring."""
+        self._law.set_ring(ring)
+
     def set_command(self, command: TimedSetpoint) -> None:
         """Offer a setpoint; the newest of the source of the highest priority counts."""
         conflict = self._law.commands.conflict
@@ -87,6 +92,7 @@ class Controller:
                                 motor_stopped=self._motor_stopped)
         self._report_arming()
         self._report_slowing()
+        self._report_obstacles()
         self._count_stop(output.reason)
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
@@ -132,6 +138,16 @@ class Controller:
         self.state.slowed += bool(self.state.slowed_by and not before)
         if self.state.slowed_by == MOTION_DOUBTFUL != before:
             self._report(f"the wheels turn slowly: {MOTION_DOUBTFUL}")
+
+    def _report_obstacles(self) -> None:
+        """Keep the collision monitor's reason to slow down or stop; count and report the stops."""
+        state, monitor = self.state, self._law.collision
+        was_blocked = state.blocked
+        state.obstacle = "" if self._law.reason else monitor.reason
+        state.blocked = bool(state.obstacle) and monitor.share == 0.0
+        if state.blocked and not was_blocked:
+            state.obstacle_stops += 1
+            self._report(f"the wheels stop: {state.obstacle}; {remedy(state.obstacle)}")
 
     def _count_stop(self, reason: str) -> None:
         """Keep the reason; count it where it ends a drive, and report it unless the end was asked for."""

@@ -16,6 +16,7 @@ from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.telemetry import StageStats
@@ -54,6 +55,10 @@ class ControllerLink:
     def send_pose(self, pose: ControllerPose) -> None:
         """Send a pose, from any thread; the newest counts."""
         self._send(pose)
+
+    def send_ring(self, ring: ControllerRing) -> None:
+        """Send an obstacle ring, from any thread; the newest counts."""
+        self._send(ring)
 
     def send_setpoint(self, command: TimedSetpoint) -> None:
         """Send a setpoint, its arrival by CLOCK_MONOTONIC, from any thread; the newest counts."""
@@ -104,7 +109,7 @@ class ControllerLink:
             self._process.wait()
         self._channel.close()
 
-    def _send(self, update: ControllerPose | TimedSetpoint | ArmRequest | None) -> None:
+    def _send(self, update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None) -> None:
         self._channel.send(ControllerUpdate(self._stop_ns, update))
 
     def _receive(self, timeout_s: float) -> object:

@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings
@@ -22,13 +23,13 @@ class ControllerStart(NamedTuple):
 
 
 class ControllerUpdate(NamedTuple):
-    """One message of the daemon: a pose, a setpoint or a request to arm, if any, and always the last stop request.
+    """One message of the daemon: a pose, a ring, a setpoint or a request to arm, if any, and always the last stop.
 
     So a stop arrives with the next message that does, even if its own was lost.
     """
 
     stop_ns: int  # 0: none
-    update: ControllerPose | TimedSetpoint | ArmRequest | None
+    update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None
 
 
 class StartFailed(NamedTuple):

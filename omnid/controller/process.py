@@ -19,6 +19,7 @@ from omnid.controller.ipc import NO_MESSAGE, Channel
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
@@ -77,6 +78,8 @@ class ControllerLoop:
         self._controller.stop(message.stop_ns)
         if isinstance(message.update, ControllerPose):
             self._controller.set_pose(message.update)
+        elif isinstance(message.update, ControllerRing):
+            self._controller.set_ring(message.update)
         elif isinstance(message.update, TimedSetpoint):
             self._controller.set_command(message.update)
         elif isinstance(message.update, ArmRequest):

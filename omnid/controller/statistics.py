@@ -29,6 +29,9 @@ class ControllerState:
     battery_v: float = math.nan  # by its report
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
     slowed: int = 0  # how often it began to
+    obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
+    blocked: bool = False  # it stops the base: the command leads to an obstacle
+    obstacle_stops: int = 0  # how often it began to
     sent: int = 0  # commands that were answered
     late: int = 0  # commands whose answer did not come in time; the wheels go on
     errors: int = 0  # commands that failed

@@ -11,6 +11,7 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.statistics import ControllerState, ControllerStatistics
 from omnid.core.control.arming import STARTED
+from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
@@ -155,14 +156,14 @@ class StatusCollector:
         values |= _times(status_names.TICK_LATE, controller.lateness)
         values[time_key(status_names.TICK_LATE, "p999")] = f"{1e3 * controller.lateness.p(0.999):.2f}"
         values |= {f"{status_names.IGNORED_PREFIX}{reason}": str(count) for reason, count in state.refused.items()}
-        values |= _arming(state)
+        values |= _arming(state) | _obstacle(state)
         if commands is not None:
             refused = dict(commands.refused)  # a copy, for another thread adds to it
             values |= {Key.COMMANDS: str(commands.accepted), Key.STOPS: str(commands.stops)}
             values |= {f"{status_names.REFUSED_PREFIX}{reason}": str(count) for reason, count in refused.items()}
         if math.isfinite(state.battery_v):
             values["battery_v"] = f"{state.battery_v:.2f}"
-        message = state.reason or (f"driving slowly: {state.slowed_by}" if state.slowed_by else "driving")
+        message = state.reason or _driving(state)
         if state.reason == NOT_ARMED:
             message = state.disarmed_by if state.disarmed_by == STARTED else f"not armed: {state.disarmed_by}"
         return DiagnosticStatus(status_names.WHEELS, self._wheels_level(controller), message, values)
@@ -173,7 +174,7 @@ class StatusCollector:
         if state.reason == FAILED or state.failed or state.fault:
             return ERROR
         reason = state.disarmed_by if state.reason == NOT_ARMED else state.reason
-        if not reason and state.slowed_by:
+        if not reason and (state.slowed_by or state.obstacle):
             return WARN
         return OK if reason in (*EXPECTED_STOPS, STARTED) else WARN
 
@@ -210,6 +211,24 @@ def _arming(state: ControllerState) -> dict[str, str]:
               Key.REMEDY: REMEDY if state.needs_request else "", Key.ARM_STAMP_NS: str(state.arm_answer.stamp_ns),
               Key.ARM_REFUSAL: state.arm_answer.refusal, Key.SOURCE: state.source}
     return {key: text for key, text in values.items() if text}
+
+
+def _driving(state: ControllerState) -> str:
+    """Return how the base drives while no rule stops it."""
+    if state.blocked:
+        return f"stopped: {state.obstacle}"
+    slow = state.slowed_by or state.obstacle
+    return f"driving slowly: {slow}" if slow else "driving"
+
+
+def _obstacle(state: ControllerState) -> dict[str, str]:
+    """Return the values about the collision monitor."""
+    values: dict[str, str] = {Key.OBSTACLE_STOPS: str(state.obstacle_stops)}
+    if state.obstacle:
+        values[Key.OBSTACLE] = state.obstacle
+    if state.blocked:
+        values[Key.REMEDY] = remedy(state.obstacle)
+    return values
 
 
 def _times(name: str, histogram: Histogram) -> dict[str, str]:

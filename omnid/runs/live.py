@@ -45,10 +45,11 @@ from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.command_log import command_recorder
-from omnid.sinks.drive import LiveDrive, PlannerDrive
+from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, GeometryVersions
+from omnid.stages.obstacles import ASSUMED_HEIGHT_M, floor_is_assumed
 from omnid.stages.rig_gate import never
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
@@ -160,6 +161,9 @@ class LiveRun:
                 RigRefinement(versions, config.rig, has_time, application)))
         if refinement is not None:
             poses["refine"] = refinement
+        if controller and config.obstacles.enabled and floor_is_assumed(geometry, config.obstacles):
+            session.warn(f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
+                         f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
         requests = RequestQueue()
         receiver = NavigationReceiver(requests.put, config.controller.deadlines.command_s,
                                       synchronised=config.bus.command_clock == "synchronised",
@@ -167,6 +171,7 @@ class LiveRun:
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
                       navigation=self._navigation(session, controller, requests) if controller else None,
+                      rings={"controller-ring": RingToController(controller)} if controller else {},
                       rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
                       versions=versions, features=lambda: ladder.level.features,
                       map_period_s=lambda: ladder.level.map_period_s, ring_period_s=lambda: ladder.level.ring_period_s,

@@ -72,6 +72,10 @@ class Session:
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
+        if settings.collision.check and not self.config.obstacles.enabled:
+            settings = settings.without_obstacles
+            self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
+                      "against obstacles")
         start = ControllerStart(self.config.motor, settings, realtime)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)

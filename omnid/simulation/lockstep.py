@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Generic, Literal, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.graph import Graph
-from omnid.messages import OdometryUpdate
+from omnid.messages import ObstacleRing, OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
@@ -31,10 +31,12 @@ from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
+from omnid.stages.obstacles import controller_ring
 from omnid.stages.odometry import of_base
 from omnid.stages.synchronise import Synchronise
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,7 @@ class SimulatedRun:
     states: tuple[str, ...]  # of the poses
     ticks: tuple[Tick, ...]
     lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
+    rings: tuple[ObstacleRing, ...]
 
     @property
     def truth_in_odom(self) -> Array:
@@ -114,6 +117,7 @@ class _Lockstep:
         self._T_odom_base = np.eye(4)
         self._truth: dict[int, Array] = {}
         self._poses: list[tuple[int, Array, str]] = []
+        self._rings: list[ObstacleRing] = []
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
@@ -122,13 +126,15 @@ class _Lockstep:
         frames = graph.source("cameras", lambda: self._frames(seconds))
         shape = geometry(self._rig, config.panorama)
         pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
-        wire(graph, pairs, shape, config, Sinks(poses={"poses": _Take(self._take_pose)}))
+        wire(graph, pairs, shape, config, Sinks(poses={"poses": _Take(self._take_pose)},
+                                                rings={"rings": _Take(self._take_ring)}))
         graph.run()
         return SimulatedRun(
             np.array([stamp for stamp, _, _ in self._poses], np.int64),
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
             np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
-            tuple(state for _, _, state in self._poses), tuple(vehicle.log.ticks), tuple(vehicle.log.lines))
+            tuple(state for _, _, state in self._poses), tuple(vehicle.log.ticks), tuple(vehicle.log.lines),
+            tuple(self._rings))
 
     def _frames(self, seconds: float) -> Iterator[Frame]:
         """Advance the robot from pair to pair; the stages work while the frames are yielded."""
@@ -177,13 +183,20 @@ class _Lockstep:
         self._vehicle.post(odometry.stamp_ns + delay_ns, lambda: self._vehicle.controller.set_pose(pose))
 
 
-class _Take:
+    def _take_ring(self, ring: ObstacleRing) -> None:
+        self._rings.append(ring)
+        newest = controller_ring(ring)
+        delay_ns = round(self._robot.pose_delay_s * 1e9)
+        self._vehicle.post(ring.stamp_ns + delay_ns, lambda: self._vehicle.controller.set_ring(newest))
+
+
+class _Take(Generic[T]):
     """A sink that calls a function."""
 
-    def __init__(self, take: Callable[[OdometryUpdate], None]) -> None:
+    def __init__(self, take: Callable[[T], None]) -> None:
         self._take = take
 
-    def process(self, message: OdometryUpdate) -> None:
+    def process(self, message: T) -> None:
         """Take a message."""
         self._take(message)
 

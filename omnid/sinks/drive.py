@@ -15,8 +15,9 @@ from omnid.controller.link import ControllerLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
-from omnid.messages import NavigationUpdate, OdometryUpdate
+from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
+from omnid.stages.obstacles import controller_ring
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
 FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a replay
@@ -55,6 +56,17 @@ class PlannerDrive:
         """Send a setpoint, if there is one."""
         if update.setpoint is not None:
             self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
+
+
+class RingToController:
+    """Passes the obstacle rings of `omnid run` to the controller process."""
+
+    def __init__(self, link: ControllerLink) -> None:
+        self._link = link
+
+    def process(self, ring: ObstacleRing) -> None:
+        """Send a ring."""
+        self._link.send_ring(controller_ring(ring))
 
 
 class ReplayDrive:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import ObstaclesConfig
+from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.obstacles.observation import observe
 from omnid.core.obstacles.ring_filter import RingFilter
+from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import ObstacleRing, OdometryUpdate
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS, no_wait
@@ -21,6 +25,27 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 
 
+ASSUMED_HEIGHT_M: Final = 1.1  # of the cameras, where the rig's T_base_rig does not say it
+LEAST_HEIGHT_M: Final = 0.1  # of the cameras over the floor, in a T_base_rig that says it
+
+
+def ring_settings(geometry: Geometry, config: ObstaclesConfig) -> RingSettings:
+    """Return the settings with the height of the floor; where the base is the rig itself, with an assumed one."""
+    if not floor_is_assumed(geometry, config):
+        return config.ring
+    return replace(config.ring, floor_m=viewpoint(geometry)[2] - ASSUMED_HEIGHT_M)
+
+
+def floor_is_assumed(geometry: Geometry, config: ObstaclesConfig) -> bool:
+    """True if T_base_rig has the cameras on the floor, as one that was never measured."""
+    return bool(viewpoint(geometry)[2] - config.ring.floor_m < LEAST_HEIGHT_M)
+
+
+def viewpoint(geometry: Geometry) -> Array:
+    """Return the lower viewpoint (3,) in the base frame."""
+    return np.asarray((geometry.rig.T_base_rig @ geometry.T_rig_rect)[:3, 3])
+
+
 class Obstacles:
     """Makes a ring of each pair that is due; dense stereo of a pair is shared with the map."""
 
@@ -28,10 +53,11 @@ class Obstacles:
                  ) -> None:
         """min_period_s: called for each pair, the least time between two rings under overload."""
         self._T_base_rig = geometry.rig.T_base_rig
-        self._config, self._min_period_s = config, min_period_s
+        self._min_period_s = min_period_s
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
-        self._filter = RingFilter(config.ring)
-        self._view: Array = (self._T_base_rig @ geometry.T_rig_rect)[:3, 3]
+        self._settings = ring_settings(geometry, config)
+        self._filter = RingFilter(self._settings)
+        self._view = viewpoint(geometry)
         self._last_ns: int | None = None
         self._resets = 0
 
@@ -45,7 +71,7 @@ class Obstacles:
             self._resets = odometry.reset_counter
         depth = odometry.depth
         points = se3.apply(self._T_base_rig, depth.points)
-        seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._config.ring)
+        seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
         ring = self._filter.update(odometry.stamp_ns, planar(T_odom_base), seen)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base)
@@ -58,6 +84,19 @@ class Obstacles:
         is_keyframe = len(odometry.features.new) > 0
         since_ns = odometry.stamp_ns - self._last_ns
         return since_ns < 0 or since_ns >= (wait_ns / 2 if is_keyframe else wait_ns) - STAMP_JITTER_NS
+
+
+def controller_ring(ring: ObstacleRing) -> ControllerRing:
+    """Return the part of a ring that the controller needs: ranges less their sigma, moving obstacles in base axes."""
+    nearest = np.where(np.isfinite(ring.ranges_m), ring.ranges_m - np.nan_to_num(ring.sigma_m), ring.ranges_m)
+    T = planar(ring.T_odom_base)
+    moving = []
+    for obstacle in ring.moving:
+        x, y = (np.array([obstacle.x_m, obstacle.y_m]) - T[:2, 3]) @ T[:2, :2]
+        vx, vy = np.array([obstacle.vx_mps, obstacle.vy_mps]) @ T[:2, :2]
+        moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m))
+    return ControllerRing(ring.stamp_ns, tuple(np.maximum(nearest, 0.0).tolist()), tuple(ring.free_m.tolist()),
+                          tuple(moving))
 
 
 def planar(T_odom_base: Array) -> Array:

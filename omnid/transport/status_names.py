@@ -79,7 +79,9 @@ class Key(StrEnum):
     SOURCE = "source"  # of the commands that drive; no key while none does
     ARMED = "armed"  # 1 or 0
     DISARMED_BY = "disarmed_by"  # the reason, no key while armed; DISARMED_BY_STOP after a stop
-    REMEDY = "remedy"  # the way to arm, no key where none is needed
+    REMEDY = "remedy"  # the way to arm, or past an obstacle; no key where none is needed
+    OBSTACLE = "obstacle"  # why the collision monitor slows down or stops the base; no key while it does not
+    OBSTACLE_STOPS = "obstacle_stops"
     ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
     ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
     # Navigation, on its own topic

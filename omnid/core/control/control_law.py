@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from omnid.core.control.arming import AUTOMATIC, Arming, ArmRequest, arming_knob
+from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
@@ -56,6 +58,7 @@ class ControllerSettings:
     arming: str = arming_knob()
     trust: TrustSettings = field(default_factory=TrustSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
+    collision: CollisionSettings = field(default_factory=CollisionSettings)
 
     @property
     def of_replay(self) -> ControllerSettings:
@@ -68,7 +71,12 @@ class ControllerSettings:
     @property
     def of_log(self) -> ControllerSettings:
         """The settings where the images are those of a log, which do not follow the wheels."""
-        return replace(self, motion=replace(self.motion, check=False))
+        return replace(self, motion=replace(self.motion, check=False)).without_obstacles
+
+    @property
+    def without_obstacles(self) -> ControllerSettings:
+        """The settings where no obstacles are looked for."""
+        return replace(self, collision=replace(self.collision, check=False))
 
 
 class ControllerPose(NamedTuple):
@@ -121,6 +129,7 @@ class ControlLaw:
         self.arming = Arming(settings.arming)
         self.plausibility = Plausibility(settings.trust, settings.motion)
         self.commands = CommandSelector(settings.sources)
+        self.collision = CollisionMonitor(settings.collision, settings.limits.deceleration_mps2)
         self.motion = STOP  # that the base follows now: the next step continues from it
         self.reason = IDLE  # of the last step
 
@@ -134,6 +143,10 @@ class ControlLaw:
         self._pose_jumped |= self._pose is not None and self._jumps(self._pose, pose)
         self._pose = pose
         self.plausibility.add_pose(pose.stamp_ns, pose.state, pose.motion, pose.resets)
+
+    def set_ring(self, ring: ControllerRing) -> None:
+        """Replace the obstacle ring."""
+        self.collision.set_ring(ring)
 
     def set_command(self, command: TimedSetpoint) -> None:
         """Offer a setpoint."""
@@ -168,18 +181,21 @@ class ControlLaw:
         if self.reason or pose is None or command is None:
             self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
         else:
-            heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), dt_s)
+            heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), now_ns, dt_s)
+        self.collision.follow(now_ns, self.motion)
         return ControlOutput(self.motion, heading_rad, self.reason)
 
     def motor_heading(self, counted_rad: float, rate_radps: float) -> None:
         """Take the heading, in its own count, and the yaw rate that the motor controller reported; NaN if unknown."""
         self._goal.update(counted_rad, rate_radps)
 
-    def _drive(self, setpoint: Setpoint, heading_rad: float, dt_s: float) -> float:
+    def _drive(self, setpoint: Setpoint, heading_rad: float, now_ns: int, dt_s: float) -> float:
         """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
         wanted = self._heading_controller.step(setpoint, heading_rad, dt_s, self.motion)
         limits = self._settings.limits
-        self.motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
+        motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
+        # Last of all, the part of this motion that obstacles allow, reached with the deceleration of the limits.
+        self.motion = limits.step(self.collision.step(now_ns, motion), self.motion, dt_s)
         turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
         error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
         return self._goal.towards(turn_rad, error_rad)

@@ -66,7 +66,7 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings) 
 
 def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> HeightBand:
     """Tell obstacles from floor among points (N, 3), for sigmas (N,) along rays from a viewpoint (3,)."""
-    low, high = settings.heights_m
+    low, high = (settings.floor_m + height for height in settings.heights_m)
     away = points - view
     across2 = away[:, 0] ** 2 + away[:, 1] ** 2
     rise2 = away[:, 2] ** 2

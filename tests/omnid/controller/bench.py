@@ -24,7 +24,7 @@ PERIOD_NS = 50_000_000
 LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
                        yaw_acceleration_radps2=4.0)
 SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0),
-                              trust=TrustSettings(battery_v=11.0))
+                              trust=TrustSettings(battery_v=11.0)).without_obstacles
 UNATTENDED = replace(SETTINGS, arming=AUTOMATIC)
 AHEAD = Setpoint(0.3, None, 0.0)
 

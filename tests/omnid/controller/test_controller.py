@@ -331,7 +331,8 @@ def test_keeps_the_motor_controllers_heading_while_it_slows_down(bench: Bench) -
 @contextlib.contextmanager
 def real_controller(twin: SimulatedMotor) -> Iterator[Controller]:
     driver = SerialMotor(twin.port, timeout_s=2.0, watchdog_ms=10_000)
-    controller = Controller(driver, ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, arming=AUTOMATIC), 0.02)
+    settings = ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, arming=AUTOMATIC).without_obstacles
+    controller = Controller(driver, settings, 0.02)
     try:
         yield controller
     finally:

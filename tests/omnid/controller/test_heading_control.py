@@ -26,7 +26,8 @@ from omnid.core.control.velocity_limits import VelocityLimits
 
 PERIOD_S = 0.05
 LIMITS = VelocityLimits(yaw_rate_radps=1.0)
-SETTINGS = ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, HeadingLimits(yaw_rate_radps=1.0), arming=AUTOMATIC)
+SETTINGS = ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, HeadingLimits(yaw_rate_radps=1.0),
+                              arming=AUTOMATIC).without_obstacles
 GAIN_HZ = 8.0
 RIPPLE = 1.2  # the goal moves in steps, one a tick, and this motor controller follows within a tick
 FAST = MotionLimits(yaw_rate_radps=10.0, yaw_acceleration_radps2=50.0, heading_gain_hz=GAIN_HZ)

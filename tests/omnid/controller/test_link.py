@@ -42,7 +42,7 @@ DECELERATION_MPS2 = 0.8
 def start_message(port: object, arming: str = AUTOMATIC) -> ControllerStart:
     limits = VelocityLimits(deceleration_mps2=DECELERATION_MPS2)
     motor = MotorSettings(port=str(port), rate_hz=10.0, watchdog_ms=5000)
-    settings = ControllerSettings(DEADLINES, limits, arming=arming)
+    settings = ControllerSettings(DEADLINES, limits, arming=arming).without_obstacles
     return ControllerStart(motor, settings, RealtimeSettings(lock_memory=False))
 
 

@@ -61,7 +61,7 @@ class Daemon:
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
         self.motor = AcceptingMotor()
-        self.controller = Controller(self.motor, ControllerSettings(), 0.05)
+        self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
         self.controller_statistics = ControllerStatistics(self.stages[1])
         self.commands = CommandReceiver(self, 0.5)
         self.report = StatusCollector(

@@ -12,7 +12,7 @@ from omnid.errors import OmnidError
 
 FLOOR_M = -1.2
 VIEW = np.zeros(3)
-SETTINGS = RingSettings()
+SETTINGS = RingSettings(floor_m=FLOOR_M)
 
 
 def seen(*parts: np.ndarray, sigma_of_m2: float = 0.01, settings: RingSettings = SETTINGS) -> Observation:
@@ -83,7 +83,7 @@ def test_few_points_are_no_obstacle() -> None:
 
 
 def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
-    ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.2, 1.4)))
+    ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
     assert np.isposinf(ring.ranges_m[within(-28, 28)]).all() and (ring.free_m[within(-28, 28)] == 6.0).all()
     assert np.isnan(ring.ranges_m[within(92, 118)]).all()
 

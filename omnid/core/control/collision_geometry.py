@@ -1,0 +1,89 @@
+"""Time until the outline of a moving base touches a point, on the arc of its motion; exact, in plain Python.
+
+The base moves with (v, w): in its own frame a point that stands turns with -w about the centre (0, v / w).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from omnid.core.control.heading_controller import Twist
+
+STRAIGHT_RADPS: Final = 1e-3  # slower turns count as none
+TINY: Final = 1e-9
+
+
+class Outline(NamedTuple):
+    """Rectangle about the base's origin, parallel to its axes; distances from the origin, m."""
+
+    front_m: float
+    rear_m: float
+    half_width_m: float
+
+    def contains(self, x_m: float, y_m: float) -> bool:
+        """True for a point inside."""
+        return -self.rear_m <= x_m <= self.front_m and abs(y_m) <= self.half_width_m
+
+    def gap_m(self, x_m: float, y_m: float) -> float:
+        """Return the distance of a point from the outline, 0 inside."""
+        return math.hypot(max(x_m - self.front_m, -self.rear_m - x_m, 0.0), max(abs(y_m) - self.half_width_m, 0.0))
+
+    @property
+    def radius_m(self) -> float:
+        """Distance of the farthest corner from the origin."""
+        return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
+
+    def edge_m(self, azimuth_rad: float) -> float:
+        """Return the distance of the edge from the origin in a direction."""
+        c, s = math.cos(azimuth_rad), abs(math.sin(azimuth_rad))
+        along_m = (self.front_m if c > 0 else self.rear_m) / max(abs(c), TINY)
+        return min(along_m, self.half_width_m / max(s, TINY))
+
+    def is_approached(self, x_m: float, y_m: float, motion: Twist) -> bool:
+        """True if the motion takes the outline nearer to a point, or a point inside it deeper."""
+        vx, vy = motion.yaw_rate_radps * y_m - motion.velocity_mps, -motion.yaw_rate_radps * x_m
+        dx = max(x_m - self.front_m, 0.0) - max(-self.rear_m - x_m, 0.0)
+        dy = math.copysign(max(abs(y_m) - self.half_width_m, 0.0), y_m)
+        if dx == 0.0 and dy == 0.0:  # inside: the way out is over the nearest edge
+            edges = ((self.front_m - x_m, 1.0, 0.0), (self.rear_m + x_m, -1.0, 0.0),
+                     (self.half_width_m - y_m, 0.0, 1.0), (self.half_width_m + y_m, 0.0, -1.0))
+            _, dx, dy = min(edges)
+        return dx * vx + dy * vy < -TINY
+
+
+def contact_s(outline: Outline, motion: Twist, x_m: float, y_m: float) -> float:
+    """Return the time until the outline touches a point outside it, inf if it never does."""
+    v, w = motion.velocity_mps, motion.yaw_rate_radps
+    if abs(w) >= STRAIGHT_RADPS:
+        return _on_arc_s(outline, v / w, w, x_m, y_m)
+    if v == 0.0 or abs(y_m) > outline.half_width_m:
+        return math.inf
+    ahead_m = x_m - outline.front_m if v > 0.0 else -outline.rear_m - x_m
+    return ahead_m / abs(v) if ahead_m >= 0.0 else math.inf
+
+
+def _on_arc_s(outline: Outline, radius_m: float, w: float, x_m: float, y_m: float) -> float:
+    """Return the time until the first crossing of the point's circle about (0, radius_m) with an edge."""
+    rho2 = x_m**2 + (y_m - radius_m) ** 2
+    start = math.atan2(y_m - radius_m, x_m)
+    first = math.inf
+    for x, y in _crossings(outline, radius_m, rho2):
+        turned = (start - math.atan2(y - radius_m, x)) * math.copysign(1.0, w)
+        first = min(first, turned % math.tau)
+    return first / abs(w)
+
+
+def _crossings(outline: Outline, radius_m: float, rho2: float) -> list[tuple[float, float]]:
+    """Return the points where a circle about (0, radius_m) crosses the edges."""
+    found = []
+    for x in (outline.front_m, -outline.rear_m):
+        if rho2 >= x * x:
+            rise = math.sqrt(rho2 - x * x)
+            found += [(x, y) for y in (radius_m + rise, radius_m - rise) if abs(y) <= outline.half_width_m]
+    for y in (outline.half_width_m, -outline.half_width_m):
+        across2 = rho2 - (y - radius_m) ** 2
+        if across2 >= 0.0:
+            reach = math.sqrt(across2)
+            found += [(x, y) for x in (reach, -reach) if -outline.rear_m <= x <= outline.front_m]
+    return found

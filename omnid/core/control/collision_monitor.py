@@ -1,0 +1,274 @@
+"""Collision monitor: slows down and stops the motion that the control law is about to give, before obstacles.
+
+The model is the collision monitor of nav2 (Macenski et al. 2023, "From the desks of ROS maintainers", 5): a polygon in
+which nothing may be (stop), one in which the base drives slowly, and the time to collision on the commanded arc. Here
+the polygons lie on the side to which the base is commanded: a motion that leads away from an obstacle is free.
+Unknown directions are not free. Plain Python: it runs in the process that steers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Final, NamedTuple
+
+from omnid.core.control.collision_geometry import Outline, contact_s
+from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+
+S_PER_NS: Final = 1e-9
+MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
+TURN_MPS: Final = 0.01  # slower motions turn on the spot
+LEAST_MPS: Final = 0.02  # slower than this the base stops
+BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on
+UNKNOWN_SECTORS: Final = 5  # consecutive ones without a range that make a direction unknown
+MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles
+MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once
+MOST_MOVING: Final = 16
+
+BLOCKED: Final = "an obstacle is in the way"
+NEAR: Final = "an obstacle is near"
+MOVING: Final = "a moving obstacle comes into the way"
+UNKNOWN: Final = "the way ahead is unknown"
+RING_STALE: Final = "no new obstacle ring"
+REMEDY: Final = "drive back or turn away, or clear the way"
+RING_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
+
+
+class MovingPoint(NamedTuple):
+    """A moving obstacle in the base frame of its ring, whose axes stand still; m, m/s."""
+
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+    radius_m: float
+
+
+class ControllerRing(NamedTuple):
+    """The part of an obstacle ring that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
+
+    stamp_ns: int  # of the capture
+    ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
+    free_m: tuple[float, ...] = ()  # (N,) up to which an unknown direction was seen to be free; empty: 0
+    moving: tuple[MovingPoint, ...] = ()
+
+
+class Allowance(NamedTuple):
+    """Allowed share of a motion, and why it is less than all of it."""
+
+    share: float
+    reason: str  # empty where the share is 1
+
+
+FREE: Final = Allowance(1.0, "")
+
+
+def remedy(reason: str) -> str:
+    """Return what to do about a reason to slow down or stop."""
+    return RING_REMEDY if reason == RING_STALE else REMEDY
+
+
+class CollisionMonitor:
+    """Follows rings and commanded motions; not thread-safe. Memory and work of a tick are bounded by the ring's size.
+    """
+
+    def __init__(self, settings: CollisionSettings, deceleration_mps2: float) -> None:
+        """deceleration_mps2: with which the base can brake."""
+        self._settings, self._deceleration = settings, deceleration_mps2
+        self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
+        self._stamp_ns: int | None = None
+        self._points: list[tuple[float, float]] = []  # obstacles in the frame of the ring
+        self._frontier: list[tuple[float, float]] = []  # where the unknown begins
+        self._moving: tuple[MovingPoint, ...] = ()
+        self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
+        self.reason = ""  # of the last step: why the motion was changed
+        self.share = 1.0  # of the motion that was allowed
+
+    def set_ring(self, ring: ControllerRing) -> None:
+        """Replace the ring, unless it is older."""
+        if (self._stamp_ns is not None and ring.stamp_ns < self._stamp_ns) or not ring.ranges_m:
+            return
+        self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
+        count = len(ring.ranges_m)
+        step = math.tau / count
+        self._points = [(r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
+                        for k, r in enumerate(ring.ranges_m) if math.isfinite(r)]
+        free = ring.free_m if len(ring.free_m) == count else (0.0,) * count
+        self._frontier = []
+        for k in _unknown_sectors(ring.ranges_m):
+            azimuth = (k + 0.5) * step - math.pi
+            begins_m = max(free[k], self._outline.edge_m(azimuth))
+            self._frontier.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
+
+    def step(self, now_ns: int, motion: Twist) -> Twist:
+        """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
+        allowance = self._judged(now_ns, motion)
+        self.share, self.reason = allowance
+        if allowance.share >= 1.0:
+            return motion
+        return Twist(allowance.share * motion.velocity_mps, allowance.share * motion.yaw_rate_radps)
+
+    def follow(self, now_ns: int, motion: Twist) -> None:
+        """Take the motion that the base follows from now on."""
+        self._motions.append((now_ns, motion))
+
+    def _judged(self, now_ns: int, motion: Twist) -> Allowance:
+        """Return the strictest of all rules."""
+        settings = self._settings
+        if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
+            return FREE
+        age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
+        if not abs(age_s) <= settings.stale_s:
+            if settings.stale == IGNORE:
+                return FREE
+            return self._capped(motion, 0.0 if settings.stale == STOP else settings.slow_mps, RING_STALE)
+        moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
+        speed_mps = abs(motion.velocity_mps)
+        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
+        reach_m = way_m + self._outline.radius_m + settings.stop_m + settings.slow_m
+        points = _seen_from(self._points, moved, reach_m)
+        allowances = [self._before(points, motion), self._near(points, motion)]
+        if settings.unknown != IGNORE:
+            allowances.append(self._into_unknown(_seen_from(self._frontier, moved, reach_m), motion))
+        if self._moving:
+            allowances.append(self._before_moving(moved, age_s, motion))
+        return min(allowances)
+
+    def _before(self, points: list[tuple[float, float]], motion: Twist) -> Allowance:
+        """Keep the time to collision, and stop before what is in the stop polygon."""
+        share = self._share_before(points, motion)
+        return FREE if share >= 1.0 else Allowance(share, BLOCKED if share == 0.0 else NEAR)
+
+    def _share_before(self, points: list[tuple[float, float]], motion: Twist) -> float:
+        settings = self._settings
+        stop = self._stop_polygon(motion)
+        first_s = math.inf
+        for x, y in points:
+            if stop.contains(x, y):
+                if self._outline.is_approached(x, y, motion):
+                    return 0.0
+            else:
+                first_s = min(first_s, contact_s(stop, motion, x, y))
+        if first_s == math.inf:
+            return 1.0
+        share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)
+        if speed_mps > TURN_MPS:
+            way_m = speed_mps * first_s
+            share = min(share, math.sqrt(2 * BRAKING_SHARE * self._deceleration * way_m) / speed_mps)
+            if share < 1.0 and share * speed_mps < LEAST_MPS:
+                return 0.0
+        return min(1.0, share)
+
+    def _stop_polygon(self, motion: Twist) -> Outline:
+        """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
+        settings, outline = self._settings, self._outline
+        ahead_m = settings.stop_m if motion.velocity_mps > TURN_MPS else 0.0
+        behind_m = settings.stop_m if motion.velocity_mps < -TURN_MPS else 0.0
+        return Outline(outline.front_m + ahead_m, outline.rear_m + behind_m, outline.half_width_m + settings.side_m)
+
+    def _near(self, points: list[tuple[float, float]], motion: Twist) -> Allowance:
+        """Drive slowly while something is in the slow polygon, on the side to which the base moves."""
+        settings, outline = self._settings, self._outline
+        if abs(motion.velocity_mps) <= settings.slow_mps:
+            return FREE
+        wide_m = outline.half_width_m + settings.slow_side_m
+        side = math.copysign(1.0, motion.velocity_mps)
+        far_m = (outline.front_m if side > 0 else outline.rear_m) + settings.slow_m
+        is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
+        return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
+
+    def _into_unknown(self, frontier: list[tuple[float, float]], motion: Twist) -> Allowance:
+        """Approach what was never seen slowly, or not at all."""
+        if abs(motion.velocity_mps) <= TURN_MPS:
+            return FREE
+        share = self._share_before(frontier, motion)
+        least = 0.0
+        if self._settings.unknown != STOP:
+            least = min(1.0, self._settings.slow_mps / abs(motion.velocity_mps))
+        share = max(share, least)
+        return FREE if share >= 1.0 else Allowance(share, UNKNOWN)
+
+    def _before_moving(self, moved: tuple[float, float, float], age_s: float, motion: Twist) -> Allowance:
+        """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be."""
+        settings, stop = self._settings, self._stop_polygon(motion)
+        steps = math.ceil(settings.time_s / MOVING_STEP_S)
+        for step in range(steps):
+            ahead_s = step * MOVING_STEP_S
+            pose = _composed(moved, _on_arc(motion, ahead_s))
+            for obstacle in self._moving:
+                at_s = age_s + ahead_s
+                x, y = _in_frame(pose, obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
+                if stop.gap_m(x, y) <= obstacle.radius_m and (step or self._outline.is_approached(x, y, motion)):
+                    return Allowance(0.0 if ahead_s <= MOVING_STOP_S else ahead_s / settings.time_s, MOVING)
+        return FREE
+
+    def _capped(self, motion: Twist, speed_mps: float, reason: str) -> Allowance:
+        """Return the share at which the speed is at most so high; turns on the spot slow down alike."""
+        if speed_mps <= 0.0:
+            return Allowance(0.0, reason)
+        edge_mps = max(abs(motion.velocity_mps), abs(motion.yaw_rate_radps) * self._outline.radius_m)
+        return FREE if edge_mps <= speed_mps else Allowance(speed_mps / edge_mps, reason)
+
+    def _moved_since(self, stamp_ns: int, now_ns: int) -> tuple[float, float, float]:
+        """Return x, y and yaw of the base now in the frame of the ring, by the motions since its images."""
+        pose, until_ns = (0.0, 0.0, 0.0), now_ns
+        pieces = []
+        for at_ns, motion in reversed(self._motions):
+            begin_ns = max(at_ns, stamp_ns)
+            if until_ns > begin_ns:
+                pieces.append((motion, min((until_ns - begin_ns) * S_PER_NS, LONGEST_TICK_S)))
+            until_ns = min(until_ns, begin_ns)
+            if at_ns <= stamp_ns:
+                break
+        for motion, dt_s in reversed(pieces):
+            pose = _composed(pose, _on_arc(motion, dt_s))
+        return pose
+
+
+def _unknown_sectors(ranges_m: tuple[float, ...]) -> list[int]:
+    """Return the sectors without a range in runs of at least UNKNOWN_SECTORS, around the full turn."""
+    count = len(ranges_m)
+    unknown = [math.isnan(r) for r in ranges_m]
+    if all(unknown):
+        return list(range(count))
+    start = unknown.index(False)
+    found: list[int] = []
+    run: list[int] = []
+    for k in (*range(start, count), *range(start + 1)):
+        if unknown[k]:
+            run.append(k)
+            continue
+        found += run if len(run) >= UNKNOWN_SECTORS else []
+        run = []
+    return found
+
+
+def _on_arc(motion: Twist, dt_s: float) -> tuple[float, float, float]:
+    """Return x, y and yaw after a time of a constant motion."""
+    turn = motion.yaw_rate_radps * dt_s
+    chord = motion.velocity_mps * dt_s
+    if abs(turn) > 1e-9:
+        chord *= 2 * math.sin(turn / 2) / turn
+    return chord * math.cos(turn / 2), chord * math.sin(turn / 2), turn
+
+
+def _composed(first: tuple[float, float, float], then: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the pose of `then`, which is given in the frame of `first`."""
+    c, s = math.cos(first[2]), math.sin(first[2])
+    return first[0] + c * then[0] - s * then[1], first[1] + s * then[0] + c * then[1], first[2] + then[2]
+
+
+def _in_frame(pose: tuple[float, float, float], x_m: float, y_m: float) -> tuple[float, float]:
+    """Return a point in the frame at a pose."""
+    dx, dy, c, s = x_m - pose[0], y_m - pose[1], math.cos(pose[2]), math.sin(pose[2])
+    return c * dx + s * dy, c * dy - s * dx
+
+
+def _seen_from(points: list[tuple[float, float]], pose: tuple[float, float, float], reach_m: float
+               ) -> list[tuple[float, float]]:
+    """Return points in the frame at a pose, those within reach."""
+    px, py, c, s = pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])
+    reach2 = reach_m * reach_m
+    return [(c * (x - px) + s * (y - py), c * (y - py) - s * (x - px)) for x, y in points
+            if (x - px) ** 2 + (y - py) ** 2 <= reach2]

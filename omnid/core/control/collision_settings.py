@@ -1,0 +1,34 @@
+"""Settings of the collision monitor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from omnid.settings import knob
+
+STOP: Final = "stop"
+SLOW: Final = "slow"
+IGNORE: Final = "ignore"
+
+
+@dataclass(frozen=True, slots=True)
+class CollisionSettings:
+    """Outline of the base, distances and times at which it stops and slows down before obstacles."""
+
+    check: bool = knob(True, "slow down and stop before obstacles, whatever the source of the command")
+    front_m: float = knob(0.25, "outline of the base: its front, m ahead of the origin of base_link", low=0, high=5)
+    rear_m: float = knob(0.25, "outline of the base: its rear, m behind the origin", low=0, high=5)
+    half_width_m: float = knob(0.22, "outline of the base: half its width, m", low=0.01, high=5)
+    stop_m: float = knob(0.15, "the base stops so far before an obstacle, m", low=0.01, high=5)
+    side_m: float = knob(0.04, "free space that it needs at its sides, m", low=0, high=5)
+    time_s: float = knob(1.5, "time to collision that it keeps: its speed is at most the distance to where it must "
+                         "stop, divided by this, s", low=0.2, high=10)
+    slow_m: float = knob(0.5, "an obstacle nearer than this ahead slows it down to slow_mps, m", low=0, high=10)
+    slow_side_m: float = knob(0.12, "the same beside its way, m", low=0, high=10)
+    slow_mps: float = knob(0.2, "speed near obstacles and into the unknown, m/s", low=0.01, high=10)
+    unknown: str = knob(SLOW, "where the way ahead has not been seen: into it at slow_mps, stop before it, or ignore "
+                        "it", choices=(SLOW, STOP, IGNORE))
+    stale: str = knob(STOP, "when the newest ring of obstacles is older than stale_s, or there is none",
+                      choices=(STOP, SLOW, IGNORE))
+    stale_s: float = knob(0.8, "age of the images of the newest ring beyond which it is stale, s", low=0.1, high=10)

@@ -1,0 +1,182 @@
+"""The collision monitor: polygons, time to collision, unknown directions, old rings, moving obstacles."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+
+import pytest
+
+from omnid.core.control import collision_monitor as monitor_module
+from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing, MovingPoint
+from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.heading_controller import Twist
+
+S = 1_000_000_000
+SETTINGS = CollisionSettings()
+FREE_RING = (math.inf,) * 360
+AHEAD = Twist(0.5)
+
+
+def sector(azimuth_deg: float) -> int:
+    """Return the sector of an azimuth."""
+    return int((azimuth_deg + 180) % 360)
+
+
+def with_points(*points: tuple[float, float], rest: float = math.inf) -> tuple[float, ...]:
+    """Return the ranges of a ring with obstacles at points, 3 degrees wide."""
+    ranges = [rest] * 360
+    for x, y in points:
+        for shift in (-1, 0, 1):
+            k = (sector(math.degrees(math.atan2(y, x))) + shift) % 360
+            ranges[k] = math.hypot(x, y)
+    return tuple(ranges)
+
+
+def with_unknown(low_deg: float, high_deg: float, rest: float = math.inf) -> tuple[float, ...]:
+    """Return the ranges of a ring of which a part is unknown."""
+    return tuple(math.nan if low_deg <= k - 179.5 <= high_deg else rest for k in range(360))
+
+
+def after(ranges: tuple[float, ...], motion: Twist = AHEAD, settings: CollisionSettings = SETTINGS, *,
+          free: tuple[float, ...] = (), moving: tuple[MovingPoint, ...] = (), age_s: float = 0.1
+          ) -> tuple[Twist, str]:
+    """Return the allowed motion and the reason, before a new ring."""
+    monitor = CollisionMonitor(settings, 1.5)
+    monitor.set_ring(ControllerRing(10 * S, ranges, free, moving))
+    allowed = monitor.step(10 * S + round(age_s * S), motion)
+    return allowed, monitor.reason
+
+
+def test_free_is_free() -> None:
+    for motion in (AHEAD, Twist(-0.5), Twist(0.0, 1.0), Twist(0.3, -0.8)):
+        assert after(FREE_RING, motion) == (motion, "")
+
+
+@pytest.mark.parametrize("point", [(0.39, 0.0), (0.3, 0.2), (0.26, -0.1), (0.2, 0.0)])
+def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out(point: tuple[float, float]) -> None:
+    assert after(with_points(point)) == (Twist(), monitor_module.BLOCKED)
+    allowed, _ = after(with_points(point), Twist(-0.3))
+    assert allowed == Twist(-0.3)
+    assert after(with_points((-point[0], point[1])), Twist(-0.3)) == (Twist(), monitor_module.BLOCKED)
+
+
+@pytest.mark.parametrize("distance_m", [0.5, 0.8, 1.1])
+def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -> None:
+    settings = replace(SETTINGS, slow_m=0.0)
+    allowed, reason = after(with_points((distance_m, 0.0)), AHEAD, settings)
+    expected = (distance_m - settings.front_m - settings.stop_m) / settings.time_s
+    assert allowed.velocity_mps == pytest.approx(min(0.5, expected), rel=0.01) and (reason == monitor_module.NEAR) == (
+        expected < 0.5)
+
+
+def test_weak_brakes_slow_down_earlier() -> None:
+    monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 0.1)
+    monitor.set_ring(ControllerRing(10 * S, with_points((1.4, 0.0))))
+    allowed = monitor.step(10 * S, AHEAD)
+    assert allowed.velocity_mps**2 / (2 * 0.1) <= 1.0
+
+
+def test_drives_slowly_past_what_is_beside_its_way() -> None:
+    allowed, reason = after(with_points((0.6, 0.3)))
+    assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.NEAR
+    assert after(with_points((0.6, 0.5))) == (AHEAD, "")
+    assert after(with_points((-0.6, 0.3))) == (AHEAD, "")
+
+
+def test_an_arc_is_judged_on_the_arc() -> None:
+    # On an arc of 0.5 m to the left the base meets what is ahead on the left, not what is straight ahead.
+    arc, point = Twist(0.3, 0.6), (0.45, 0.62)
+    settings = replace(SETTINGS, slow_m=0.0, time_s=3.0)
+    assert after(with_points(point), arc, settings)[0].velocity_mps < 0.29
+    assert after(with_points(point), Twist(0.3), settings)[0] == Twist(0.3)
+    allowed, _ = after(with_points(point), arc, settings)
+    assert allowed.yaw_rate_radps / allowed.velocity_mps == pytest.approx(2.0)
+
+
+def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
+    turn = Twist(0.0, -0.5)
+    assert after(with_points((0.38, 0.0)), turn)[0] == turn
+    assert after(with_points((0.27, 0.2)), turn)[0].yaw_rate_radps > -0.3
+
+
+def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
+    wall = with_unknown(-20, 20)
+    allowed, reason = after(wall)
+    assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.UNKNOWN
+    assert after(wall, settings=replace(SETTINGS, unknown="stop")) == (Twist(), monitor_module.UNKNOWN)
+    assert after(wall, settings=replace(SETTINGS, unknown="ignore")) == (AHEAD, "")
+    assert after(wall, Twist(-0.5)) == (Twist(-0.5), "")
+
+
+def test_an_unknown_way_that_was_seen_to_be_free_is_driven_up_to_there() -> None:
+    wall = with_unknown(-20, 20)
+    assert after(wall, free=(2.0,) * 360) == (AHEAD, "")
+    settings = replace(SETTINGS, unknown="stop")
+    allowed, _ = after(wall, free=(1.0,) * 360, settings=settings)
+    assert allowed.velocity_mps == pytest.approx(0.6 / settings.time_s, rel=0.1)
+
+
+def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:
+    assert after(with_unknown(-2, 2)) == (AHEAD, "")
+    assert after(with_unknown(-3, 3))[1] == monitor_module.UNKNOWN
+
+
+@pytest.mark.parametrize(("stale", "expected_mps"), [("stop", 0.0), ("slow", SETTINGS.slow_mps), ("ignore", 0.5)])
+def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: float) -> None:
+    settings = replace(SETTINGS, stale=stale)
+    allowed, reason = after(FREE_RING, settings=settings, age_s=settings.stale_s + 0.01)
+    assert allowed.velocity_mps == pytest.approx(expected_mps)
+    assert reason == ("" if stale == "ignore" else monitor_module.RING_STALE)
+    missing = CollisionMonitor(settings, 1.5)
+    assert missing.step(S, AHEAD).velocity_mps == pytest.approx(expected_mps)
+
+
+def test_is_off_when_it_is_off() -> None:
+    off = replace(SETTINGS, check=False)
+    assert after(with_points((0.3, 0.0)), settings=off, age_s=9.0) == (AHEAD, "")
+
+
+def test_an_older_or_an_empty_ring_changes_nothing() -> None:
+    monitor = CollisionMonitor(SETTINGS, 1.5)
+    monitor.set_ring(ControllerRing(10 * S, with_points((0.3, 0.0))))
+    monitor.set_ring(ControllerRing(9 * S, FREE_RING))
+    monitor.set_ring(ControllerRing(11 * S, ()))
+    assert monitor.step(10 * S, AHEAD) == Twist()
+
+
+def test_the_ring_is_moved_by_the_motion_since_its_images() -> None:
+    monitor = CollisionMonitor(SETTINGS, 1.5)
+    monitor.set_ring(ControllerRing(10 * S, with_points((0.6, 0.0))))
+    for tick in range(10):  # 0.5 s at 0.5 m/s: the obstacle is now 0.35 m ahead
+        monitor.follow(10 * S + tick * S // 20, AHEAD)
+    assert monitor.step(10 * S + S // 2, Twist(0.1)) == Twist()
+    still = CollisionMonitor(SETTINGS, 1.5)
+    still.set_ring(ControllerRing(10 * S, with_points((0.6, 0.0))))
+    assert still.step(10 * S + S // 2, Twist(0.1)) == Twist(0.1)
+
+
+def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does_not() -> None:
+    crossing = MovingPoint(0.9, 0.9, 0.0, -1.0, 0.25)
+    allowed, reason = after(FREE_RING, moving=(crossing,))
+    assert allowed.velocity_mps < 0.35 and reason == monitor_module.MOVING
+    assert after(FREE_RING, moving=(crossing._replace(vy_mps=1.0),)) == (AHEAD, "")
+    near = MovingPoint(0.9, 0.0, -1.0, 0.0, 0.25)
+    assert after(FREE_RING, moving=(near,)) == (Twist(), monitor_module.MOVING)
+
+
+def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
+    rng = random.Random(3)
+    reasons = set()
+    for _ in range(2000):
+        ranges = rng.choice((with_unknown(-20, 20), with_points((rng.uniform(-2, 2), rng.uniform(-2, 2))),
+                             tuple(rng.choice((math.inf, math.nan, rng.uniform(0.05, 3.0))) for _ in range(360))))
+        moving = tuple(MovingPoint(*(rng.uniform(-2, 2) for _ in range(4)), 0.2) for _ in range(rng.randrange(3)))
+        motion = Twist(rng.uniform(-1, 1), rng.uniform(-2, 2))
+        allowed, reason = after(ranges, motion, moving=moving, age_s=rng.uniform(-0.2, 1.0))
+        share = allowed.velocity_mps / motion.velocity_mps
+        assert 0.0 <= share <= 1.0 and allowed.yaw_rate_radps == pytest.approx(share * motion.yaw_rate_radps)
+        assert (share == 1.0) == (reason == "")
+        reasons.add(reason)
+    assert len(reasons) == 6
