@@ -30,10 +30,12 @@ from omnid.transport.decode import (
     Cloud,
     Diagnostics,
     Map,
+    NavigationReport,
     Pose,
     decode_cloud,
     decode_diagnostics,
     decode_map,
+    decode_navigation,
     decode_pose,
 )
 from omnid.transport.pose_attachment import PoseAttachment
@@ -41,9 +43,8 @@ from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import Unreachable
 from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
-__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "Pose", "PoseAttachment", "Robot", "Scan",
-           "Subscription",
-           "Unreachable", "subscribe"]
+__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "NavigationReport", "Pose",
+           "PoseAttachment", "Robot", "Scan", "Subscription", "Unreachable", "subscribe"]
 
 T = TypeVar("T")
 _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
@@ -51,6 +52,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
     Diagnostics: ("status", decode_diagnostics),
     Cloud: ("cloud", decode_cloud),
     Map: ("map", decode_map),
+    NavigationReport: ("navigation", decode_navigation),
     Scan: ("scan", decode_scan),
 }
 _QUERY_TIMEOUT_S: Final = 1.0
@@ -141,7 +143,7 @@ class Robot:
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
-        """Subscribe to messages of a kind: Pose, Diagnostics, Cloud or Map."""
+        """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map or NavigationReport."""
         return self._subscription(kind)
 
     def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
@@ -284,28 +286,30 @@ class Driver:
 
     def __init__(self, session: zenoh.Session, robot: str, source: str = "") -> None:
         prefix = f"cmd/{source}" if source else "cmd"
-        topics = {TWIST: f"{prefix}/{TWIST}", HEADING: f"{prefix}/{HEADING}", STOP: STOP, ARM: ARM}
-        self._publishers = {name: _command_publisher(session, f"{robot}/{topic}") for name, topic in topics.items()}
+        self._session, self._robot = session, robot
+        self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
+        self._publishers = {topic: _command_publisher(session, f"{robot}/{topic}")
+                            for topic in (self._twist, self._heading, STOP, ARM)}
         self._sent = 0
 
     @property
     def connected(self) -> bool:
         """True if a robot subscribes to the commands."""
-        status: Any = self._publishers[TWIST].matching_status  # zenoh's stub takes it for a bool
+        status: Any = self._publishers[self._twist].matching_status  # zenoh's stub takes it for a bool
         return bool(status.matching)
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Drive with this forward speed and yaw rate (counter-clockwise)."""
         payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
-        self._put(TWIST, payload)
+        self.send(self._twist, payload)
 
     def heading(self, velocity_mps: float, heading_rad: float) -> None:
         """Drive with this speed and hold a heading in odom (counter-clockwise)."""
-        self._put(HEADING, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
+        self.send(self._heading, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
 
     def stop(self) -> None:
         """Stop the wheels, whatever else was commanded, until `arm` is called."""
-        self._put(STOP, b"")
+        self.send(STOP, b"")
 
     def arm(self) -> int:
         """Ask the robot to arm; it refuses while a fault holds. Return the stamp, which its status repeats, ns.
@@ -317,12 +321,14 @@ class Driver:
         while not self.connected and time.monotonic() < deadline_s:
             time.sleep(_POLL_S)
         stamp_ns = time.time_ns()
-        self._put(ARM, codec.header_cdr(stamp_ns))
+        self.send(ARM, codec.header_cdr(stamp_ns))
         return stamp_ns
 
-    def _put(self, name: str, payload: bytes) -> None:
-        """Send with the identity of this program, by which the robot tells two senders apart."""
-        publisher, self._sent = self._publishers[name], (self._sent + 1) % _SEQUENCE
+    def send(self, topic: str, payload: bytes) -> None:
+        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program: it tells senders apart."""
+        if topic not in self._publishers:
+            self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
+        publisher, self._sent = self._publishers[topic], (self._sent + 1) % _SEQUENCE
         publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent))
 
 

@@ -67,13 +67,13 @@ ARROWS: Mapping[str, str] = {
     "omnid.cli": "calib.errors drivers.errors omnid.commands omnid.engine omnid.errors omnid.version",
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
-        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file "
-        "calib.rig calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras "
-        "drivers.errors drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config "
-        "omnid.controller omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics "
-        "omnid.doctor omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings "
-        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages "
-        "omnid.transport omnid.viewer omnid.web",
+        "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file calib.rig "
+        "calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras drivers.errors drivers.frame "
+        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller omnid.core.navigation "
+        "omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics omnid.doctor omnid.engine "
+        "omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings omnid.report omnid.runs "
+        "omnid.service omnid.settings omnid.settings_dump omnid.sinks omnid.stages omnid.transport omnid.viewer "
+        "omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation omnid.core.obstacles "
         "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "
@@ -111,7 +111,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.core.stereo omnid.navigation_state omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
-        "omnid.sinks omnid.transport",
+        "omnid.navigation_state omnid.sinks omnid.transport",
     "omnid.navigation_state": "",
     "omnid.recordings":
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
@@ -143,8 +143,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.simulation.worlds": "",
     "omnid.sinks":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
-        "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.errors omnid.formats "
-        "omnid.messages omnid.navigation_state omnid.stages omnid.tracking_state omnid.transport",
+        "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.engine omnid.errors "
+        "omnid.formats omnid.messages omnid.navigation_state omnid.stages omnid.tracking_state omnid.transport",
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame drivers.motion "
         "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.navigation omnid.core.obstacles "

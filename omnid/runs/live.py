@@ -169,7 +169,7 @@ class LiveRun:
                                       synchronised=config.bus.command_clock == "synchronised",
                                       report=partial(self._report, logging.WARNING))
         sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
-                      live_drive=LiveDrive(controller, rig.T_base_rig) if controller else None,
+                      live_drive=LiveDrive(controller, rig.T_base_rig, requests.end) if controller else None,
                       navigation=self._navigation(session, controller, requests) if controller else None,
                       rings={"controller-ring": RingToController(controller)} if controller else {},
                       rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),

@@ -16,7 +16,7 @@ from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.route_map import RunRouteMap
-from omnid.sinks.drive import LiveDrive, PlannerDrive, ReplayDrive
+from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, GeometryVersions
@@ -61,9 +61,9 @@ class Sinks:
 class NavigationParts(NamedTuple):
     """The surroundings of the navigation of a run with wheels."""
 
-    requests: RequestQueue
+    requests: RequestQueue | None  # None: its caller gives requests to the stage
     wheels: Callable[[], WheelState]
-    drive: PlannerDrive
+    drive: Sink[NavigationUpdate]
     routes: RouteStore
     map_name: str  # of the file of the map; empty: it is not saved
 
@@ -74,6 +74,7 @@ class WiredStages(NamedTuple):
     rig_gate: RigGate
     mapping: Mapping | None
     places: Places | None
+    navigation: NavigationStage | None  # that of a run in lock-step is given its requests directly
 
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
@@ -96,22 +97,32 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         for name, map_sink in sinks.maps.items():
             graph.sink(name, map_sink, maps)
     places: Places | None = None
-    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus or sinks.known_places is not None):
+    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus or sinks.navigation
+                                  or sinks.known_places is not None):
         places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only,
                         is_overloaded=lambda: sinks.map_period_s() == math.inf)
-        updates: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
-        outgoing["bus-places"] = updates
+        in_map: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
+        outgoing["bus-places"] = in_map
         for name, place_sink in sinks.places.items():
-            graph.sink(name, place_sink, updates)
-    if config.obstacles.enabled and (sinks.rings or sinks.recorder or sinks.bus):
-        rings: Stream[ObstacleRing] = graph.stage(
+            graph.sink(name, place_sink, in_map)
+    rings: Stream[ObstacleRing] | None = None
+    if config.obstacles.enabled and (sinks.rings or sinks.recorder or sinks.bus or sinks.navigation):
+        rings = graph.stage(
             "obstacles", Obstacles(geometry, config.obstacles, sinks.ring_period_s), odometry)
         outgoing["bus-scan"] = rings
         for name, ring_sink in sinks.rings.items():
             graph.sink(name, ring_sink, rings)
+    navigation: NavigationStage | None = None
     if sinks.navigation:
-        inputs = (odometry,) if places is None else (odometry, outgoing["bus-places"])
-        outgoing["bus-navigation"] = _navigation(graph, inputs, geometry, config, sinks.navigation, places)
+        others = [outgoing[name] for name in ("bus-places", "bus-scan") if name in outgoing]
+        inputs: tuple[Stream[Any], ...] = (odometry, *others)
+        navigation = _navigation(geometry, config, sinks.navigation, places)
+        if sinks.navigation.requests is not None:
+            requests = sinks.navigation.requests
+            inputs = (*inputs, graph.source("requests", requests.batches, wake=requests.end))
+        updates: Stream[NavigationUpdate] = graph.stage("navigation", navigation, *inputs)
+        graph.sink("planner", sinks.navigation.drive, updates, policy=NEWEST, depth=1)
+        outgoing["bus-navigation"] = updates
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
     if sinks.recorder:
@@ -119,19 +130,14 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(rig_gate, mapping, places)
+    return WiredStages(rig_gate, mapping, places, navigation)
 
 
-def _navigation(graph: Graph, poses: tuple[Stream[Any], ...], geometry: Geometry, config: Config,
-                parts: NavigationParts, places: Places | None) -> Stream[NavigationUpdate]:
-    """Join the navigation, whose setpoints go to the controller."""
+def _navigation(geometry: Geometry, config: Config, parts: NavigationParts, places: Places | None) -> NavigationStage:
+    """Return the stage of the navigation, whose setpoints go to the controller."""
     T_base_rig = geometry.rig.T_base_rig
-    requests = graph.source("requests", parts.requests.batches, wake=parts.requests.end)
     route_map = None if places is None else RunRouteMap(places, T_base_rig, parts.map_name)
-    stage = NavigationStage(config.navigation, T_base_rig, parts.wheels, Routes(parts.routes, route_map))
-    updates: Stream[NavigationUpdate] = graph.stage("navigation", stage, *poses, requests)
-    graph.sink("planner", parts.drive, updates, policy=NEWEST, depth=1)
-    return updates
+    return NavigationStage(config.navigation, T_base_rig, parts.wheels, Routes(parts.routes, route_map))
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

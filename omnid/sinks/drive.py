@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from omnid.controller.link import ControllerLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
+from omnid.engine.flow import nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
@@ -26,8 +27,10 @@ FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a r
 class LiveDrive:
     """Pass the poses of `omnid run` on; setpoints come from the network."""
 
-    def __init__(self, link: ControllerLink, T_base_rig: NDArray[np.float64]) -> None:
-        self._link, self._T_base_rig = link, T_base_rig
+    def __init__(self, link: ControllerLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing
+                 ) -> None:
+        """ended: called after the last pose."""
+        self._link, self._T_base_rig, self._ended = link, T_base_rig, ended
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose."""
@@ -36,6 +39,7 @@ class LiveDrive:
     def finish(self) -> None:
         """Have the wheels slow down to a stop: there will be no more poses."""
         self._link.end()
+        self._ended()
 
     def commands(self) -> Iterator[VelocityCommand]:
         """Yield the commands that the controller sends; OmnidError where its process ends unasked."""

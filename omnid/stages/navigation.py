@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
+from omnid.core.navigation.local_planner import room_ahead
 from omnid.core.navigation.navigator import Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import (
@@ -27,14 +29,16 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.core.places.planar import planar
 from omnid.errors import OmnidError
-from omnid.messages import NavigationPlan, NavigationUpdate, OdometryUpdate, PlaceUpdate, RequestAnswer
+from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.odometry import base_pose, of_base
 from omnid.stages.routes import KeyframeTie, Routes
 
 Array = NDArray[np.float64]
-NavigationInput: TypeAlias = "OdometryUpdate | PlaceUpdate | NavigationCommand | Iterable[NavigationCommand]"
+NavigationInput: TypeAlias = (OdometryUpdate | PlaceUpdate | ObstacleRing | NavigationCommand
+                              | Iterable[NavigationCommand])
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
+RING_NS = 2_000_000_000  # older rings tell nothing: the collision monitor sees to it that the base does not drive on
 FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
 
 
@@ -51,6 +55,7 @@ class NavigationStage:
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: KeyframeTie | None = None
+        self._ring: ObstacleRing | None = None
         self._seq = 0
         self._answer: RequestAnswer | None = None
         self._plan: NavigationPlan | None = None  # that was not given yet
@@ -65,6 +70,9 @@ class NavigationStage:
             case PlaceUpdate():
                 self._place(message)
                 return None
+            case ObstacleRing():
+                self._ring = message
+                return None
             case NavigationCommand():
                 return self._request(message)
         update = None
@@ -75,13 +83,27 @@ class NavigationStage:
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         self._seq = odometry.seq
+        pose, speed_mps = planar(T_odom_base), float(velocity[0])
+        obstacles = self._obstacles(odometry.stamp_ns)
+        nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._settings.radius_m
         self._now = now = Situation(
-            odometry.stamp_ns, planar(T_odom_base), float(velocity[0]), float(velocity[5]), odometry.state,
-            odometry.reset_counter, self._wheels(), self._in_map)
+            odometry.stamp_ns, pose, speed_mps, float(velocity[5]), odometry.state, odometry.reset_counter,
+            self._wheels(), self._in_map, obstacles, nearest_m)
         ended = self._routes.record(now, self._tie)
         if ended:
             self._refuse(ended)
         return self._update(self._navigator.step(now))
+
+    def _obstacles(self, stamp_ns: int) -> Array | None:
+        """Return the positions (N, 2) of obstacles in odom; None without a ring that is young enough."""
+        ring = self._ring
+        if ring is None or not 0 <= stamp_ns - ring.stamp_ns <= RING_NS:
+            return None
+        seen = np.isfinite(ring.ranges_m)
+        ranges_m, directions = ring.ranges_m[seen].astype(np.float64), azimuths()[seen]
+        points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions),
+                                  np.zeros(len(ranges_m))])
+        return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
 
     def _place(self, update: PlaceUpdate) -> None:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import RouteRequest
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
-from omnid.core.navigation.situation import Situation
+from omnid.core.navigation.situation import Situation, refusal_of_map
 from omnid.errors import OmnidError
 from omnid.tracking_state import MapState
 
@@ -73,8 +74,9 @@ class Routes:
         self._map()
         if self._recorder is not None:
             raise OmnidError(f"the route {self._recorder.name} is being taught: finish or stop it first")
-        if now.in_map is None or now.in_map.state is MapState.LOST:
-            raise OmnidError("there is no pose in the map now: check the images and the light (`omnid listen`)")
+        refusal = refusal_of_map(now, math.inf)
+        if refusal:
+            raise OmnidError(refusal)
         self._recorder = RouteRecorder(name)
 
     def record(self, now: Situation, tie: KeyframeTie | None) -> str:

@@ -5,6 +5,7 @@ Arrays in SI units, not to be written to; p_a = T_a_b @ p_b.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -14,9 +15,10 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.transport import codec
+from omnid.transport import codec, status_names
 from omnid.transport.codec import NS_PER_S, DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.status_names import Key
 
 ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
 Array = NDArray[np.float64]
@@ -92,6 +94,43 @@ class Map:
     cells: NDArray[np.int8]  # (H, W) -1 unknown, 0 free, up to 100 occupied; rows from low to high y, columns x
     cell_m: float
     corner: tuple[float, float]  # x, y of cell (0, 0), m
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationReport:
+    """State of goals, paths and routes; see omnid.navigation_state for the states."""
+
+    stamp_ns: int
+    state: str
+    reason: str  # of a halt or an end
+    task: str  # "goal", "path" or "route NAME"
+    command_ns: int  # stamp of the goal or path that it follows from; 0 without
+    left_m: float  # way to the end; NaN unknown
+    request: str  # the newest one
+    request_number: int  # rises with each request
+    request_stamp_ns: int  # of its sender; 0: it had none
+    refusal: str  # empty where it was accepted
+    teaching: str = ""  # name of the route that is recorded
+    taught_m: float = 0.0
+
+
+def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
+    """Decode the state of the navigation. Raise OmnidError for any other bytes."""
+    report = decode_diagnostics(payload)
+
+    def value(key: str) -> str:
+        return report.value(status_names.NAVIGATION, key)
+
+    left_m, taught_m = (status_names.number(value(key)) for key in (Key.LEFT_M, Key.TAUGHT_M))
+    return NavigationReport(
+        report.stamp_ns, value(Key.STATE), value(Key.REASON), value(Key.TASK), _whole(value(Key.COMMAND_NS)),
+        math.nan if left_m is None else left_m, value(Key.REQUEST), _whole(value(Key.REQUEST_NUMBER)),
+        _whole(value(Key.REQUEST_STAMP_NS)), value(Key.REFUSAL), value(Key.TEACHING), taught_m or 0.0)
+
+
+def _whole(text: str) -> int:
+    """Return a number of at most 19 digits, 0 for any other text."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
 
 
 def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = None) -> Pose:

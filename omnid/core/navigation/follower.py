@@ -21,6 +21,8 @@ SETTLED_MPS: Final = 0.03
 CORNER_M: Final = 0.03  # from the end of a leg that is not the last
 CORRECTIONS: Final = 3  # drives of what is missing to the goal
 BEHIND_RAD: Final = math.pi / 2  # what is missing lies behind: it is driven backwards
+SKIP_M: Final = 2.0  # before a corner, and after it, where a detour may cut it
+SKIP_BESIDE_M: Final = 0.15
 STAND: Final = Setpoint(0.0, None, 0.0)
 
 
@@ -53,6 +55,38 @@ class Follower:
     def pursuit(self) -> Pursuit | None:
         """The leg that is followed; None while the base turns at the end."""
         return self._pursuit
+
+    def path_ahead(self, way_m: float) -> Array:
+        """Return the path (N, 2) from the nearest point on, so far and some more, through the next legs if need be."""
+        if self._pursuit is None:
+            return self.path.goal[None]
+        leg = self._pursuit.leg
+        s_m = self._pursuit.s_m
+        pieces = [leg.at(s_m)[None, :2], leg.xy[(leg.s > s_m) & (leg.s <= s_m + way_m)]]
+        left_m = leg.length_m - s_m
+        for leg in self._legs[self._number + 1:]:
+            if left_m >= way_m:
+                break
+            pieces.append(leg.xy[(leg.s > 0) & (leg.s <= way_m)])
+            left_m += leg.length_m
+        return np.vstack(pieces)
+
+    @property
+    def leg_left_m(self) -> float:
+        """Way to the end of the leg."""
+        return 0.0 if self._pursuit is None else self._pursuit.leg.length_m - self._pursuit.s_m
+
+    def skip_corner(self, pose: Array) -> None:
+        """Go on with the next leg where the base, on a detour, has come to it beside the end of this one."""
+        pursuit = self._pursuit
+        if pursuit is None or self._number + 1 >= len(self._legs) or self.leg_left_m > SKIP_M:
+            return
+        leg = self._legs[self._number + 1]
+        near_m = np.hypot(leg.xy[:, 0] - pose[0], leg.xy[:, 1] - pose[1])
+        k = int(np.argmin(np.where(leg.s <= SKIP_M, near_m, np.inf)))
+        if near_m[k] < SKIP_BESIDE_M < abs(pursuit.leg.offset_m(pose, pursuit.s_m)):
+            self._number += 1
+            self._pursuit = Pursuit(leg, self._settings.pursuit, float(leg.s[k]))
 
     def step(self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
              ) -> Following:

@@ -6,7 +6,6 @@ Every end is a stop. Time is that of the poses. A drive in the frame map follows
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -17,10 +16,12 @@ from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
 from omnid.core.navigation.follower import STAND, Follower
+from omnid.core.navigation.local_planner import Detour, LocalPlanner
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation, refusal_of_map, refusal_to_drive
+from omnid.core.places.planar import composed, relative
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -29,6 +30,7 @@ Array = NDArray[np.float64]
 STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
 PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)
 BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left
+PLANNED_M: Final = 4.0  # of the path that the local planner is given
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
 
 
@@ -61,27 +63,12 @@ class Navigation(NamedTuple):
     offset_m: float = math.nan  # of the base to the left of the path
 
 
-class LocalPlan(NamedTuple):
-    """Answer of the planner that goes around obstacles."""
-
-    setpoint: Setpoint | None  # None: there is no way
-    avoiding: bool  # the setpoint leaves the path
-    reason: str = ""
-
-
-# From the drive, the situation, the pose in the drive's frame and the setpoint of the path, heading in odom.
-Avoid = Callable[[Drive, Situation, Setpoint], LocalPlan]
-
-
-def _straight_on(_: Drive, __: Situation, setpoint: Setpoint) -> LocalPlan:
-    return LocalPlan(setpoint, False)
-
-
 class Navigator:
     """Holds the drive that is under way, if there is one."""
 
-    def __init__(self, settings: NavigationSettings, avoid: Avoid = _straight_on) -> None:
-        self._settings, self._avoid = settings, avoid
+    def __init__(self, settings: NavigationSettings) -> None:
+        self._settings = settings
+        self._planner = LocalPlanner(settings)
         self._last_ns: int | None = None
         self._stops = 0  # still to be sent
         self.drive: Drive | None = None
@@ -98,6 +85,7 @@ class Navigator:
     def start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
               ) -> None:
         """Begin a drive, which replaces the one before."""
+        self._planner.restart()
         self.drive = Drive(task, frame, paths, Follower(paths[0], self._settings), now.resets, command_ns,
                            heading_rad=float(now.pose[2]))
         self.task, self.command_ns, self._stops = task, command_ns, 0
@@ -149,9 +137,9 @@ class Navigator:
             return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
         setpoint = self._in_odom(following.setpoint, drive, now)
         # 4. Obstacles.
-        plan = self._avoid(drive, now, setpoint)
+        plan = self._around_obstacles(drive, now, setpoint)
         if plan.setpoint is None:
-            return self._wait(drive, NavigationState.BLOCKED, plan.reason, dt_s)._replace(
+            return self._wait(drive, NavigationState.BLOCKED, "something stands on the path", dt_s)._replace(
                 left_m=following.left_m, offset_m=following.offset_m)
         # 5. What holds the wheels, and progress.
         if self._is_stuck(drive, now, following.left_m, dt_s):
@@ -217,6 +205,18 @@ class Navigator:
         self.state, self.reason = state, reason
         setpoint = None if state is NavigationState.PAUSED else STAND
         return Navigation(setpoint, state, reason)
+
+    def _around_obstacles(self, drive: Drive, now: Situation, setpoint: Setpoint) -> Detour:
+        """Return the motion, by way of a detour where the path is blocked."""
+        if now.obstacles is None:
+            return Detour(setpoint, False)
+        T_odom_frame = relative(now.T_frame_odom(drive.frame), np.zeros(3))
+        ahead = drive.follower.path_ahead(PLANNED_M)
+        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
+        detour = self._planner.plan(now.pose, path[:, :2], now.obstacles, setpoint, drive.follower.leg_left_m)
+        if detour.avoiding:
+            drive.follower.skip_corner(now.pose_in(drive.frame))
+        return detour
 
     def _in_odom(self, setpoint: Setpoint, drive: Drive, now: Situation) -> Setpoint:
         if setpoint.heading_rad is None:

@@ -44,7 +44,8 @@ class Situation(NamedTuple):
     resets: int  # how often odometry has begun again
     wheels: WheelState
     in_map: MapPosition | None = None  # None: nothing is known yet
-    obstacle_m: float = math.inf  # from the outline of the base to the nearest one
+    obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
+    obstacle_m: float = math.inf  # from the outline of the base to the nearest one that is not behind it
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:
         """Return the pose of odom in a frame (3,)."""

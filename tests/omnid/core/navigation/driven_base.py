@@ -71,7 +71,7 @@ class DrivenBase:
         state = MapState.LOCALIZED if self.localised else MapState.ODOMETRY_ONLY
         return Situation(round(self.t_s * 1e9), noisy, self.v + self.rng.normal(0, 0.01),
                          self.w + self.rng.normal(0, 0.01), self.state, self.resets, self.wheels,
-                         MapPosition(self.T_map_odom, state, 0.02), self.obstacle_m)
+                         MapPosition(self.T_map_odom, state, 0.02), obstacle_m=self.obstacle_m)
 
     def tick(self) -> Navigation | None:
         """Advance by TICK_S; return the answer of the navigation where a pose has come."""

@@ -1,0 +1,51 @@
+"""`omnid goto`: drive a robot to a pose."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from omnid.commands.config import add_settings
+from omnid.commands.listen import add_robot, config_of
+
+FARTHEST_M = 1e6
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `goto` to the command line."""
+    parser = subparsers.add_parser("goto", help="drive a robot to a pose, around obstacles",
+                                   description="Drive an armed robot to a pose of its base and wait for the end; "
+                                   "Ctrl-C cancels, and it stops. Exit code 0: reached, 1: not reached.")
+    parser.add_argument("pose", type=float, nargs="*", metavar="X Y [YAW]", help="m, m, and deg counter-clockwise; "
+                        "without YAW the heading stays as it comes")
+    parser.add_argument("--frame", choices=("odom", "map"), default="odom", help="frame of the pose: odom begins at "
+                        "the robot's start, map is that of its saved map; default %(default)s")
+    verbs = parser.add_mutually_exclusive_group()
+    verbs.add_argument("--cancel", action="store_const", dest="verb", const="cancel", help="end what is under way")
+    verbs.add_argument("--pause", action="store_const", dest="verb", const="pause", help="halt")
+    verbs.add_argument("--resume", action="store_const", dest="verb", const="resume", help="go on after a halt")
+    parser.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
+    add_robot(parser)
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive, or cancel, pause, resume."""
+    from omnid.errors import OmnidError
+    from omnid.monitor.navigation import NavigationClient, drive_to_end
+
+    if args.verb and args.pose:
+        raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
+    if not args.verb and len(args.pose) not in (2, 3):
+        raise OmnidError(f"goto: expected X Y [YAW], found {len(args.pose)} numbers")
+    if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for value in args.pose):
+        raise OmnidError(f"goto: expected finite numbers of at most {FARTHEST_M:g}")
+    with NavigationClient(config_of(args).bus) as client:
+        if args.verb:
+            report = client.navigate(args.verb)
+            print(f"{report.state}: {report.reason}" if report.reason else report.state)
+            return 0
+        heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
+        client.goal(args.pose[0], args.pose[1], heading_rad, args.frame)
+        return 0 if args.no_wait else drive_to_end(client)

@@ -1,0 +1,239 @@
+"""The way around obstacles: dynamic window on the distances of a wave front, within a corridor of the path.
+
+Fox, Burgard, Thrun, "The dynamic window approach to collision avoidance", IEEE RAM 1997; Brock, Khatib, "High-speed
+navigation using the global dynamic window approach", ICRA 1999: arcs that keep clear of all obstacles are judged by the
+distance that is left at their end, by a wave front (NF1) from a free point of the path behind the obstacle. So there
+are no local minima within the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.settings import NavigationSettings
+
+Array = NDArray[np.float64]
+
+CELL_M: Final = 0.05
+HALF_CELLS: Final = 64  # of the grid about the base: 3.2 m to each side
+AHEAD_M: Final = 2.0  # of the path, in which obstacles are looked for
+REJOIN_M: Final = 0.3  # of free path that the detour ends on, behind the obstacle
+REJOIN_WITHIN_M: Final = 3.0  # of the way: within the grid
+BACK_ON_PATH_M: Final = 0.12  # beside the path, from which it is followed again
+BEFORE_M: Final = 0.35  # from the outline to an obstacle on the path at which the base waits
+WAIT_MPS2: Final = 0.2  # deceleration towards it
+ARC_S: Final = 1.6  # length of an arc
+ARC_STEPS: Final = 8
+SPEEDS: Final = 4
+YAW_RATES: Final = 17
+SHARE: Final = 0.7  # of the speed, on a detour
+HEADING_M_PER_RAD: Final = 0.25  # weights of the judgement, as metres of way
+CLEARANCE_WEIGHT_M: Final = 0.15
+FAR_M: Final = 1e3  # way left where no way leads to the path
+SHORTEST_ARC_M: Final = 0.02
+BEHIND_SHARE: Final = -0.17  # cosine of the direction beyond which an obstacle is behind
+
+
+class Detour(NamedTuple):
+    """Answer of the planner."""
+
+    setpoint: Setpoint | None  # None: there is no way
+    avoiding: bool
+
+
+class LocalPlanner:
+    """Decide at each pose whether the path can be followed, and go around what stands on it. All in odom."""
+
+    def __init__(self, settings: NavigationSettings) -> None:
+        self._settings = settings
+        self._avoiding = False
+        self._edges = _neighbours()
+        speeds = np.linspace(0.0, SHARE * settings.pursuit.velocity_mps, SPEEDS)
+        rates = np.linspace(-settings.pursuit.yaw_rate_radps, settings.pursuit.yaw_rate_radps, YAW_RATES)
+        self._v, self._w = (grid.ravel() for grid in np.meshgrid(speeds, rates))
+        t = np.linspace(0.0, ARC_S, ARC_STEPS + 1)[1:]
+        turned = self._w[:, None] * t
+        # Chord of an arc: v t sin(w t / 2) / (w t / 2), in the direction w t / 2.
+        chord = self._v[:, None] * t * np.sinc(turned / (2 * np.pi))
+        self._arc_x, self._arc_y = chord * np.cos(turned / 2), chord * np.sin(turned / 2)
+        self._turned = turned[:, -1]
+
+    def restart(self) -> None:
+        """Forget the detour of the last drive."""
+        self._avoiding = False
+
+    def plan(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float = math.inf
+             ) -> Detour:
+        """Return the motion: that of the path where it is free.
+
+        pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2). wanted: the
+        motion on the path. leg_left_m: way to the next corner: what stands behind it does not matter yet.
+        """
+        settings = self._settings
+        offset_m = float(np.hypot(*(path[0] - pose[:2])))
+        if not len(obstacles) or not (self._avoiding or wanted.velocity_mps > 0):
+            self._avoiding = self._avoiding and bool(len(obstacles))
+            return Detour(wanted, False)
+        # 1. Where the path, and the way to it, comes too near to an obstacle.
+        ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        near = ways <= min(AHEAD_M, leg_left_m + CELL_M)
+        room_m = _distances(path, obstacles)
+        is_blocked = room_m < settings.radius_m + settings.clearance_m
+        leaves = is_blocked[0] and _gets_farther(room_m)  # it stands there already, and drives away
+        first_m = math.inf if leaves or not is_blocked[near].any() else float(ways[np.argmax(is_blocked)])
+        if first_m == math.inf and (not self._avoiding or offset_m < BACK_ON_PATH_M):
+            self._avoiding = False
+            return Detour(wanted, False)
+        # 2. A free point of the path behind the obstacle, and the distances to it within the corridor.
+        goal = _rejoin(ways, is_blocked, first_m if first_m < math.inf else 0.0)
+        if goal is not None and settings.corridor_m > 0:
+            motion = self._around(pose, path, obstacles, path[goal])
+            if motion is not None:
+                self._avoiding = True
+                return Detour(motion, True)
+        # 3. No way: up to the obstacle, and wait.
+        left_m = first_m - settings.radius_m - BEFORE_M
+        if self._avoiding or left_m <= 0:
+            return Detour(None, self._avoiding)
+        speed_mps = min(wanted.velocity_mps, math.sqrt(2 * WAIT_MPS2 * left_m))
+        slower = speed_mps / wanted.velocity_mps
+        return Detour(Setpoint(speed_mps, wanted.heading_rad, wanted.yaw_rate_radps * slower), False)
+
+    def _around(self, pose: Array, path: Array, obstacles: Array, goal: Array) -> Setpoint | None:
+        """Return the best arc; None without one."""
+        settings = self._settings
+        corner = pose[:2] - HALF_CELLS * CELL_M
+        room_m = _grid_distances(obstacles, corner)
+        beside_m = _grid_distances(path, corner)
+        own = room_m[HALF_CELLS, HALF_CELLS]
+        least_m = min(settings.radius_m + 0.5 * settings.clearance_m, max(0.0, float(own) - CELL_M))
+        is_free = (room_m > least_m) & (beside_m <= settings.corridor_m)
+        is_free[HALF_CELLS, HALF_CELLS] = True
+        left_m = _wave_front(self._edges, is_free, _cells(goal[None], corner)[0])
+        if left_m is None or left_m[HALF_CELLS, HALF_CELLS] >= FAR_M:
+            return None
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x = pose[0] + c * self._arc_x - s * self._arc_y
+        y = pose[1] + s * self._arc_x + c * self._arc_y
+        cells = _cells(np.stack([x, y], axis=-1), corner)
+        rows, columns = cells[..., 1], cells[..., 0]
+        clear = room_m[rows, columns].min(axis=1)
+        open_ = is_free[rows, columns].all(axis=1) & (left_m[rows[:, -1], columns[:, -1]] < FAR_M)
+        stands = self._v < SHORTEST_ARC_M
+        open_ |= stands & (np.abs(self._w) > 0)
+        # The heading at the end against the way down the distances.
+        ends = left_m[rows[:, -1], columns[:, -1]]
+        down = _descent(left_m, rows[:, -1], columns[:, -1])
+        off = np.abs(np.remainder(pose[2] + self._turned - down + np.pi, 2 * np.pi) - np.pi)
+        wide_m = settings.radius_m + 2 * settings.clearance_m
+        cost = ends + HEADING_M_PER_RAD * off + CLEARANCE_WEIGHT_M * np.clip((wide_m - clear) / wide_m, 0, 1)
+        cost = np.where(open_, cost, np.inf)
+        best = int(np.argmin(cost))
+        if not np.isfinite(cost[best]):
+            return None
+        return Setpoint(float(self._v[best]), None, float(self._w[best]))
+
+
+def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
+    """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind, as the base drives."""
+    if not len(obstacles):
+        return math.inf
+    sign = -1.0 if speed_mps < 0 else 1.0
+    dx, dy = obstacles[:, 0] - pose[0], obstacles[:, 1] - pose[1]
+    distance = np.hypot(dx, dy)
+    forward = sign * (math.cos(pose[2]) * dx + math.sin(pose[2]) * dy)
+    return float(distance[forward > BEHIND_SHARE * distance].min(initial=math.inf))
+
+
+def _distances(points: Array, obstacles: Array) -> Array:
+    """Return the distance of each point (N, 2) to the nearest obstacle (M, 2)."""
+    return np.asarray(np.hypot(points[:, None, 0] - obstacles[:, 0], points[:, None, 1] - obstacles[:, 1]).min(axis=1))
+
+
+def _gets_farther(room_m: Array) -> bool:
+    """True if a path leads away from the obstacle that is too near at its beginning."""
+    k = min(len(room_m) - 1, 6)
+    return bool((np.diff(room_m[:k + 1]) >= -1e-9).all())
+
+
+def _rejoin(ways: Array, is_blocked: NDArray[np.bool_], first_m: float) -> int | None:
+    """Return the point of the path behind the obstacle at which REJOIN_M are free; None without one."""
+    behind = (ways > first_m) & ~is_blocked & (ways < REJOIN_WITHIN_M)
+    span = max(1, round(REJOIN_M / CELL_M))
+    for k in np.flatnonzero(behind):
+        if not is_blocked[k:k + span].any() and (ways[k] - first_m >= REJOIN_M or k == len(ways) - 1):
+            return min(int(k) + span // 2, len(ways) - 1)
+    return None
+
+
+def _cells(points: Array, corner: Array) -> NDArray[np.intp]:
+    """Return columns and rows (..., 2) of points (..., 2), those beyond the grid at its border."""
+    return np.clip(((points - corner) / CELL_M).round(), 0, 2 * HALF_CELLS).astype(np.intp)
+
+
+def _grid_distances(points: Array, corner: Array) -> Array:
+    """Return the distance of each cell to the nearest point [m]."""
+    size = 2 * HALF_CELLS + 1
+    inside = ((points >= corner) & (points <= corner + 2 * HALF_CELLS * CELL_M)).all(axis=1)
+    grid = np.ones((size, size), np.uint8)
+    cells = _cells(points[inside], corner)
+    grid[cells[:, 1], cells[:, 0]] = 0
+    if not len(cells):
+        return np.full((size, size), FAR_M)
+    return np.asarray(cv2.distanceTransform(grid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, np.float64)
+
+
+class _Neighbours(NamedTuple):
+    """Edges between neighbouring cells of the grid, in the order of their first cell."""
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    length_m: Array
+
+
+def _neighbours() -> _Neighbours:
+    """Return the edges to the eight cells around each cell."""
+    size = 2 * HALF_CELLS + 1
+    rows, columns, steps = np.meshgrid(np.arange(size), np.arange(size), np.arange(8), indexing="ij")
+    dy = np.array([-1, -1, -1, 0, 0, 1, 1, 1])[steps]
+    dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])[steps]
+    inside = (rows + dy >= 0) & (rows + dy < size) & (columns + dx >= 0) & (columns + dx < size)
+    first = (rows * size + columns)[inside]
+    second = ((rows + dy) * size + columns + dx)[inside]
+    return _Neighbours(first.astype(np.int32), second.astype(np.int32), CELL_M * np.hypot(dx, dy)[inside])
+
+
+def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], goal: NDArray[np.intp]) -> Array | None:
+    """Return the way from each free cell to the goal [m], FAR_M where there is none; None where the goal is not free.
+    """
+    column, row = int(goal[0]), int(goal[1])
+    if not is_free[row, column]:
+        return None
+    free = is_free.ravel()
+    usable = free[edges.first] & free[edges.second]
+    counts = np.bincount(edges.first[usable], minlength=free.size)
+    graph = csr_matrix((edges.length_m[usable], edges.second[usable], np.concatenate([[0], np.cumsum(counts)])),
+                       shape=(free.size, free.size))
+    found = dijkstra(graph, indices=row * len(is_free) + column)
+    return np.asarray(np.where(np.isfinite(found), found, FAR_M).reshape(is_free.shape))
+
+
+def _descent(left_m: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """Return the direction [rad] in which the way left falls most, over some cells."""
+    best, direction = np.full(len(rows), np.inf), np.zeros(len(rows))
+    reach, limit = 4, len(left_m) - 1
+    for k in range(16):
+        angle = 2 * math.pi * k / 16
+        r = np.clip(rows + round(reach * math.sin(angle)), 0, limit)
+        c = np.clip(columns + round(reach * math.cos(angle)), 0, limit)
+        lower = left_m[r, c] < best
+        best, direction = np.where(lower, left_m[r, c], best), np.where(lower, angle, direction)
+    return direction

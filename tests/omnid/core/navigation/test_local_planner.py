@@ -1,0 +1,134 @@
+"""Ways around obstacles in a closed loop: a ring of ranges as the cameras give it, boxes on and beside the path."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.navigation.navigator import Navigator
+from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
+from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.settings import NavigationSettings
+from omnid.navigation_state import NavigationState
+from tests.omnid.core.navigation.driven_base import DrivenBase
+
+Array = NDArray[np.float64]
+AZIMUTHS = -math.pi + (np.arange(360) + 0.5) * math.tau / 360
+SETTINGS = NavigationSettings(blocked_s=5.0)
+
+
+class Boxes:
+    """Boxes on the floor: x0, y0, x1, y1 [m]."""
+
+    def __init__(self, *boxes: tuple[float, float, float, float]) -> None:
+        self.boxes = np.array(boxes).reshape(-1, 4)
+
+    def clearance_m(self, xy: Array) -> float:
+        """Return the distance of a point to the nearest box."""
+        if not len(self.boxes):
+            return math.inf
+        low, high = self.boxes[:, :2] - xy, xy - self.boxes[:, 2:]
+        return float(np.hypot(*np.maximum(np.maximum(low, high), 0.0).T).min())
+
+    def ring(self, pose: Array) -> Array:
+        """Return ranges (360,) from a pose, inf beyond 4 m: slabs of the boxes."""
+        directions = np.column_stack([np.cos(AZIMUTHS + pose[2]), np.sin(AZIMUTHS + pose[2])])
+        if not len(self.boxes):
+            return np.full(360, math.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a = (self.boxes[:, None, :2] - pose[:2]) / directions
+            b = (self.boxes[:, None, 2:] - pose[:2]) / directions
+        enter, leave = np.minimum(a, b).max(axis=2), np.maximum(a, b).min(axis=2)
+        hit = np.where((enter <= leave) & (enter > 0), enter, math.inf).min(axis=0)
+        return np.where(hit < 4.0, hit, math.inf)
+
+
+class BaseAmongBoxes(DrivenBase):
+    """A base whose ring shows boxes."""
+
+    boxes = Boxes()
+
+    def seen(self):  # type: ignore[no-untyped-def]
+        now = super().seen()
+        ranges = self.boxes.ring(self.pose) + self.rng.normal(0, 0.01, 360)
+        seen = np.isfinite(ranges)
+        points = self.pose[:2] + (ranges * np.array([np.cos(AZIMUTHS + self.pose[2]),
+                                                     np.sin(AZIMUTHS + self.pose[2])])).T[seen]
+        near_m = float(ranges[seen & (np.abs(AZIMUTHS) < 1.7)].min(initial=math.inf)) - SETTINGS.radius_m
+        return now._replace(obstacles=points, obstacle_m=near_m)
+
+
+def drive(boxes: Boxes, seed: int, settings: NavigationSettings = SETTINGS, length_m: float = 5.0) -> BaseAmongBoxes:
+    """Begin to drive straight on among boxes."""
+    base = BaseAmongBoxes(Navigator(settings), seed)
+    base.boxes = boxes
+    path = DrivePath((straight_leg((0.0, 0.0), (length_m, 0.0)),), 0.0)
+    base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
+    return base
+
+
+def clearance_m(base: BaseAmongBoxes) -> float:
+    """Return the smallest distance of the outline to a box."""
+    return min(base.boxes.clearance_m(sample.pose[:2]) for sample in base.samples) - SETTINGS.radius_m
+
+
+@pytest.mark.parametrize("boxes", [
+    Boxes((2.5, -0.2, 2.9, 0.2)), Boxes((2.5, -1.2, 2.8, 0.1)), Boxes((2.5, -0.1, 2.8, 1.2)),
+    Boxes((1.6, -0.6, 1.8, 0.3), (3.2, -0.3, 3.4, 0.6)), Boxes((2.0, -0.15, 3.2, 0.15)),
+    Boxes((2.4, -0.2, 2.8, 0.2), (-1.0, 1.2, 7.0, 1.4), (-1.0, -1.4, 7.0, -1.2))])
+def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
+    base = drive(boxes, 1)
+    assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
+    assert base.error((5.0, 0.0, 0.0))[0] < 0.03
+    assert clearance_m(base) > 0.02
+    assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
+    offsets = [abs(float(sample.pose[1])) for sample in base.samples]
+    assert max(offsets) < SETTINGS.corridor_m + 0.1
+
+
+@pytest.mark.parametrize("boxes", [
+    Boxes((2.5, -3.0, 2.7, 3.0)), Boxes((2.5, -0.7, 2.7, 0.7), (1.5, 0.7, 2.7, 0.9), (1.5, -0.9, 2.7, -0.7)),
+    Boxes((4.8, -0.2, 5.2, 0.2))])
+def test_waits_where_there_is_no_way_and_then_says_so(boxes: Boxes) -> None:
+    base = drive(boxes, 1)
+    answer = base.run(90)
+    assert answer.state is NavigationState.FAILED and "blocked for 5 s" in answer.reason
+    assert any(sample.navigation.state is NavigationState.BLOCKED for sample in base.samples)
+    assert 0.05 < clearance_m(base) < 1.0
+    assert abs(base.v) < 0.01
+
+
+def test_goes_on_when_the_way_becomes_free() -> None:
+    base = drive(Boxes((2.5, -3.0, 2.7, 3.0)), 2)
+    base.run(60, lambda answer: answer.state is NavigationState.BLOCKED)
+    base.boxes = Boxes()
+    assert base.run(60).state is NavigationState.REACHED
+
+
+def test_without_a_corridor_it_stays_on_the_path() -> None:
+    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(blocked_s=3.0, corridor_m=0.0))
+    assert base.run(60).state is NavigationState.FAILED
+    assert max(abs(float(sample.pose[1])) for sample in base.samples) < 0.1
+
+
+def test_walls_beside_the_path_change_nothing() -> None:
+    base = drive(Boxes((-1.0, 0.6, 7.0, 0.8), (-1.0, -0.8, 7.0, -0.6)), 4)
+    assert base.run(90).state is NavigationState.REACHED
+    assert not any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
+
+
+def test_a_base_that_stands_too_near_drives_away() -> None:
+    base = drive(Boxes((-0.5, -0.4, 0.2, -0.27)), 5)
+    assert base.run(60).state is NavigationState.REACHED
+
+
+def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
+    base = BaseAmongBoxes(Navigator(SETTINGS), 6)
+    base.boxes = Boxes((2.8, 1.2, 3.2, 1.6))
+    path = drive_path([(0.0, 0.0), (3.0, 0.0), (3.0, 3.0)], math.pi / 2)
+    base.navigator.start("path", NavigationFrame.ODOM, [path], base.seen())
+    assert base.run(90).state is NavigationState.REACHED
+    assert clearance_m(base) > 0.02
