@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Iterator
@@ -26,11 +27,15 @@ _WARNINGS = {
 _COUNTERS = ("lower", "upper", *_WARNINGS)
 
 
+WHOLE = (0.0, math.inf)
+
+
 class LogReader:
     """A FrameSource that streams a log once per call of frames().
 
     path: as for `open_image_log`. lower, upper: topics, where their names do not identify the cameras. window: number
-    of frames that are held back to sort them by stamp. Raises DriverError where the path is no such log, or the topics
+    of frames that are held back to sort them by stamp. span_s: the part of the log that is read, from and until so many
+    seconds after the stamp of its first image. Raises DriverError where the path is no such log, or the topics
     of the two cameras are ambiguous.
 
     During and after frames(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate', 'unstamped'
@@ -39,9 +44,10 @@ class LogReader:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32
+        self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32,
+        span_s: tuple[float, float] = WHOLE,
     ) -> None:
-        self._window, self._closed = window, False
+        self._window, self._closed, self._span_s = window, False, span_s
         self._log = open_image_log(path)
         self._reset()
         try:
@@ -59,6 +65,11 @@ class LogReader:
     def frames(self) -> Iterator[Frame]:
         """Yield the frames of both cameras in the order of their stamps; seq counts each camera's from 0."""
         self._reset()
+        yield from self._in_span(self._sorted())
+        if not self._closed:
+            self._report()
+
+    def _sorted(self) -> Iterator[Frame]:
         buffer = ReorderBuffer(self._window, self.counts)
         for logged in self._log.images():
             camera = self._cameras.get(logged.topic)
@@ -67,7 +78,23 @@ class LogReader:
                 yield from buffer.push(camera, image)
         if not self._closed:
             yield from buffer.drain()
-            self._report()
+
+    def _in_span(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield the frames of the part that is read; others do not count, so that seq begins at 0 there."""
+        begin_s, end_s = self._span_s
+        first_ns, at_s = None, 0.0
+        for frame in frames:
+            first_ns = frame.stamp_ns if first_ns is None else first_ns
+            at_s = 1e-9 * (frame.stamp_ns - first_ns)
+            if begin_s <= at_s <= end_s:
+                yield frame
+            else:
+                self.counts[frame.camera] -= 1
+            if at_s > end_s:
+                return
+        if first_ns is not None and at_s < begin_s:
+            raise DriverError(f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
+                              f"expected, {begin_s:g} s found")
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -75,9 +102,10 @@ class LogReader:
         self._log.close()
 
     def pair_estimate(self) -> int | None:
-        """Return the largest possible number of pairs, for a progress bar; None where the log does not state it."""
+        """Return the largest possible number of pairs, for a progress bar; None where the log does not state it, or
+        is read in part."""
         counts = self._log.counts()
-        return None if counts is None else min(counts.get(topic, 0) for topic in self._cameras)
+        return None if counts is None or self._span_s != WHOLE else min(counts.get(topic, 0) for topic in self._cameras)
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""

@@ -16,6 +16,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         help="the same format, of the same rig frame in any world frame")
     parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS",
                         help="largest difference between the stamps of two poses; default %(default)s")
+    parser.add_argument("--align", choices=("origin", "rigid", "scale"), default="origin", help="the first pose "
+                        "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
+                        "the estimate's scale, as its --align --correct_scale")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -25,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
 
-    metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3)
+    metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3, args.align)
     if args.json:
         print_json(metrics)
     else:

@@ -25,6 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
     parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    parser.add_argument("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
+    parser.add_argument("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end")
     _add_outputs(parser)
     _add_computation(parser)
     add_map(parser)
@@ -63,9 +65,9 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import load_config, unused_settings
     from omnid.runs.replay import ReplayOptions
 
-    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), tum=args.tum, map_tum=args.map_tum,
-                            cloud=args.cloud, plan=args.plan, record=args.record, publish=args.publish,
-                            inline=args.inline, realtime=args.realtime, settings=args.config)
+    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), span_s=_span_of(args), tum=args.tum,
+                            map_tum=args.map_tum, cloud=args.cloud, plan=args.plan, record=args.record,
+                            publish=args.publish, inline=args.inline, realtime=args.realtime, settings=args.config)
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
@@ -102,6 +104,19 @@ def _print_result(result: RunResult, options: ReplayOptions, as_json: bool) -> N
                     "signal": result.signal}, stream)
         return
     print(run_summary(result.counters, result.timings.values()), file=stream)
+
+
+def _span_of(args: argparse.Namespace) -> tuple[float, float]:
+    """Return the part of the log that is read. Raise OmnidError for times that are none."""
+    import math
+
+    from omnid.errors import OmnidError
+
+    if not 0 <= args.start_s < math.inf:
+        raise OmnidError(f"--start-s {args.start_s:g}: expected a time of 0 s or more")
+    if args.seconds is not None and not 0 < args.seconds < math.inf:
+        raise OmnidError(f"--seconds {args.seconds:g}: expected a time above 0 s")
+    return args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds
 
 
 def _shortcuts(args: argparse.Namespace) -> list[str]:

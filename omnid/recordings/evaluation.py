@@ -1,5 +1,4 @@
-"""Errors of an estimated trajectory against the truth, as `evo_ape --align_origin` and `evo_rpe -d 1 -u f` define them.
-"""
+"""Errors of an estimated trajectory against the truth, as `evo_ape` and `evo_rpe -d 1 -u f` define them."""
 
 from __future__ import annotations
 
@@ -12,11 +11,12 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory
+from omnid.recordings.alignment import aligned
 
 
 @dataclass(frozen=True, slots=True)
 class Metrics:
-    """Errors over the associated poses, of which only the first is aligned. NaN: undefined."""
+    """Errors over the associated poses after the alignment. NaN: undefined."""
 
     pairs: int  # associated poses
     coverage: float  # share of the truth's poses that have an estimate, 0..1
@@ -33,8 +33,10 @@ class Metrics:
     heading_end_rad: float  # signed, positive: the estimate is rotated too far left
 
 
-def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> Metrics:
+def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01, alignment: str = "origin") -> Metrics:
     """Compare an estimate with the truth, both T_world_rig of the same rig frame in any two worlds.
+
+    alignment: one of ALIGNMENTS, see `alignment.aligned`.
 
     Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
     truth, the nearer one. Raise OmnidError for fewer than two associated poses.
@@ -46,8 +48,8 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01)
             f" estimate {_span(estimate)}, truth {_span(truth)}: do both use the same clock?"
         )
     T_true = truth.T[of_truth]
-    T_world_odom = T_true[0] @ se3.inverse(estimate.T[of_estimate[0]])
-    return _metrics(T_world_odom @ estimate.T[of_estimate], T_true, of_truth.size / truth.stamps_ns.size)
+    T_estimate = aligned(estimate.T[of_estimate], T_true, alignment)
+    return _metrics(T_estimate, T_true, of_truth.size / truth.stamps_ns.size)
 
 
 def format_metrics(metrics: Metrics) -> str:

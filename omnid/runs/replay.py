@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
@@ -14,7 +15,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import WHOLE, LogReader
 from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunStatistics
@@ -65,6 +66,7 @@ class ReplayOptions:
 
     rig: Path | Rig | None = None  # None: the rig.toml that is attached to the log
     topics: Topics = (None, None)  # of the images; None: those of the rig, else by their names
+    span_s: tuple[float, float] = WHOLE  # the part of the log, from and until so many seconds after its first image
     tum: Path | None = None
     map_tum: Path | None = None
     cloud: Path | None = None
@@ -158,10 +160,11 @@ class _Replay:
         named = ("", "")
         if rig and not (lower and upper):
             named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
+        read = partial(LogReader, self._log, window=window, span_s=self._options.span_s)
         if all(named):
             with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
-                return LogReader(self._log, lower or named[0], upper or named[1], window=window)
-        return LogReader(self._log, lower, upper, window=window)
+                return read(lower or named[0], upper or named[1])
+        return read(lower, upper)
 
     def _rig(self, reader: LogReader) -> Rig:
         rig = self._options.rig

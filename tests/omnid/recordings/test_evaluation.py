@@ -120,6 +120,25 @@ def test_too_few_poses_names_both_ranges() -> None:
         evaluate(trajectory([], np.empty((0, 4, 4))), truth)
 
 
+def test_all_positions_are_aligned_where_that_is_asked_for() -> None:
+    truth = spline()
+    motion = se3.exp([4.0, -2.0, 1.0, 0.3, -0.2, 2.5])
+    first_is_wrong = trajectory(truth.stamps_ns, motion @ truth.T)
+    first_is_wrong.T[0, :3, 3] += 0.5
+    assert evaluate(first_is_wrong, truth).ate_max_m > 0.4
+    rigid = evaluate(first_is_wrong, truth, alignment="rigid")
+    assert rigid.ate_rmse_m < 0.15 and rigid.end_error_m < 0.05
+    small = trajectory(truth.stamps_ns, motion @ truth.T)
+    small.T[:, :3, 3] *= 0.9
+    assert evaluate(small, truth, alignment="rigid").ate_max_m > 0.1
+    scaled = evaluate(small, truth, alignment="scale")
+    assert scaled.ate_max_m < 1e-9 and scaled.length_error_ratio == pytest.approx(0.0, abs=1e-9)
+    assert scaled.heading_max_rad < 1e-6
+    for alignment in ("rigid", "scale"):
+        with pytest.raises(OmnidError, match="lie on a line"):
+            evaluate(straight(11, 0.1), straight(11, 0.1), alignment=alignment)
+
+
 @pytest.mark.parametrize("tolerance_s", [-0.1, math.nan, math.inf])
 def test_bad_tolerance(tolerance_s: float) -> None:
     with pytest.raises(OmnidError, match="tolerance"):
@@ -141,6 +160,10 @@ def test_same_numbers_as_evo(tmp_path: Path) -> None:
     ape = evo("evo_ape", *files, "--align_origin")
     assert metrics.ate_rmse_m == pytest.approx(ape["rmse"], abs=1e-6)
     assert metrics.ate_max_m == pytest.approx(ape["max"], abs=1e-6)
+    for alignment, options in (("rigid", ["--align"]), ("scale", ["--align", "--correct_scale"])):
+        ape = evo("evo_ape", *files, *options)
+        found = evaluate(read_tum(files[1]), read_tum(files[0]), alignment=alignment)
+        assert found.ate_rmse_m == pytest.approx(ape["rmse"], abs=1e-6)
     rpe = evo("evo_rpe", *files, "-d", "1", "-u", "f")
     assert metrics.rpe_translation_rmse_m == pytest.approx(rpe["rmse"], abs=1e-6)
     turned = evo("evo_rpe", *files, "-d", "1", "-u", "f", "-r", "angle_deg")
