@@ -1,7 +1,7 @@
 """Compiled functions (core/compiled.py) made ready before the first image, and kept on disk between two starts.
 
-A folder holds the code of one state of the sources, of one version of numba and Python and of one processor. It is
-filled in a folder of another name, which gets its name when it is complete, and its files are checked by their digests
+A folder holds the code of one file in one state, of one version of numba and Python and of one processor. It is filled
+in a folder of another name, which gets its name when it is complete, and its files are checked by their digests
 before they are read: a power cut, a full disk or two programs at once cannot leave code that is half written. Folders
 of other states are removed, the oldest first.
 """
@@ -14,22 +14,24 @@ import json
 import logging
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import omnid.core
-from omnid.core.compiled import KERNEL_FILES, declared
+from omnid.core.compiled import KERNEL_FILES, Kernel, declared
 from omnid.errors import OmnidError
 
-MAX_FOLDERS: Final = 4  # of other states that are kept
+MAX_FOLDERS: Final = 40  # of other states, and of files that were not compiled now
 MAX_BYTES: Final = 64 << 20  # of a folder that is read: a larger one is none of ours
 DIGESTS: Final = "digests.json"
+_IMPORTED: Final = re.compile(r"^(?:from|import) (omnid\.core\.\S*_kernels)\b", re.MULTILINE)
 _OWN_ONLY: Final = 0o022  # bits of a mode by which others could write: what is read here is run
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
@@ -50,36 +52,40 @@ def prepare_kernels(report: Report) -> None:
         raise OmnidError("the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
                          f"the service, or what else denies executable memory ({error})") from error
     files = _kernel_files()
-    for name in files:
+    folders = {name: _folder_of_state(path) for name, path in files.items()}
+    reason = _why_unusable(cache_folder())
+    missing = []
+    for name, folder in folders.items():
         importlib.import_module(name)
-    folder = _folder_of_state(files.values())
-    reason = _why_unusable(folder.parent)
-    if not reason and _is_intact(folder):
-        _compile_into(folder)
-    else:
-        _compile_first(folder, reason, report)
+        if not reason and _is_intact(folder):
+            _compile_into(name, folder)
+        else:
+            missing.append(name)
+    if missing:
+        _compile_first({name: folders[name] for name in missing}, reason, report)
     _state["ready"] = True
 
 
-def _compile_first(folder: Path, reason: str, report: Report) -> None:
+def _compile_first(folders: Mapping[str, Path], reason: str, report: Report) -> None:
     """Compile what is not on the disk; reason: why it cannot be kept there, empty where it can."""
     started_s = time.monotonic()
-    report(logging.INFO, f"compiling {sum(1 for _ in declared())} functions for this processor, once; takes up to a "
-           "minute")
-    if reason:
-        _compile_into(None)
-    else:
-        try:
-            _compile_and_publish(folder)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            _compile_into(None)
+    count = sum(1 for name in folders for _ in _functions_of(name))
+    report(logging.INFO, f"compiling {count} functions for this processor, once; takes up to a minute")
+    for name, folder in folders.items():
+        if not reason:
+            try:
+                _compile_and_publish(name, folder)
+                continue
+            except OSError as error:
+                reason = error.strerror or str(error)
+        _compile_into(name, None)
     took_s = time.monotonic() - started_s
     if reason:
-        report(logging.WARNING, f"the compiled functions cannot be kept in {folder.parent}: {reason}: every start "
+        report(logging.WARNING, f"the compiled functions cannot be kept in {cache_folder()}: {reason}: every start "
                f"takes {took_s:.0f} s longer; make that folder writable, or set OMNID_CACHE_DIR to another one")
     else:
-        report(logging.INFO, f"compiled in {took_s:.0f} s; kept in {folder}")
+        _remove_others(set(folders.values()))
+        report(logging.INFO, f"compiled in {took_s:.0f} s; kept in {cache_folder()}")
 
 
 def cache_folder() -> Path:
@@ -99,8 +105,8 @@ def _kernel_files() -> dict[str, Path]:
             for path in sorted(root.rglob(KERNEL_FILES))}
 
 
-def _folder_of_state(files: Iterable[Path]) -> Path:
-    """Return the folder for the code of these sources, versions and processor."""
+def _folder_of_state(path: Path) -> Path:
+    """Return the folder for the code of this file and those that it imports, of these versions and this processor."""
     import llvmlite.binding as llvm
     import numba
     import numpy as np
@@ -109,10 +115,21 @@ def _folder_of_state(files: Iterable[Path]) -> Path:
     processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     environment = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
     digest.update(repr((sys.version, numba.__version__, np.__version__, processor, environment)).encode())
-    for path in (Path(omnid.core.__path__[0]) / "compiled.py", *files):
+    for source in (Path(omnid.core.__path__[0]) / "compiled.py", *_with_imported(path)):
         # numba compares the times of files, and names its own files by their paths.
-        digest.update(repr((str(path), path.stat().st_mtime_ns)).encode() + path.read_bytes())
-    return cache_folder() / f"kernels-{digest.hexdigest()[:20]}"
+        digest.update(repr((str(source), source.stat().st_mtime_ns)).encode() + source.read_bytes())
+    return cache_folder() / f"kernels-{path.stem.removesuffix('_kernels')}-{digest.hexdigest()[:20]}"
+
+
+def _with_imported(path: Path) -> list[Path]:
+    """Return a file and all others with compiled functions that it imports, also by way of each other."""
+    files, found, queue = _kernel_files(), [path], [path]
+    while queue:
+        text = queue.pop().read_text("utf-8")
+        imported = [files[name] for name in _IMPORTED.findall(text) if name in files]
+        queue += [file for file in imported if file not in found]
+        found += [file for file in imported if file not in found]
+    return [path, *sorted(found[1:])]
 
 
 def _why_unusable(folder: Path) -> str:
@@ -128,31 +145,33 @@ def _why_unusable(folder: Path) -> str:
     return ""
 
 
-def _compile_into(folder: Path | None) -> None:
-    """Compile all functions that are not in the folder; None: keep none."""
+def _functions_of(name: str) -> list[Kernel[..., Any]]:
+    """Return the compiled functions of a file (name of its module)."""
+    return [kernel for kernel in declared() if kernel.function.__module__ == name]
+
+
+def _compile_into(name: str, folder: Path | None) -> None:
+    """Compile the functions of a file that are not in the folder; None: keep none."""
     import numba
 
     if folder is not None:
         numba.config.CACHE_DIR = str(folder)
-    for kernel in declared():
+    for kernel in _functions_of(name):
         kernel.compile(kept=folder is not None)
 
 
-def _compile_and_publish(folder: Path) -> None:
-    """Compile all functions into a new folder, and give it its name."""
+def _compile_and_publish(name: str, folder: Path) -> None:
+    """Compile the functions of a file into a new folder, and give it its name."""
     making = Path(tempfile.mkdtemp(prefix="making-", dir=folder.parent))
     try:
-        _compile_into(making)
-        digests = json.dumps(_digests(making))
-        with open(making / DIGESTS, "x") as file:
-            file.write(digests)
+        _compile_into(name, making)
+        (making / DIGESTS).write_text(json.dumps(_digests(making)))
         if folder.exists():  # damaged, or another program was faster
             folder.rename(making / "before")
         making.rename(folder)
         shutil.rmtree(folder / "before", ignore_errors=True)
     finally:
         shutil.rmtree(making, ignore_errors=True)
-    _remove_others(folder)
 
 
 def _digests(folder: Path) -> dict[str, str]:
@@ -175,14 +194,14 @@ def _is_intact(folder: Path) -> bool:
         return False
 
 
-def _remove_others(folder: Path) -> None:
+def _remove_others(used: set[Path]) -> None:
     """Remove the folders of other states beyond MAX_FOLDERS, the oldest first, and what was left half made."""
     with suppress(OSError):
-        others = sorted((path for path in folder.parent.glob("kernels-*") if path != folder),
+        others = sorted((path for path in cache_folder().glob("kernels-*") if path not in used),
                         key=lambda path: path.stat().st_mtime, reverse=True)
         for path in others[MAX_FOLDERS:]:
             shutil.rmtree(path, ignore_errors=True)
         day_ago_s = time.time() - 86400
-        for path in folder.parent.glob("making-*"):
+        for path in cache_folder().glob("making-*"):
             if path.stat().st_mtime < day_ago_s:
                 shutil.rmtree(path, ignore_errors=True)

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from omnid.engine import kernel_cache
+
 # One function of its own, so that a test takes a second: the files of core compile in conftest.py already.
 PROGRAM = """
 import logging, sys
@@ -34,40 +36,40 @@ def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
                           env=environment, cwd=Path(__file__).parents[3])
 
 
-def test_functions_are_compiled_once_and_read_from_then_on(tmp_path: Path) -> None:
-    first, second = run(tmp_path / "cache"), run(tmp_path / "cache")
-    assert first.stdout.splitlines()[0].startswith("INFO compiling 1 functions")
-    assert first.stdout.splitlines()[1].startswith("INFO compiled in ")
-    assert first.stdout.splitlines()[2:] == ["[1.5, 2.5] 0"]
+def test_functions_are_compiled_once_and_damaged_files_are_never_read(tmp_path: Path) -> None:
+    for index in range(kernel_cache.MAX_FOLDERS + 9):
+        old = tmp_path / f"kernels-{index}"
+        old.mkdir()
+        os.utime(old, (index, index))
+    first, second = run(tmp_path), run(tmp_path)
+    lines = first.stdout.splitlines()
+    assert lines[0].startswith("INFO compiling 1 functions") and lines[1].startswith("INFO compiled in ")
+    assert lines[2:] == ["[1.5, 2.5] 0"]
     assert second.stdout.splitlines() == ["[1.5, 2.5] 1"], second.stderr
+    kept = {path.name for path in tmp_path.iterdir()}
+    assert len(kept) == kernel_cache.MAX_FOLDERS + 1 and "kernels-40" in kept and "kernels-0" not in kept
 
-
-def test_damaged_files_are_never_read(tmp_path: Path) -> None:
-    run(tmp_path)
-    (folder,) = tmp_path.glob("kernels-*")
+    (folder,) = tmp_path.glob("kernels-sample-*")
     code = next(folder.rglob("*.nbc"))
     damaged = bytearray(code.read_bytes())
     damaged[len(damaged) // 2] ^= 0xFF
     code.write_bytes(damaged)
     again = run(tmp_path)
-    assert again.stdout.splitlines()[0].startswith("INFO compiling") and again.stdout.endswith("[1.5, 2.5] 0\n")
+    assert again.stdout.startswith("INFO compiling") and again.stdout.endswith("[1.5, 2.5] 0\n")
+    assert kernel_cache._is_intact(folder)
     (folder / "digests.json").write_text("{")
-    assert run(tmp_path).stdout.startswith("INFO compiling")
-    assert run(tmp_path).stdout == "[1.5, 2.5] 1\n"
-    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+    assert not kernel_cache._is_intact(folder)
 
 
 def test_a_folder_that_cannot_be_used_gives_a_warning(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    for folder, reason in ((tmp_path / "file", "File exists"), (tmp_path / "open", "others can write")):
-        if folder.name == "open":
-            folder.mkdir()
-            folder.chmod(0o777)
-        done = run(folder)
-        assert "WARNING the compiled functions cannot be kept" in done.stdout and reason in done.stdout
-        assert "OMNID_CACHE_DIR" in done.stdout
-        assert done.stdout.endswith("[1.5, 2.5] 0\n"), done.stderr
-    assert not list((tmp_path / "open").iterdir())
+    assert kernel_cache._why_unusable(tmp_path / "file") == "File exists"
+    tmp_path.chmod(0o777)
+    done = run(tmp_path)
+    assert "WARNING the compiled functions cannot be kept" in done.stdout and "others can write" in done.stdout
+    assert "OMNID_CACHE_DIR" in done.stdout
+    assert done.stdout.endswith("[1.5, 2.5] 0\n"), done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
@@ -77,11 +79,9 @@ def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
     assert "OmnidError: the system allows no code that is compiled at run time: remove MemoryDenyWrite" in done.stderr
 
 
-def test_old_folders_are_removed(tmp_path: Path) -> None:
-    for index in range(7):
-        old = tmp_path / f"kernels-{index}"
-        old.mkdir()
-        os.utime(old, (index, index))
-    run(tmp_path)
-    kept = {path.name for path in tmp_path.iterdir()}
-    assert len(kept) == 5 and {f"kernels-{index}" for index in (3, 4, 5, 6)} < kept
+def test_a_file_is_compiled_again_where_one_that_it_imports_changed() -> None:
+    files = kernel_cache._kernel_files()
+    found = kernel_cache._with_imported(files["omnid.core.odometry.landmark_kernels"])
+    assert [path.stem for path in found] == ["landmark_kernels", "pose_kernels"]
+    assert kernel_cache._with_imported(files["omnid.core.odometry.patch_kernels"]) == [
+        files["omnid.core.odometry.patch_kernels"]]
