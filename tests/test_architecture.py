@@ -91,7 +91,7 @@ ARROWS: Mapping[str, str] = {
         "calib.panorama calib.se3 drivers.motion omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",
     "omnid.core.places":
-        "calib.panorama calib.se3 omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings "
+        "calib.panorama calib.se3 omnid.core omnid.core.mapping omnid.core.odometry omnid.core.stereo omnid.settings "
         "omnid.tracking_state",
     "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
-from omnid.core.places.descriptors import describe_patches
+from omnid.core.places.descriptor_kernels import describe as kernel
+from omnid.core.places.descriptors import _cell_weights, describe_patches
 from tests.omnid.core.scenery import texture, wrapped
 
 PIXELS = np.array([[60.0, 50], [150, 60], [240, 70], [330, 55], [2, 60]])
@@ -45,3 +47,19 @@ def test_no_patches_and_no_contrast_are_no_error() -> None:
     blank = wrapped(np.full((120, 480), 90, np.uint8))
     assert describe_patches(blank, PIXELS[:0], SIDES[:0]).shape == (0, 128)
     assert not describe_patches(blank, PIXELS, SIDES).any()
+
+
+@pytest.mark.parametrize("angle", np.arange(-3.1, 3.2, 0.31).tolist())
+def test_the_gradient_of_a_ramp_counts_in_the_two_directions_beside_its_own(angle: float) -> None:
+    y, x = np.mgrid[:18, :18].astype(np.float32)
+    found = np.zeros((1, 128), np.uint8)
+    kernel((5 * np.float32(np.cos(angle)) * x + 5 * np.float32(np.sin(angle)) * y)[None], _cell_weights(), found)
+    cells = found.reshape(16, 8).astype(int)
+    direction = (angle / (2 * np.pi) * 8) % 8
+    low, high = int(direction), (int(direction) + 1) % 8
+    assert not np.delete(cells, [low, high], axis=1).any() and cells[:, [low, high]].any(axis=1).all()
+    nearer, farther = (low, high) if direction % 1 < 0.5 else (high, low)
+    assert (cells[:, nearer] >= cells[:, farther]).all()
+    # Shares at the rim of the window are below the limit of a histogram's entries.
+    ratio = (cells[0, farther] / cells[0, nearer]) ** 2
+    assert abs(ratio - min(direction % 1, 1 - direction % 1) / max(direction % 1, 1 - direction % 1)) < 0.05
