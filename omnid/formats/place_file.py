@@ -18,13 +18,13 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_map import UNUSED, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.errors import OmnidError
 from omnid.formats import place_rows
 from omnid.formats.place_rows import BadRowError
 
-VERSION: Final = 1  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+VERSION: Final = 2  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
@@ -33,7 +33,8 @@ MAX_KEYFRAMES: Final = 100_000
 MAX_LINKS: Final = 1_000_000
 MAX_STEPS: Final = 50  # blocks of a million instructions that SQLite may take to read a map
 SCHEMA: Final = {
-    "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, T_map_rect BLOB, "
+    "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
+                "missed INTEGER, T_map_rect BLOB, "
                 "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
                 "crc32 INTEGER)",
     "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
@@ -111,7 +112,8 @@ def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
         for text in SCHEMA.values():
             database.execute(text)
         ids = sorted(places.keyframes)
-        keyframes = (place_rows.keyframe_row(places.keyframes[id], places.poses[id]) for id in ids)
+        keyframes = (place_rows.keyframe_row(places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED))
+                     for id in ids)
         _insert(database, "keyframe", keyframes)
         _insert(database, "link", (place_rows.link_row(link) for link in places.links))
         _insert(database, "map", [place_rows.map_row(rig, len(ids), len(places.links), places.dropped)])
@@ -179,9 +181,11 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
     for name, found, expected in (("keyframes", len(keyframes), head.keyframes), ("links", len(links), head.links)):
         if found != expected:
             raise BadRowError(f"expected {expected} {name}, found {found}")
-    _check(keyframes, links)
-    for keyframe, T_map_rect in keyframes:
+    _check([(keyframe, T_map_rect) for keyframe, T_map_rect, _ in keyframes], links)
+    for keyframe, T_map_rect, use in keyframes:
         places.keyframes[keyframe.id], places.poses[keyframe.id] = keyframe, T_map_rect
+        if use != UNUSED:
+            places.uses[keyframe.id] = use
     places.links, places.dropped = links, head.dropped
     return places, head.rig
 

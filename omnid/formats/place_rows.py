@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
-from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe
 from omnid.core.places.place_rig import PlaceRig
 
 Array = NDArray[np.float64]
@@ -52,10 +52,10 @@ def checksum(row: Row) -> int:
     return crc
 
 
-def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array) -> Row:
+def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse) -> Row:
     """Return the row of a keyframe."""
     features = keyframe.features
-    return (keyframe.id, keyframe.session, keyframe.stamp_ns, _bytes(T_map_rect[:3], "<f8"),
+    return (keyframe.id, keyframe.session, keyframe.stamp_ns, use.found, use.missed, _bytes(T_map_rect[:3], "<f8"),
             _bytes(keyframe.T_odom_rect[:3], "<f8"), _bytes(keyframe.covariance, "<f8"),
             _bytes(keyframe.thumbnail, "i1"), _bytes(keyframe.scan, "<f2"), _bytes(features.descriptors, "u1"),
             _bytes(features.views, "<f4"))
@@ -84,9 +84,12 @@ def read_map_row(row: Row) -> Head:
     return Head(rig, _integer(keyframes), _integer(links), _integer(dropped))
 
 
-def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array]:
-    """Return a keyframe and its pose T_map_rect (4, 4). Raises BadRowError. Poses and covariance are not checked."""
-    id, session, stamp_ns, T_map_rect, T_odom_rect, covariance, thumbnail, scan, descriptors, views = row
+def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array, KeyframeUse]:
+    """Return a keyframe, its pose T_map_rect (4, 4) and its use. Raises BadRowError.
+
+    Poses and covariance are not checked.
+    """
+    id, session, stamp_ns, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan, descriptors, views = row
     ranges = _array(scan, "<f2", (SECTORS,))
     if not (np.isnan(ranges) | ((ranges >= 0) & (ranges <= MAX_RANGE_M))).all():
         raise BadRowError(f"a range of keyframe {id!r} is outside 0 to {MAX_RANGE_M:g} m")
@@ -102,7 +105,7 @@ def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array]:
     keyframe = PlaceKeyframe(_integer(id), _integer(session), _integer(stamp_ns, -MAX_INTEGER),
                              _transform(T_odom_rect), _array(covariance, "<f8", (6, 6)),
                              _array(thumbnail, "i1", THUMBNAIL), ranges, features)
-    return keyframe, _transform(T_map_rect)
+    return keyframe, _transform(T_map_rect), KeyframeUse(_integer(found), _integer(missed))
 
 
 def read_link_row(row: Row) -> Link:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
@@ -30,7 +31,7 @@ from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 
-WAIT_FACTOR: Final = 1.5  # of the distance between keyframes: then one is added where odometry adds none
+WAIT_FACTOR: Final = 2.0  # of the distance between keyframes: then one is added where odometry adds none
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
 SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
 SEARCHES: Final = 10  # after which only new keyframes are searched for
@@ -85,6 +86,7 @@ class MapLocaliser:
                           round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed))
         self.search = PlaceSearch(model)
         self.correction = MapCorrection(self.places)
+        self.ageing = Ageing(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
         # Parts of the map between which no pose is known have numbers; this run begins a new part.
         self._part_of = dict.fromkeys(self.places.keyframes, 0)
@@ -120,6 +122,7 @@ class MapLocaliser:
             # 3. Correct the map where several frames agree.
             if found is not None and self._newest is not None:
                 self._close_loop(frame, found, self._newest)
+                self._age(found)
         # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
         if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan)
@@ -131,7 +134,7 @@ class MapLocaliser:
     def counts(self) -> dict[str, int]:
         """Sizes and counters, for the status."""
         return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
-                "dropped": self.places.dropped, "rejected": self.correction.rejected,
+                "dropped": self.places.dropped, "aged": self.ageing.aged, "rejected": self.correction.rejected,
                 "unjoined": len(set(self._part_of.values())) - 1 if self._part_of else 0,
                 "ambiguous": self.search.ambiguous, "refused": self.search.refused}
 
@@ -219,10 +222,22 @@ class MapLocaliser:
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._part_of[keyframe.id], self._path_at[keyframe.id] = self._part, self._path_m
         self._newest = keyframe
+        self._forget_dropped()
+
+    def _forget_dropped(self) -> None:
+        """Forget the keyframes that are no longer in the map."""
         if self.places.keyframes.keys() != self._part_of.keys():
             self._part_of = {id: part for id, part in self._part_of.items() if id in self.places.keyframes}
             self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
             self.search.forget(self.places)
+
+    def _age(self, found: Recognition) -> None:
+        """Count what the search found and missed at a place that is known; what has aged leaves the map."""
+        if self._localize_only or self._state() is not MapState.LOCALIZED or found.id not in self.places.poses:
+            return
+        at = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3]
+        self.ageing.observe(at, self.search.compared, self._path_m)
+        self._forget_dropped()
 
     def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
         """Link a recognised place, once several frames agree, and correct the map."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib import se3
 
@@ -75,6 +77,16 @@ class Link:
         return Link(self.a, other.b, self.T_a_b @ other.T_a_b, covariance, weakest)
 
 
+class KeyframeUse(NamedTuple):
+    """Visits at which a keyframe was recognised, and visits since the last one of them at which it was not."""
+
+    found: int = 0
+    missed: int = 0
+
+
+UNUSED: Final = KeyframeUse()
+
+
 class PlaceMap:
     """Keyframes by id with their poses T_map_rect, and the links between them; bounded in count and bytes."""
 
@@ -83,6 +95,7 @@ class PlaceMap:
         self.keyframes: dict[int, PlaceKeyframe] = {}
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
+        self.uses: dict[int, KeyframeUse] = {}  # by id; none: UNUSED
         self.dropped = 0  # keyframes, because the map was full
 
     def __len__(self) -> int:
@@ -110,14 +123,15 @@ class PlaceMap:
     def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
         """Add a keyframe with the link of odometry that leads to it; None where there is no such link.
 
-        A full map drops the keyframe that has the nearest neighbour, the older one of both.
+        A full map drops one of the two keyframes that are nearest to each other: the one that was recognised at fewer
+        visits, less those it was missed at since; the older one of equal ones.
         """
         self.keyframes[keyframe.id] = keyframe
         self.poses[keyframe.id] = T_map_rect
         if link is not None:
             self.links.append(link)
         while len(self) > max(2, self._max_keyframes) or (len(self) > 2 and self.nbytes > self._max_bytes):
-            self.drop(self._most_redundant(keyframe.id))
+            self.drop(self._least_useful(keyframe.id))
             self.dropped += 1
 
     def drop(self, id: int) -> None:
@@ -132,15 +146,20 @@ class PlaceMap:
             self.links += [link if link.a < link.b else link.reversed()
                            for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])]
         del self.keyframes[id], self.poses[id]
+        self.uses.pop(id, None)
 
-    def _most_redundant(self, newest: int) -> int:
-        """Return the id of the keyframe, not the newest, that is nearest to another one; the older one of two."""
+    def _least_useful(self, newest: int) -> int:
+        """Return the id of the keyframe that is to be dropped, not the newest."""
         ids = [id for id in self.keyframes if id != newest]
-        at = np.array([self.poses[id][:3, 3] for id in ids])
-        squared = (at**2).sum(axis=1)
-        apart = squared[:, None] + squared[None] - 2 * at @ at.T
-        np.fill_diagonal(apart, np.inf)
-        return ids[int(apart.min(axis=1).argmin())]
+        apart, neighbour = cKDTree(self.positions(ids)).query(self.positions(ids), k=2)
+        nearest = int(apart[:, 1].argmin())
+        # Where several are at one position, the second of them may be found first.
+        pair = sorted({ids[nearest], *(ids[int(n)] for n in neighbour[nearest])})
+        return min(pair, key=self._usefulness)
+
+    def _usefulness(self, id: int) -> int:
+        use = self.uses.get(id, UNUSED)
+        return use.found - use.missed
 
     def bound(self, max_keyframes: int, max_bytes: int) -> None:
         """Set other bounds, which hold from the next keyframe on."""
@@ -153,6 +172,7 @@ class PlaceMap:
         part.keyframes = {id: keyframe for id, keyframe in self.keyframes.items() if id in chosen}
         part.poses = {id: self.poses[id] for id in part.keyframes}
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
+        part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
         return part
 
     def move(self, poses: dict[int, Array]) -> None:

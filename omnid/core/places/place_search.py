@@ -49,6 +49,7 @@ class PlaceSearch:
         self._signatures: dict[int, Signature] = {}
         self.ambiguous = 0  # frames that fit two places equally well
         self.refused = 0  # recognitions that odometry contradicts
+        self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
 
     def near(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
              ) -> Recognition | None:
@@ -80,6 +81,7 @@ class PlaceSearch:
         The search ends at a recognition with enough inliers.
         """
         places, ids = among
+        self.compared = {}
         if not ids:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
@@ -89,6 +91,7 @@ class PlaceSearch:
         for n in chosen:
             there = places.keyframes[ids[n]].features
             place = recognise(features, there, ids[n], float(turns_rad[n]), self._model)
+            self.compared[ids[n]] = 0 if place is None else place.inliers
             if place is not None:
                 found.append(place)
                 if place.inliers >= enough:

@@ -71,6 +71,7 @@ def keep_only(places: PlaceMap, ids: Set[int]) -> None:
     places.links = [link for link in places.links if link.a in ids and link.b in ids]
     for id in places.keyframes.keys() - ids:
         del places.keyframes[id], places.poses[id]
+        places.uses.pop(id, None)
 
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:

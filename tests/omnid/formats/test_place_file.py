@@ -41,7 +41,7 @@ def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
     places = some_places(count)
     write_places(tmp_path / "a.omap", places, RIG)
     read, rig = read_places(tmp_path / "a.omap")
-    assert same(rig, RIG) and read.dropped == places.dropped
+    assert same(rig, RIG) and read.dropped == places.dropped and read.uses == places.uses
     assert list(read.keyframes) == list(places.keyframes)
     assert all(same(read.keyframes[id], places.keyframes[id]) for id in places.keyframes)
     assert all(same(read.poses[id], places.poses[id]) for id in places.keyframes)
@@ -114,7 +114,7 @@ def changed(path: Path, *statements: str) -> Path:
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ("PRAGMA user_version = 2", "version 2, expected 1"),
+        ("PRAGMA user_version = 1", "version 1, expected 2"),
         ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
         ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
         ("DELETE FROM keyframe WHERE id = 3", "expected 4 keyframes, found 3"),
@@ -133,7 +133,7 @@ def test_a_map_that_was_changed_is_refused(tmp_path: Path, statement: str, messa
 def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
     path = tmp_path / "a.omap"
     endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x FROM n"
-    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 1",
+    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 2",
             *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map")))
     with pytest.raises(OmnidError, match="tables are not those"):
         read_places(path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 
 
 def keyframe(number: int, features: int = 10) -> PlaceKeyframe:
@@ -82,3 +82,12 @@ def test_edges_turned_round_and_joined_keep_their_uncertainty() -> None:
     turned = se3.inverse(first.T_a_b @ se3.exp(noise[0]))
     np.testing.assert_allclose(np.cov(se3.log(se3.inverse(back.T_a_b) @ turned).T), back.covariance, atol=2e-5)
     assert (back.a, back.b) == (1, 0)
+
+
+def test_a_full_map_keeps_what_was_recognised_more_often() -> None:
+    places = PlaceMap(max_keyframes=4)
+    for number, x in enumerate((0.0, 1.0, 1.1, 2.0)):
+        places.add(keyframe(number), pose(x))
+    places.uses = {1: KeyframeUse(2, 0), 2: KeyframeUse(3, 2), 3: KeyframeUse(0, 5)}
+    places.add(keyframe(4), pose(3.0))
+    assert list(places.keyframes) == [0, 1, 3, 4] and set(places.uses) == {1, 3}
