@@ -136,9 +136,10 @@ ARROWS: Mapping[str, str] = {
     "omnid.settings_dump": "omnid.settings",
     "omnid.settings_migration": "omnid.settings",
     "omnid.simulation":
-        "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.errors drivers.frame drivers.motor "
-        "drivers.motors.protocols drivers.motors.simulated omnid.config omnid.controller omnid.core.control "
-        "omnid.engine omnid.errors omnid.messages omnid.runs omnid.simulation.rendering omnid.stages",
+        "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.errors drivers.frame "
+        "drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated omnid.config "
+        "omnid.controller omnid.core.control omnid.core.navigation omnid.engine omnid.errors omnid.formats "
+        "omnid.messages omnid.runs omnid.simulation.rendering omnid.sinks omnid.stages",
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":

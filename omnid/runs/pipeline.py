@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
@@ -29,7 +30,6 @@ from omnid.stages.places import Places
 from omnid.stages.rig_gate import RigGate, never
 from omnid.stages.routes import Routes, RouteStore
 from omnid.stages.stereo import Stereo
-from omnid.transport.navigation_commands import RequestQueue
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +58,20 @@ class Sinks:
     record_depth: int | None = None  # messages of each kind that may wait for the recorder
 
 
+class RequestSource(Protocol):
+    """Requests to the navigation; `end` ends `batches`."""
+
+    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
+        """Yield requests."""
+
+    def end(self) -> None:
+        """End `batches`; from any thread."""
+
+
 class NavigationParts(NamedTuple):
     """The surroundings of the navigation of a run with wheels."""
 
-    requests: RequestQueue | None  # None: its caller gives requests to the stage
+    requests: RequestSource | None  # None: its caller gives requests to the stage
     wheels: Callable[[], WheelState]
     drive: Sink[NavigationUpdate]
     routes: RouteStore

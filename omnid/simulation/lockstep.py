@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeAlias, TypeVar
+from pathlib import Path
+from typing import Final, Generic, Literal, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -17,26 +18,36 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.rig import Rig
 from drivers.frame import Frame
+from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.statistics import ControllerState
 from omnid.core.control.arming import ArmRequest
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.requests import NavigationCommand
+from omnid.core.navigation.requests import Request as NavigationRequest
+from omnid.core.navigation.situation import WheelState
+from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph
-from omnid.messages import ObstacleRing, OdometryUpdate
-from omnid.runs.pipeline import Sinks, wire
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.formats.route_file import RouteFolder
+from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.runs.pipeline import NavigationParts, Sinks, wire
+from omnid.runs.place_maps import RunPlaces
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
+from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
 from omnid.stages.odometry import of_base
 from omnid.stages.synchronise import Synchronise
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
+STOPPING_NS: Final = 2_000_000_000  # at the end, in which the wheels come to rest
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +56,15 @@ class Moment:
 
     time_s: float  # since the start
     T_world_base: Array  # (4, 4) true
+    controller: ControllerState
     odometry: OdometryUpdate | None  # the newest
     T_odom_base: Array  # (4, 4) of it; the identity without one
-    controller: ControllerState
+    navigation: NavigationUpdate | None  # the newest
+    place: PlaceUpdate | None  # the newest
 
 
-# A setpoint of the operator, a request to arm, or a stop.
-Request: TypeAlias = Setpoint | Literal["arm", "stop"]
+# A setpoint of the operator, a request to arm, a stop, or a request to the navigation.
+Request: TypeAlias = Setpoint | Literal["arm", "stop"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 
@@ -76,6 +89,9 @@ class SimulatedRun:
     ticks: tuple[Tick, ...]
     lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
     rings: tuple[ObstacleRing, ...]
+    navigation: tuple[NavigationUpdate, ...]
+    places: tuple[PlaceUpdate, ...]
+    T_base_rig: Array  # (4, 4)
 
     @property
     def truth_in_odom(self) -> Array:
@@ -97,7 +113,12 @@ class SimulatedRun:
 
 def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: float, seed: int = 0,
              config: Config | None = None, faults: Iterable[Fault] = ()) -> SimulatedRun:
-    """Drive for so many seconds of simulated time and return the run."""
+    """Drive for so many seconds of simulated time and return the run.
+
+    A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
+    where there is one. Raises OmnidError as `omnid run` does.
+    """
+    prepare_kernels(nothing)
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -113,31 +134,39 @@ class _Lockstep:
         self._rig = with_masks(robot.rig)
         self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed)
         self._vehicle = Vehicle(world, robot, config, seed)
-        self._odometry: OdometryUpdate | None = None
-        self._T_odom_base = np.eye(4)
+        self._delay_ns = round(robot.pose_delay_s * 1e9)
+        self._requests = LockstepRequests()
         self._truth: dict[int, Array] = {}
+        self._odometry: OdometryUpdate | None = None
         self._poses: list[tuple[int, Array, str]] = []
         self._rings: list[ObstacleRing] = []
+        self._navigation: list[NavigationUpdate] = []
+        self._places: list[PlaceUpdate] = []
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
         config, vehicle = self._config, self._vehicle
         graph = Graph(threaded=False)
-        frames = graph.source("cameras", lambda: self._frames(seconds))
+        frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
         pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
-        wire(graph, pairs, shape, config, Sinks(poses={"poses": _Take(self._take_pose)},
-                                                rings={"rings": _Take(self._take_ring)}))
+        run_places = RunPlaces(config, shape, nothing)
+        parts = NavigationParts(self._requests, self._wheels, Take(self._take_navigation),
+                                RouteFolder(Path(config.navigation.routes)), config.places.map)
+        sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)}, navigation=parts,
+                      places={"in map": Take(self._places.append)} if config.places.map else {})
+        wire(graph, pairs, shape, config, run_places.known_to(sinks))
         graph.run()
+        run_places.finish()
         return SimulatedRun(
             np.array([stamp for stamp, _, _ in self._poses], np.int64),
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
             np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
             tuple(state for _, _, state in self._poses), tuple(vehicle.log.ticks), tuple(vehicle.log.lines),
-            tuple(self._rings))
+            tuple(self._rings), tuple(self._navigation), tuple(self._places), self._rig.T_base_rig)
 
-    def _frames(self, seconds: float) -> Iterator[Frame]:
-        """Advance the robot from pair to pair; the stages work while the frames are yielded."""
+    def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
+        """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
         vehicle, period_s = self._vehicle, 1.0 / self._robot.rate_hz
         for seq in range(int(seconds / period_s)):
             stamp_ns = START_NS + round(seq * period_s * 1e9)
@@ -145,9 +174,11 @@ class _Lockstep:
             vehicle.advance(stamp_ns)
             self._send()
             self._truth[stamp_ns] = vehicle.T_world_base
+            yield from vehicle.take_samples()
             yield from self._pair(seq, stamp_ns)
         vehicle.controller.end()
-        vehicle.advance(vehicle.now_ns + 2_000_000_000)
+        vehicle.advance(vehicle.now_ns + STOPPING_NS)
+        self._requests.end()
 
     def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
         T_world_rig = self._vehicle.T_world_base @ self._rig.T_base_rig
@@ -164,41 +195,79 @@ class _Lockstep:
     def _send(self) -> None:
         """Send what the drive asks for now."""
         vehicle, controller = self._vehicle, self._vehicle.controller
-        moment = Moment(vehicle.time_s, vehicle.T_world_base, self._odometry, self._T_odom_base, controller.state)
+        moment = Moment(vehicle.time_s, vehicle.T_world_base, controller.state, self._odometry,
+                        self._poses[-1][1] if self._poses else np.eye(4), _newest(self._navigation),
+                        _newest(self._places))
         arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
         for request in self._drive(moment):
             if isinstance(request, Setpoint):
                 controller.set_command(TimedSetpoint(arrival_ns, request))
             elif request == "arm":
                 controller.arm(ArmRequest(arrival_ns))
-            else:
+            elif request == "stop":
                 controller.stop(arrival_ns)
+            else:
+                self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns))
+
+    def _wheels(self) -> WheelState:
+        state = self._vehicle.controller.state
+        return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source)
 
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig = self._rig.T_base_rig
-        self._odometry, self._T_odom_base = odometry, of_base(odometry, T_base_rig)[0]
-        self._poses.append((odometry.stamp_ns, self._T_odom_base, odometry.state))
+        self._odometry = odometry
+        self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state))
         pose = controller_pose(odometry, T_base_rig)
-        delay_ns = round(self._robot.pose_delay_s * 1e9)
-        self._vehicle.post(odometry.stamp_ns + delay_ns, lambda: self._vehicle.controller.set_pose(pose))
-
+        self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_pose(pose))
 
     def _take_ring(self, ring: ObstacleRing) -> None:
         self._rings.append(ring)
-        newest = controller_ring(ring)
-        delay_ns = round(self._robot.pose_delay_s * 1e9)
-        self._vehicle.post(ring.stamp_ns + delay_ns, lambda: self._vehicle.controller.set_ring(newest))
+        seen = controller_ring(ring)
+        self._vehicle.post(ring.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_ring(seen))
+
+    def _take_navigation(self, update: NavigationUpdate) -> None:
+        self._navigation.append(update)
+        if update.setpoint is not None:
+            due_ns = self._vehicle.now_ns + self._delay_ns
+            command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)
+            self._vehicle.post(due_ns, lambda: self._vehicle.controller.set_command(command))
 
 
-class _Take(Generic[T]):
+class LockstepRequests:
+    """Requests to the navigation, as a source that never waits: it gives those that came since its last turn."""
+
+    def __init__(self) -> None:
+        self._waiting: list[NavigationCommand] = []
+        self._ended = False
+
+    def put(self, command: NavigationCommand) -> None:
+        """Add a request."""
+        self._waiting.append(command)
+
+    def end(self) -> None:
+        """End `batches`."""
+        self._ended = True
+
+    def batches(self) -> Iterator[list[NavigationCommand]]:
+        """Yield the requests of each turn, mostly none."""
+        while not self._ended:
+            taken, self._waiting = self._waiting, []
+            yield taken
+
+
+class Take(Generic[T]):
     """A sink that calls a function."""
 
     def __init__(self, take: Callable[[T], None]) -> None:
         self._take = take
 
-    def process(self, message: T) -> None:
+    def process(self, message: T, /) -> None:
         """Take a message."""
         self._take(message)
+
+
+def _newest(messages: list[T]) -> T | None:
+    return messages[-1] if messages else None
 
 
 def with_masks(rig: Rig) -> Rig:

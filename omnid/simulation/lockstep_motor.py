@@ -18,13 +18,16 @@ class LockstepMotor:
         """Connect; DriverError where the controller does not take the watchdog's time."""
         self._protocol, self._controller, self._clock_ns = protocol, controller, clock_ns
         self._framer = protocol.framer()
+        self.status: MotorStatus | None = None  # the last reply
         self.cut = False  # fault: no byte arrives at either end
         self._run(protocol.connect(watchdog_ms))
         self._run(protocol.drive(stop_command(0), clock_ns() * 1e-9))
 
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Send a command and return the controller's reply; DriverError without one."""
-        return self._run(self._protocol.drive(command, self._clock_ns() * 1e-9))
+        self.status = None
+        self.status = self._run(self._protocol.drive(command, self._clock_ns() * 1e-9))
+        return self.status
 
     def close(self) -> None:
         """Stop the wheels."""

@@ -46,6 +46,7 @@ class GyroErrors:
 
     bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)
     noise_radps: float = 0.003
+    rate_hz: float = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,8 @@ class SimulatedRobot:
     limits: MotionLimits = field(default_factory=lambda: MotionLimits(acceleration_mps2=1.5, lag_s=0.06))
     wheels: WheelErrors = WheelErrors()
     gyro: GyroErrors = GyroErrors()
+    has_odometry: bool = True  # the daemon is given what the motor controller reports of its wheels
+    has_gyro: bool = True
     rate_hz: float = 10.0  # of the cameras
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
 

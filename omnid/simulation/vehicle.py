@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import heapq
+import math
+import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -11,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
@@ -64,6 +67,9 @@ class Vehicle:
         self._tick_ns = START_NS
         self._waiting: list[tuple[int, int, Callable[[], None]]] = []
         self._posted = 0
+        self._gyro_noise = random.Random(seed + 1)
+        self._gyro_ns = START_NS
+        self.samples: list[MotionSample] = []  # since they were taken
         self._robot, self._standing = robot, footprints(world.standing, robot.height_m)
 
     @property
@@ -83,22 +89,44 @@ class Vehicle:
         self._posted += 1
 
     def advance(self, until_ns: int) -> None:
-        """Advance to a time, with all ticks that are due until then."""
-        while self._tick_ns <= until_ns:
-            self._move(self._tick_ns)
-            while self._waiting and self._waiting[0][0] <= self.now_ns:
-                heapq.heappop(self._waiting)[2]()
-            self._tick()
-            self._tick_ns += self._period_ns
+        """Advance to a time, with all ticks and samples that are due until then."""
+        while (due_ns := min(self._tick_ns, self._gyro_ns)) <= until_ns:
+            self._move(due_ns)
+            if due_ns == self._gyro_ns:
+                self._gyro_ns += round(1e9 / self._robot.gyro.rate_hz)
+            if due_ns == self._tick_ns:
+                while self._waiting and self._waiting[0][0] <= self.now_ns:
+                    heapq.heappop(self._waiting)[2]()
+                self._tick()
+                self._tick_ns += self._period_ns
         self._move(until_ns)
 
+    def take_samples(self) -> list[MotionSample]:
+        """Return the samples of wheels and gyro since the last call."""
+        samples, self.samples = self.samples, []
+        return samples
+
     def _move(self, until_ns: int) -> None:
-        self.twin.base.advance((until_ns - self.now_ns) * 1e-9)
+        base, dt_s = self.twin.base, (until_ns - self.now_ns) * 1e-9
+        before_rad = base.pose[2]
+        base.advance(dt_s)
         self.now_ns = until_ns
-        self.people.advance(self.time_s, self.twin.base.pose[:2])
+        if self._robot.has_gyro and dt_s > 0.0:
+            self._sense_rotation(math.remainder(base.pose[2] - before_rad, math.tau) / dt_s)
+        self.people.advance(self.time_s, base.pose[:2])
+
+    def _sense_rotation(self, yaw_rate_radps: float) -> None:
+        """Add a sample of the gyro: the mean over the time since the last one."""
+        errors = self._robot.gyro
+        noise = [errors.noise_radps * self._gyro_noise.gauss(0.0, 1.0) for _ in range(3)]
+        x, y, z = (bias + wrong for bias, wrong in zip(errors.bias_radps, noise, strict=True))
+        self.samples.append(GyroSample(self.now_ns, x, y, z + yaw_rate_radps))
 
     def _tick(self) -> None:
         report = self.controller.tick()
+        status = self.motor.status
+        if self._robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
+            self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
         self.log.ticks.append(Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason,
                                    self._clearance_m()))
 

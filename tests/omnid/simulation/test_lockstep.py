@@ -10,6 +10,8 @@ import pytest
 
 from calib import se3
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, make_robot, with_slips
 from omnid.simulation.world_file import load_world
@@ -54,6 +56,21 @@ def test_a_motor_that_is_cut_off_stops_by_its_own_watchdog() -> None:
     assert places[1.5] - places[1.4] > 0.015
     assert places[2.9] == places[2.5]
     assert any("no answer" in line for _, line in run.lines)
+
+
+def test_a_goal_is_reached_by_the_true_robot() -> None:
+    asked: list[float] = []
+
+    def to_the_goal(moment: Moment) -> Iterator[Request]:
+        if moment.odometry is not None and not moment.controller.armed:
+            yield "arm"
+        elif moment.controller.armed and not asked:
+            asked.append(moment.time_s)
+            yield GoalRequest(NavigationFrame.ODOM, 0.5, 0.0)
+
+    run = simulate(WORLD, make_robot(SIZE), to_the_goal, seconds=5.0, seed=1)
+    assert run.navigation[-1].state is NavigationState.REACHED
+    assert np.hypot(*(run.truth_in_odom[-1][:2, 3] - (0.5, 0.0))) < 0.05
 
 
 def test_slipping_wheels_turn_farther_than_the_robot_drives() -> None:
