@@ -17,7 +17,7 @@ class WheelSample:
 
 @dataclass(frozen=True, slots=True)
 class GyroSample:
-    """Angular velocity of the base about its axes: x forward, y left, z up."""
+    """Angular velocity about the axes of the gyro; those of the base are x forward, y left, z up."""
 
     stamp_ns: int  # of the measurement, by the clock of the images' stamps
     x_radps: float

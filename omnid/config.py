@@ -15,6 +15,7 @@ from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
@@ -233,6 +234,7 @@ class Config:
     rig: RigConfig = field(default_factory=RigConfig)
     pair: PairConfig = field(default_factory=PairConfig)
     camera: TimingConfig = field(default_factory=TimingConfig)
+    motion: MotionSensorSettings = field(default_factory=MotionSensorSettings)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)

@@ -146,6 +146,7 @@ class OdometryUpdate:
     depth: StereoDepth
     features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
     light: Light = field(default_factory=Light)
+    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -48,7 +48,8 @@ ARROWS: Mapping[str, str] = {
     "drivers.errors": "",
     "drivers.events": "",
     "drivers.frame": "drivers.errors",
-    "drivers.logs": "drivers.errors drivers.events drivers.frame",
+    "drivers.imu": "drivers.errors drivers.motion",
+    "drivers.logs": "drivers.errors drivers.events drivers.frame drivers.motion",
     "drivers.motion": "",
     "drivers.motor": "",
     "drivers.motors": "drivers.errors drivers.motor drivers.motors.protocols",
@@ -79,8 +80,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "
         "omnid.settings_migration omnid.transport",
     "omnid.controller":
-        "drivers.errors drivers.motor drivers.motors drivers.motors.protocols drivers.motors.simulated "
-        "omnid.core.control omnid.engine omnid.errors omnid.settings",
+        "drivers.errors drivers.motion drivers.motor drivers.motors drivers.motors.protocols "
+        "drivers.motors.simulated omnid.core.control omnid.engine omnid.errors omnid.settings",
     "omnid.core": "",
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
@@ -96,13 +97,13 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.rig": "calib.fit calib.panorama calib.rig calib.se3 omnid.core.odometry omnid.core.stereo",
     "omnid.core.stereo": "calib.panorama omnid.settings",
     "omnid.diagnostics":
-        "calib.panorama drivers.cameras drivers.frame omnid.config omnid.controller omnid.core.control "
-        "omnid.core.odometry omnid.core.rig omnid.engine "
-        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
+        "calib.panorama drivers.cameras drivers.frame drivers.imu omnid.config omnid.controller omnid.core.control "
+        "omnid.core.odometry omnid.core.rig omnid.engine omnid.messages omnid.stages omnid.tracking_state "
+        "omnid.transport",
     "omnid.doctor":
         "calib.errors calib.rig_file drivers.cameras drivers.errors drivers.motor drivers.motors omnid.config "
         "omnid.controller omnid.engine omnid.errors omnid.transport",
-    "omnid.engine": "drivers.frame omnid.core omnid.errors omnid.settings",
+    "omnid.engine": "omnid.core omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.navigation omnid.core.places omnid.errors",
@@ -124,11 +125,10 @@ ARROWS: Mapping[str, str] = {
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
     "omnid.runs":
-        "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.logs "
-        "drivers.motor omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.navigation "
-        "omnid.core.places "
-        "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.messages omnid.refinement "
-        "omnid.settings_dump omnid.sinks "
+        "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.imu "
+        "drivers.logs drivers.motion drivers.motor omnid.config omnid.controller omnid.core.control "
+        "omnid.core.mapping omnid.core.navigation omnid.core.odometry omnid.core.places omnid.diagnostics "
+        "omnid.engine omnid.errors omnid.formats omnid.messages omnid.refinement omnid.settings_dump omnid.sinks "
         "omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
@@ -143,9 +143,10 @@ ARROWS: Mapping[str, str] = {
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":
-        "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motor omnid.config omnid.controller "
-        "omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.engine omnid.errors "
-        "omnid.formats omnid.messages omnid.navigation_state omnid.stages omnid.tracking_state omnid.transport",
+        "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motion drivers.motor omnid.config "
+        "omnid.controller omnid.core.control omnid.core.mapping omnid.core.places omnid.diagnostics omnid.engine "
+        "omnid.errors omnid.formats omnid.messages omnid.navigation_state omnid.stages omnid.tracking_state "
+        "omnid.transport",
     "omnid.stages":
         "calib.masks calib.models calib.panorama calib.rig calib.se3 drivers.errors drivers.frame drivers.motion "
         "drivers.motor omnid.config omnid.core.control omnid.core.mapping omnid.core.navigation omnid.core.obstacles "
@@ -153,8 +154,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.errors omnid.messages omnid.tracking_state",
     "omnid.tracking_state": "",
     "omnid.transport":
-        "calib.se3 drivers.frame drivers.logs omnid.core.control omnid.core.navigation omnid.errors omnid.settings "
-        "omnid.tracking_state",
+        "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motion omnid.core.control "
+        "omnid.core.navigation omnid.errors omnid.settings omnid.tracking_state",
     "omnid.version": "",
     "omnid.viewer":
         "calib.se3 drivers.errors drivers.frame drivers.logs omnid.client omnid.config omnid.core.odometry "

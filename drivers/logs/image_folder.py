@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.image_log import LogDamage, LoggedImage, images_of
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
@@ -76,6 +76,10 @@ class ImageFolder:
         return {topic: len(files) for topic, files in self._files.items()}
 
     def images(self) -> Iterator[LoggedImage]:
+        """Yield the images among the messages."""
+        return images_of(self)
+
+    def messages(self) -> Iterator[LoggedImage]:
         """Yield the images of all folders in the order of their stamps."""
         for file in sorted(file for files in self._files.values() for file in files):
             if self._closed:
@@ -96,7 +100,7 @@ class ImageFolder:
         return LogDamage()
 
     def close(self) -> None:
-        """End images()."""
+        """End messages()."""
         self._closed = True
 
 

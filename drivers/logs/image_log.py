@@ -1,4 +1,4 @@
-"""A log of images in any format: the messages that a reader of frames needs."""
+"""A log of images in any format: the messages that a reader of frames and of motion needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, Protocol
 
 from drivers.logs.ros_image import RosImage
+from drivers.logs.ros_motion import MotionReading
 
 
 class LoggedImage(NamedTuple):
@@ -14,6 +15,14 @@ class LoggedImage(NamedTuple):
     topic: str
     log_time_ns: int
     read: Callable[[], RosImage]  # raises FrameDecodeError or RecordError where there is no valid image
+
+
+class LoggedMotion(NamedTuple):
+    """A message of wheels or of an IMU that is not yet decoded."""
+
+    topic: str
+    log_time_ns: int
+    read: Callable[[], MotionReading]  # raises FrameDecodeError or RecordError where there is no valid message
 
 
 class LogDamage(NamedTuple):
@@ -34,14 +43,22 @@ class ImageLog(Protocol):
     def counts(self) -> Mapping[str, int] | None:
         """Return the number of messages of each topic; None where the log does not state it."""
 
+    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the images of all topics, and the messages of wheels and IMUs; ends early after close."""
+
     def images(self) -> Iterator[LoggedImage]:
-        """Yield the images of all topics; ends early after close."""
+        """Yield the images among the messages."""
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
 
     def damage(self) -> LogDamage:
-        """Return the faults found by the last call of images(), once that has ended."""
+        """Return the faults found by the last call of messages(), once that has ended."""
 
     def close(self) -> None:
         """Close the files; may be called twice."""
+
+
+def images_of(log: ImageLog) -> Iterator[LoggedImage]:
+    """Yield the images among the messages of a log."""
+    return (message for message in log.messages() if isinstance(message, LoggedImage))

@@ -1,7 +1,8 @@
-"""Reads the frames of two cameras from a log: MCAP, a bag of ROS 2 or ROS 1, or folders of images."""
+"""Reads the frames of two cameras, and samples of wheels and IMU, from a log: MCAP, bags of ROS, folders of images."""
 
 from __future__ import annotations
 
+import heapq
 import math
 import os
 from collections import Counter
@@ -10,20 +11,23 @@ from dataclasses import replace
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame
-from drivers.logs.image_log import LoggedImage
+from drivers.logs.image_log import LoggedImage, LoggedMotion
 from drivers.logs.log_formats import open_image_log
 from drivers.logs.mcap_records import RecordError
 from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import RosImage
-from drivers.logs.topic_choice import choose_topics
+from drivers.logs.topic_choice import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
+from drivers.motion import MotionSample
 
 _WARNINGS = {
     "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
+    "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
+MAX_WAITING_SAMPLES = 65_536  # of wheels and IMU: some minutes
 _COUNTERS = ("lower", "upper", *_WARNINGS)
 
 
@@ -36,23 +40,29 @@ class LogReader:
     path: as for `open_image_log`. lower, upper: topics, where their names do not identify the cameras. window: number
     of frames that are held back to sort them by stamp. span_s: the part of the log that is read, from and until so many
     seconds after the stamp of its first image. Raises DriverError where the path is no such log, or the topics
-    of the two cameras are ambiguous.
+    of the two cameras are ambiguous. motion: topics of wheels and IMU; None: their samples are not read.
 
-    During and after frames(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate', 'unstamped'
-    (log time used), 'broken' (messages without a valid image) and 'broken_records' (chunks or records of the file).
-    After its end `truncated` is True for an incomplete log, and `warnings` has one line per kind of fault.
+    During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
+    'unstamped' (log time used), 'broken' (messages without a valid image), 'broken_motion' and 'broken_records' (chunks
+    or records of the file). After its end `truncated` is True for an incomplete log, and `warnings` has one line per
+    kind of fault.
     """
 
     def __init__(
         self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32,
         span_s: tuple[float, float] = WHOLE,
+        motion: MotionTopics | None = None,
     ) -> None:
         self._window, self._closed, self._span_s = window, False, span_s
         self._log = open_image_log(path)
-        self._reset()
+        self._motion = MotionChoice(frozenset())
         try:
             wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
-            self._cameras = choose_topics(repr(self._log.name), self._log.topics(), wanted)
+            topics = self._log.topics()
+            self._cameras = choose_topics(repr(self._log.name), topics, wanted)
+            self._motion = MotionChoice(frozenset()) if motion is None else choose_motion_topics(
+                repr(self._log.name), topics, motion)
+            self._reset()
         except DriverError:
             self.close()
             raise
@@ -64,32 +74,46 @@ class LogReader:
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames of both cameras in the order of their stamps; seq counts each camera's from 0."""
+        return (message for message in self.messages() if isinstance(message, Frame))
+
+    def messages(self) -> Iterator[Frame | MotionSample]:
+        """Yield frames, and samples of wheels and IMU, in the order of their stamps."""
         self._reset()
         yield from self._in_span(self._sorted())
         if not self._closed:
             self._report()
 
-    def _sorted(self) -> Iterator[Frame]:
-        buffer = ReorderBuffer(self._window, self.counts)
-        for logged in self._log.images():
+    def _sorted(self) -> Iterator[Frame | MotionSample]:
+        buffer, samples = ReorderBuffer(self._window, self.counts), _Samples()
+        for logged in self._log.messages():
+            if isinstance(logged, LoggedMotion):
+                sample = self._sample(logged) if logged.topic in self._motion.names else None
+                if sample is not None:
+                    yield from samples.push(sample)
+                continue
             camera = self._cameras.get(logged.topic)
             image = None if camera is None else self._image(logged)
             if camera is not None and image is not None:
-                yield from buffer.push(camera, image)
+                for frame in buffer.push(camera, image):
+                    yield from samples.until(frame.stamp_ns)
+                    yield frame
         if not self._closed:
-            yield from buffer.drain()
+            for frame in buffer.drain():
+                yield from samples.until(frame.stamp_ns)
+                yield frame
 
-    def _in_span(self, frames: Iterator[Frame]) -> Iterator[Frame]:
-        """Yield the frames of the part that is read; others do not count, so that seq begins at 0 there."""
+    def _in_span(self, messages: Iterator[Frame | MotionSample]) -> Iterator[Frame | MotionSample]:
+        """Yield the messages of the part that is read; other frames do not count, so that seq begins at 0 there."""
         begin_s, end_s = self._span_s
         first_ns, at_s = None, 0.0
-        for frame in frames:
-            first_ns = frame.stamp_ns if first_ns is None else first_ns
-            at_s = 1e-9 * (frame.stamp_ns - first_ns)
+        for message in messages:
+            if isinstance(message, Frame):
+                first_ns = message.stamp_ns if first_ns is None else first_ns
+            at_s = 0.0 if first_ns is None else 1e-9 * (message.stamp_ns - first_ns)
             if begin_s <= at_s <= end_s:
-                yield frame
-            else:
-                self.counts[frame.camera] -= 1
+                yield message
+            elif isinstance(message, Frame):
+                self.counts[message.camera] -= 1
             if at_s > end_s:
                 return
         if first_ns is not None and at_s < begin_s:
@@ -113,9 +137,10 @@ class LogReader:
 
     def _reset(self) -> None:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
-        self.warnings: list[str] = []
+        self.warnings: list[str] = [self._motion.warning] if self._motion.warning else []
         self.truncated = False
         self._fault = ""  # of the first message without a valid image
+        self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
 
     def _image(self, logged: LoggedImage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -131,6 +156,15 @@ class LogReader:
         self.counts["unstamped"] += not image.stamp_ns and logged.log_time_ns != 0
         return replace(image, stamp_ns=image.stamp_ns or logged.log_time_ns, data=memoryview(bytes(image.data)))
 
+    def _sample(self, logged: LoggedMotion) -> MotionSample | None:
+        """Return a sample, None of a broken one."""
+        try:
+            return logged.read().sample(logged.log_time_ns)
+        except (FrameDecodeError, RecordError) as error:
+            self.counts["broken_motion"] += 1
+            self._motion_fault = self._motion_fault or str(error)
+            return None
+
     def _report(self) -> None:
         damage = self._log.damage()
         self.counts["broken_records"] = damage.broken
@@ -138,4 +172,26 @@ class LogReader:
         if damage.cut:
             self.warnings.append(damage.cut)
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
-        self.warnings += [text.format(self.counts[name], fault=self._fault) for name, text in found.items()]
+        faults = {"fault": self._fault, "motion_fault": self._motion_fault}
+        self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
+
+
+
+class _Samples:
+    """Samples that wait for the frames before them, the earliest first."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, MotionSample]] = []  # stamp, order of arrival
+        self._arrivals = 0
+
+    def push(self, sample: MotionSample) -> Iterator[MotionSample]:
+        """Add a sample; yield the earliest one where too many wait."""
+        heapq.heappush(self._heap, (sample.stamp_ns, self._arrivals, sample))
+        self._arrivals += 1
+        if len(self._heap) > MAX_WAITING_SAMPLES:
+            yield heapq.heappop(self._heap)[2]
+
+    def until(self, stamp_ns: int) -> Iterator[MotionSample]:
+        """Yield the samples up to a stamp."""
+        while self._heap and self._heap[0][0] <= stamp_ns:
+            yield heapq.heappop(self._heap)[2]

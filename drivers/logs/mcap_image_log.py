@@ -6,12 +6,13 @@ import os
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
 from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
 from drivers.logs.mcap_records import LogFile
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 _SCAN_BYTES = 64 * 2**20
 _SCAN_MESSAGES = 2000
@@ -39,13 +40,20 @@ class McapImageLog:
         return {name: sum(counts.get(channel, 0) for channel in catalog.ids(name)) for name in catalog.topics()}
 
     def images(self) -> Iterator[LoggedImage]:
-        """Yield the images in file order."""
+        """Yield the images among the messages."""
+        return images_of(self)
+
+    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the messages in file order."""
         section = DataSection(self._file, self._catalog)
         for message in section.messages():
             topic = self._catalog.topic(message.channel_id)
             if topic is not None and topic.type in IMAGE_TYPES:
                 yield LoggedImage(topic.name, message.log_time_ns,
                                   partial(_read, topic.type, message, topic.aligned))
+            elif topic is not None and topic.type in MOTION_TYPES:
+                yield LoggedMotion(topic.name, message.log_time_ns,
+                                   partial(_read_motion, topic.type, message, topic.aligned))
             if self._file.closed:
                 return
         complete = section.ended and has_footer(self._file)
@@ -58,7 +66,7 @@ class McapImageLog:
         return read_attachments(self._file, self._summary)
 
     def damage(self) -> LogDamage:
-        """Return the faults found by the last call of images()."""
+        """Return the faults found by the last call of messages()."""
         return self._damage
 
     def close(self) -> None:
@@ -74,3 +82,7 @@ class McapImageLog:
 
 def _read(kind: str, message: LogMessage, aligned: bool) -> RosImage:
     return parse_image(kind, message.data(), aligned=aligned)
+
+
+def _read_motion(kind: str, message: LogMessage, aligned: bool) -> MotionReading:
+    return parse_motion(kind, message.data(), aligned=aligned)

@@ -18,10 +18,11 @@ from typing import BinaryIO, Final, NamedTuple
 import lz4.frame  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
 from drivers.logs.mcap_catalog import ros_name
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7  # field op of a record's header
@@ -115,7 +116,11 @@ class Ros1Bag:
         return total
 
     def images(self) -> Iterator[LoggedImage]:
-        """Yield the images in the order of the file."""
+        """Yield the images among the messages."""
+        return images_of(self)
+
+    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the messages in the order of the file."""
         broken, end = 0, len(MAGIC)
         for record in self._source.records(len(MAGIC)):
             end = record.offset + record.size
@@ -135,15 +140,15 @@ class Ros1Bag:
         return {}
 
     def damage(self) -> LogDamage:
-        """Return the faults found by the last call of images()."""
+        """Return the faults found by the last call of messages()."""
         return self._damage
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _of(self, record: _Record, source: _Source) -> Iterator[LoggedImage]:
-        """Yield the images of a record: a message or a chunk; remember the connections."""
+    def _of(self, record: _Record, source: _Source) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the messages of a record: a message or a chunk; remember the connections."""
         if record.op == _CONNECTION:
             self._add(record, source)
         elif record.op == _CHUNK and source is self._source:
@@ -153,7 +158,7 @@ class Ros1Bag:
         elif record.op == _MESSAGE:
             yield from self._message(record, source)
 
-    def _message(self, record: _Record, source: _Source) -> Iterator[LoggedImage]:
+    def _message(self, record: _Record, source: _Source) -> Iterator[LoggedImage | LoggedMotion]:
         try:
             name, kind = self._topics.get(_number(record.fields["conn"]), ("", ""))
             seconds, nanoseconds = _TIME.unpack(record.fields["time"])
@@ -161,6 +166,8 @@ class Ros1Bag:
             raise RecordError("a message record is malformed") from error
         if kind in IMAGE_TYPES:
             yield LoggedImage(name, seconds * 10**9 + nanoseconds, partial(_read, kind, source, record))
+        elif kind in MOTION_TYPES:
+            yield LoggedMotion(name, seconds * 10**9 + nanoseconds, partial(_read_motion, kind, source, record))
 
     def _add(self, record: _Record, source: _Source) -> None:
         try:
@@ -245,7 +252,15 @@ def _unpack(record: _Record, source: _Source) -> bytes:
 
 
 def _read(kind: str, source: _Source, record: _Record) -> RosImage:
+    return parse_image(kind, _data(source, record), aligned=False)
+
+
+def _read_motion(kind: str, source: _Source, record: _Record) -> MotionReading:
+    return parse_motion(kind, _data(source, record), aligned=False)
+
+
+def _data(source: _Source, record: _Record) -> memoryview:
     data = source.read(record.offset, record.size) if record.size <= MAX_RECORD_BYTES else b""
     if len(data) < record.size:
         raise RecordError(f"{len(data)} of {record.size} bytes could be read")
-    return parse_image(kind, memoryview(data), aligned=False)
+    return memoryview(data)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 from drivers.errors import FrameDecodeError
 
@@ -44,31 +45,32 @@ def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) 
     aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
     """
     try:
-        members = _cdr_members(message) if aligned else _MemberReader(message, "<", aligned=False)
-        stamp_ns = _header(members)
+        members = cdr_members(message) if aligned else MemberReader(message, "<", aligned=False)
+        stamp_ns = header_stamp(members)
         return _raw(members, stamp_ns) if schema_name == IMAGE else _compressed(members, stamp_ns)
     except struct.error as error:
         raise FrameDecodeError(f"a {schema_name} of {len(message)} bytes is truncated") from error
 
 
-def _header(members: _MemberReader) -> int:
+def header_stamp(members: MemberReader) -> int:
     """Return the stamp of a std_msgs/Header [ns]."""
     if not members.aligned:
         members.number("I")  # the sequence number that a header has in ROS 1
-    seconds, nanoseconds = members.number("i"), members.number("I")
+    seconds: int = members.number("i")
+    nanoseconds: int = members.number("I")
     if seconds < 0 or nanoseconds >= 10**9:
         raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
     members.string()  # frame_id, which is not used: the topic identifies the camera
     return seconds * 10**9 + nanoseconds
 
 
-def _raw(members: _MemberReader, stamp_ns: int) -> RosImage:
+def _raw(members: MemberReader, stamp_ns: int) -> RosImage:
     height, width, encoding = members.number("I"), members.number("I"), members.string()
     bigendian, step = bool(members.number("B")), members.number("I")
     return RosImage(stamp_ns, _SYNONYMS.get(encoding, encoding), members.octets(), width, height, step, bigendian)
 
 
-def _compressed(members: _MemberReader, stamp_ns: int) -> RosImage:
+def _compressed(members: MemberReader, stamp_ns: int) -> RosImage:
     """Return a compressed image; its first bytes decide the encoding, else the format field, which is free text."""
     encoding, data = members.string(), members.octets()
     if "jp" in encoding.lower():  # such as 'bgr8; jpeg compressed bgr8'
@@ -83,18 +85,18 @@ def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
     return _MAGIC.get(bytes(data[:_MAGIC_BYTES]), otherwise)
 
 
-class _MemberReader:
+class MemberReader:
     """Reads the members of a message in order; raises struct.error at the end of the bytes."""
 
     def __init__(self, body: memoryview, order: str, aligned: bool) -> None:
         """order: "<" little endian, ">" big endian. aligned: each number begins at a multiple of its size."""
         self._order, self._body, self.aligned, self._offset = order, body, aligned, 0
 
-    def number(self, code: str) -> int:
+    def number(self, code: str) -> Any:
         """Return a number; code: its format in struct."""
         size = struct.calcsize("=" + code)
         self._offset += -self._offset % size if self.aligned else 0
-        value: int = struct.unpack_from(self._order + code, self._body, self._offset)[0]
+        value = struct.unpack_from(self._order + code, self._body, self._offset)[0]
         self._offset += size
         return value
 
@@ -112,8 +114,9 @@ class _MemberReader:
         return bytes(self.octets()[:_MAX_STRING]).rstrip(b"\0").decode("utf-8", "replace")
 
 
-def _cdr_members(message: memoryview) -> _MemberReader:
+def cdr_members(message: memoryview) -> MemberReader:
+    """Return a reader of the members of a CDR message; raise FrameDecodeError where it has no header."""
     if len(message) < _CDR_HEADER_BYTES or message[0] != 0 or message[1] not in (0, 1):
         start = bytes(message[:_CDR_HEADER_BYTES]).hex()
         raise FrameDecodeError(f"a message starts with {start}, not with a CDR header")
-    return _MemberReader(message[_CDR_HEADER_BYTES:], "<" if message[1] else ">", aligned=True)  # CDR_LE or CDR_BE
+    return MemberReader(message[_CDR_HEADER_BYTES:], "<" if message[1] else ">", aligned=True)  # CDR_LE or CDR_BE

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
-from drivers.logs.image_log import ImageLog, LogDamage, LoggedImage
+from drivers.logs.image_log import ImageLog, LogDamage, LoggedImage, LoggedMotion, images_of
 
 
 class SplitLog:
@@ -35,9 +35,13 @@ class SplitLog:
         return total
 
     def images(self) -> Iterator[LoggedImage]:
-        """Yield the images of one part after the other."""
+        """Yield the images among the messages."""
+        return images_of(self)
+
+    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the messages of one part after the other."""
         for part in self._parts:
-            yield from part.images()
+            yield from part.messages()
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attachments of the first part that has some."""

@@ -17,9 +17,10 @@ from urllib.parse import quote
 import zstandard
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 MAGIC: Final = b"SQLite format 3\0"
 _MAX_TOPICS: Final = 4096
@@ -30,7 +31,7 @@ _TABLES: Final = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND na
 _TOPICS: Final = f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics " \
     f"LIMIT {_MAX_TOPICS}"
 # In the order of writing, which needs no index: that of the time is by the stamps of the images.
-_IMAGES: Final = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({}) ORDER BY id"
+_MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({}) ORDER BY id"
 _COUNTS: Final = "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
 
 
@@ -71,16 +72,21 @@ class SqliteBag:
         return {name: int(found.get(key, 0)) for key, (name, _) in self._topics.items()}
 
     def images(self) -> Iterator[LoggedImage]:
-        """Yield the images in the order in which they were written."""
-        wanted = {key: topic for key, topic in self._topics.items() if topic[1] in IMAGE_TYPES}
+        """Yield the images among the messages."""
+        return images_of(self)
+
+    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+        """Yield the messages in the order in which they were written."""
+        wanted = {key: topic for key, topic in self._topics.items() if topic[1] in (*IMAGE_TYPES, *MOTION_TYPES)}
         broken, count = 0, 0
         try:
-            with closing(self._bag.execute(_IMAGES.format(", ".join(map(str, wanted))))) as rows:
+            with closing(self._bag.execute(_MESSAGES.format(", ".join(map(str, wanted))))) as rows:
                 for key, time_ns, data in rows:
                     count += 1
                     if isinstance(data, bytes) and isinstance(time_ns, int):
                         name, kind = wanted[key]
-                        yield LoggedImage(name, time_ns, partial(_read, kind, data))
+                        yield (LoggedImage(name, time_ns, partial(_read, kind, data)) if kind in IMAGE_TYPES
+                               else LoggedMotion(name, time_ns, partial(_read_motion, kind, data)))
                     else:
                         broken += 1
                     if self._closed:
@@ -88,7 +94,7 @@ class SqliteBag:
             self._damage = LogDamage(broken)
         except sqlite3.Error as error:
             if not self._closed:
-                self._damage = LogDamage(broken, f"the bag {self.name!r} is cut or corrupt after {count} images "
+                self._damage = LogDamage(broken, f"the bag {self.name!r} is cut or corrupt after {count} messages "
                                                  f"({_line(error)}): used those before")
 
     def attachments(self) -> dict[str, bytes]:
@@ -96,7 +102,7 @@ class SqliteBag:
         return {}
 
     def damage(self) -> LogDamage:
-        """Return the faults found by the last call of images()."""
+        """Return the faults found by the last call of messages()."""
         return self._damage
 
     def close(self) -> None:
@@ -107,6 +113,10 @@ class SqliteBag:
 
 def _read(kind: str, data: bytes) -> RosImage:
     return parse_image(kind, memoryview(_unpacked(data)))
+
+
+def _read_motion(kind: str, data: bytes) -> MotionReading:
+    return parse_motion(kind, memoryview(_unpacked(data)))
 
 
 def _unpacked(data: bytes) -> bytes:

@@ -1,13 +1,15 @@
-"""Choice of the topics of a log that are the lower and the upper camera."""
+"""Choice of the topics of a log that are the lower and the upper camera, the wheels and the IMU."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_motion import IMU, ODOMETRY
 
 _WORDS: dict[str, Camera] = {
     "lower": "lower",
@@ -39,6 +41,43 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[s
     cameras: tuple[Camera, Camera] = ("lower", "upper")
     found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in cameras}
     return _both(log, images, found)
+
+
+class MotionTopics(NamedTuple):
+    """Topics of wheels and of an IMU; None: chosen by name and type; empty: none."""
+
+    wheels: str | None = None
+    imu: str | None = None
+
+
+class MotionChoice(NamedTuple):
+    """The topics of wheels and IMU that are read, and why others that might be meant are not."""
+
+    names: frozenset[str]
+    warning: str = ""
+
+
+def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> MotionChoice:
+    """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
+
+    A topic of odometry is that of wheels if its name contains "wheel": others are results. Raises DriverError for a
+    requested topic that does not exist or is of another type.
+    """
+    chosen, warnings = [], []
+    for kind, name, knob in ((ODOMETRY, wanted.wheels, "motion.wheel_topic"), (IMU, wanted.imu, "motion.imu_topic")):
+        if name:
+            if topics.get(name) != kind:
+                found = f"holds {topics[name]}" if topics.get(name) else "is not"
+                raise DriverError(f"topic {name!r} {found} in {log}; {knob} must be one of {kind}: {_listed(topics)}")
+            chosen.append(name)
+        elif name is None:
+            found_names = [topic for topic, found in topics.items()
+                           if found == kind and (kind == IMU or "wheel" in topic.lower())]
+            if len(found_names) > 1:
+                warnings.append(f"{log} has several topics of {kind}: {_listed(found_names)}; none is used: set {knob}")
+            else:
+                chosen += found_names
+    return MotionChoice(frozenset(chosen), "; ".join(warnings))
 
 
 def _is_image(name: str, kind: str) -> bool:

@@ -62,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         _require_no_log_options(args)
         return LiveRun(config, _devices(config), log, show=show).run()
-    config = replace(config, controller=config.controller.of_log)  # the log's images do not follow the wheels
+    unrelated = replace(config.motion, wheels="off", imu="off")  # to the images of a log, and the wheels to them
+    config = replace(config, controller=config.controller.of_log, motion=unrelated)
     return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args), show).run()
 
 

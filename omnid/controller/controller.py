@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from drivers.errors import DriverError
+from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
@@ -101,8 +102,9 @@ class Controller:
             self._take_status(status, now_ns)
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
+        wheels = None if status is None else WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)
         return TickReport(None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s,
-                          self.state)
+                          self.state, wheels)
 
     def close(self) -> None:
         """Stop the wheels at once and release the driver."""

@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Final
 
 from drivers.errors import DriverError
+from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
@@ -19,6 +20,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControllerPose
+from omnid.engine.flow import nothing
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 
@@ -38,6 +40,7 @@ class ControllerLink:
     def __init__(self, start: ControllerStart, stats: StageStats, report: Callable[[str], None]) -> None:
         """Start the process; DriverError where the motor controller cannot be opened."""
         self._report = report
+        self.take_wheels: Callable[[WheelSample], object] = nothing  # called with what the motor controller reports
         self.statistics = ControllerStatistics(stats)
         self._stop_ns = 0
         self._ended_ns = 0  # when the process was asked to end
@@ -117,6 +120,8 @@ class ControllerLink:
         message: object = self._channel.receive(timeout_s)
         if isinstance(message, TickReport):
             self.statistics.add(message)
+            if message.wheels is not None:
+                self.take_wheels(message.wheels)
         elif isinstance(message, LogRecord):
             self._report(message.text)
         return message

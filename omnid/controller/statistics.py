@@ -8,6 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.safety_rules import IDLE
@@ -50,6 +51,7 @@ class TickReport(NamedTuple):
     work_s: float
     to_wheel_s: float  # from the capture of a pose's images to this, the first command that follows from it; else NaN
     state: ControllerState
+    wheels: WheelSample | None = None  # by the motor controller's report
 
 
 class ControllerStatistics:

@@ -24,6 +24,7 @@ from omnid.core.control.command_sources import PLANNER
 from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
+from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.rig_monitor import RigMonitor, RigMonitorSink, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
@@ -41,6 +42,7 @@ from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, Sinks, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
+from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -57,7 +59,7 @@ from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
 from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import SENSOR_TOPICS, command_topics
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
@@ -144,7 +146,10 @@ class LiveRun:
         config, graph, rig = self._config, self._graph, geometry.rig
         controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
-        pairing = Synchronise(rig, config.pair)
+        pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
+        sensors = SensorSources(config.motion, pairing.motion, session, controller, self._report)
+        if sensors.gyro is not None:
+            graph.source("imu", sensors.read_gyro, wake=sensors.gyro.close)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         recorder = self._recorder(session, rig) if config.record.enabled else None
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
@@ -186,7 +191,8 @@ class LiveRun:
             if stages.places and run_places.is_extended else None
         if saver is not None:
             graph.ticker("save", saver.PERIOD_S, saver)
-        commands = self._commands(session, bus, controller, recorder, receiver) if controller else None
+        commands = self._command_receiver(controller) if controller else None
+        self._subscribe(session, bus, recorder, commands, receiver, sensors)
         sources = StatusSources(
             graph.telemetry,
             {name: camera.state for name, camera in cameras.items()},
@@ -198,6 +204,7 @@ class LiveRun:
             TICKERS,
             (ladder.status, partial(start_status, stages.rig_gate),
              *([receiver.status] if controller else ()),
+             motion_status(stages.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
              *([partial(places_status, stages.places)] if stages.places else ()),
              *(part.status for part in (bus, recorder, rig_monitor, refinement, saver) if part)),
         )
@@ -250,16 +257,24 @@ class LiveRun:
         routes = RouteFolder(Path(self._config.navigation.routes))
         return NavigationParts(requests, wheels, PlannerDrive(controller), routes, self._config.places.map)
 
-    def _commands(self, session: Session, bus: Bus, controller: ControllerLink, recorder: Recorder | None,
-                  navigation: NavigationReceiver) -> CommandReceiver:
+    def _command_receiver(self, controller: ControllerLink) -> CommandReceiver:
         settings = self._config.controller
-        commands = CommandReceiver(controller, settings.deadlines.command_s, sources=settings.sources.names,
-                                   synchronised=self._config.bus.command_clock == "synchronised",
-                                   report=partial(self._report, logging.WARNING))
-        topics = command_topics(settings.sources.names)
+        return CommandReceiver(controller, settings.deadlines.command_s, sources=settings.sources.names,
+                               synchronised=self._config.bus.command_clock == "synchronised",
+                               report=partial(self._report, logging.WARNING))
+
+    def _subscribe(self, session: Session, bus: Bus, recorder: Recorder | None, commands: CommandReceiver | None,
+                   navigation: NavigationReceiver, sensors: SensorSources) -> None:
+        """Take commands, requests and samples from the bus; without a motor samples only."""
+        topics = SENSOR_TOPICS if commands is None else command_topics(self._config.controller.sources.names)
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns, topics)
 
         def receive(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
+            if sensors.receiver.handles(key):
+                sensors.receiver.receive(key, payload)
+                return  # samples are recorded with the poses
+            if commands is None:
+                return
             if navigation.handles(key):
                 navigation.receive(key, payload, sent_ns)
             else:
@@ -267,7 +282,6 @@ class LiveRun:
             record(key, payload)
 
         bus.subscribe_commands(receive, topics)
-        return commands
 
 
 def _ready(config: Config) -> str:

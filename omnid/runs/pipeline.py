@@ -82,6 +82,7 @@ class WiredStages(NamedTuple):
     """The stages that are asked for counts and warnings at the end of a run."""
 
     rig_gate: RigGate
+    odometry: OdometryStage
     mapping: Mapping | None
     places: Places | None
     navigation: NavigationStage | None  # that of a run in lock-step is given its requests directly
@@ -93,7 +94,8 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     versions = sinks.versions or GeometryVersions(geometry)
     stereo = Stereo(versions, config.stereo_settings(), rig_gate)
     panoramas = graph.stage("dewarp", Dewarp(versions, config.panorama, config.camera), pairs, direct=True)
-    poses = Chain(stereo, OdometryStage(versions, config.odometry, sinks.features))
+    odometry_stage = OdometryStage(versions, config.odometry, sinks.features)
+    poses = Chain(stereo, odometry_stage)
     odometry = graph.stage("odometry", poses, panoramas)
     if sinks.rig_monitor:
         graph.sink("rig", sinks.rig_monitor, odometry, policy=NEWEST, depth=1)
@@ -140,7 +142,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(rig_gate, mapping, places, navigation)
+    return WiredStages(rig_gate, odometry_stage, mapping, places, navigation)
 
 
 def _navigation(geometry: Geometry, config: Config, parts: NavigationParts, places: Places | None) -> NavigationStage:

@@ -16,6 +16,8 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogReader
+from drivers.logs.topic_choice import MotionTopics
+from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunStatistics
@@ -128,8 +130,8 @@ class _Replay:
             run_places = RunPlaces(self._config, geometry, session.warn, self._options.rig_places,
                                    build=self._options.build)
             sinks = run_places.known_to(self._sinks(session, geometry))
-            pairing = Synchronise(geometry.rig, self._config.pair)
-            pairs = graph.stage("pair", pairing, self._frames(graph, reader))
+            pairing = Synchronise(geometry.rig, self._config.pair, self._config.motion.R_base_imu)
+            pairs = graph.stage("pair", pairing, self._messages(graph, reader, pairing))
             stages = wire(graph, pairs, geometry, self._config, sinks)
             result = RunReport(session, reader, pairing, stages)
             if isinstance(sinks.recorder, Recorder):
@@ -156,15 +158,18 @@ class _Replay:
     def _reader(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
-        rig, window = self._options.rig, self._config.log.reorder_frames
+        rig, motion = self._options.rig, self._config.motion
+        open_log = partial(LogReader, self._log, window=self._config.log.reorder_frames,
+                           span_s=self._options.span_s, motion=MotionTopics(
+            "" if motion.wheels == "off" else motion.wheel_topic or None,
+            "" if motion.imu == "off" else motion.imu_topic or None))
         named = ("", "")
         if rig and not (lower and upper):
             named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
-        read = partial(LogReader, self._log, window=window, span_s=self._options.span_s)
         if all(named):
             with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
-                return read(lower or named[0], upper or named[1])
-        return read(lower, upper)
+                return open_log(lower or named[0], upper or named[1])
+        return open_log(lower, upper)
 
     def _rig(self, reader: LogReader) -> Rig:
         rig = self._options.rig
@@ -172,11 +177,20 @@ class _Replay:
             return attached_rig(reader, self._log)
         return read_rig(rig) if isinstance(rig, Path) else rig
 
-    def _frames(self, graph: Graph, reader: LogReader) -> Stream[Frame]:
+    def _messages(self, graph: Graph, reader: LogReader, pairing: Synchronise) -> Stream[Frame | MotionSample]:
         if not self._options.realtime:
-            return graph.source("read", reader.frames)
+            return graph.source("read", reader.messages)
         clock = PlaybackClock()
-        return graph.source("read", lambda: clock.frames(reader.frames()), wake=clock.wake)
+
+        def frames() -> Iterator[Frame]:
+            """Yield the frames; samples go straight to the pairing, since in its inbox they would replace frames."""
+            for message in clock.messages(reader.messages()):
+                if isinstance(message, Frame):
+                    yield message
+                else:
+                    pairing.motion.add(message)
+
+        return graph.source("read", frames, wake=clock.wake)
 
     def _sinks(self, session: Session, geometry: Geometry) -> Sinks:
         """Open all outputs before the run, so that one that cannot be opened ends it now."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drivers.logs.log_reader import LogReader
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.input_warnings import input_warnings
+from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.status import stage_status, summary_status
 from omnid.engine.telemetry import SummaryRow
@@ -60,12 +61,23 @@ class RunReport:
         yield from self._reader.warnings
         statistics = self._session.statistics
         if statistics.poses or not self._session.signal:
+            if self._has_motion and self._motion().message:
+                yield f"wheels and gyro: {self._motion().message}"
             yield from input_warnings(self._pairing, self._stages.rig_gate, statistics, self._session.config.pair)
 
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        return [summary_status(self.counters(statistics)), *map(stage_status, stages)]
+        motion = [self._motion()] if self._has_motion else []
+        return [summary_status(self.counters(statistics)), *motion, *map(stage_status, stages)]
+
+    @property
+    def _has_motion(self) -> bool:
+        inbox = self._pairing.motion
+        return bool(inbox.wheels or inbox.gyro)
+
+    def _motion(self) -> DiagnosticStatus:
+        return motion_status(self._stages.odometry.sensors, self._pairing.motion)()
 
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""

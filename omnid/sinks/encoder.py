@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.occupancy_grid import occupancy
@@ -17,6 +18,7 @@ from omnid.sinks.navigation_status import navigation_status
 from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, navigation_codec
+from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
@@ -80,6 +82,18 @@ class Encoder:
         edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
                  codec.FrameTransform("base_link", "rig", self._T_base_rig)]
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+        yield from self._motion(odometry)
+
+    def _motion(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
+        """Yield the samples of wheels and gyro up to the pair; those after it come with the next one again."""
+        for sample in odometry.motion:
+            if sample.stamp_ns > odometry.stamp_ns:
+                continue
+            stamp_ns = sample.stamp_ns + self.offset_ns
+            if isinstance(sample, WheelSample):
+                yield OutgoingMessage("wheel_odom", WHEEL_SCHEMA, wheel_cdr(sample, stamp_ns))
+            else:
+                yield OutgoingMessage("imu", IMU_SCHEMA, gyro_cdr(sample, stamp_ns))
 
     def _map_pose(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns

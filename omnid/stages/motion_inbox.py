@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from drivers.motion import MotionSample, WheelSample
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.motion import GyroSample, MotionSample, WheelSample
 
 MOST_WAITING: Final = 4096  # samples: ten seconds of a gyro of 400 Hz
 AHEAD_NS: Final = 5 * 10**9  # a sample so far after a pair has a stamp of another clock
@@ -18,7 +21,9 @@ class MotionInbox:
     each other, as the messages in a stage's inbox do.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, R_base_imu: NDArray[np.float64] | None = None) -> None:
+        """R_base_imu: rotation (3, 3) from the axes of the gyro to those of the base; None: they are the same."""
+        self._R_base_imu = R_base_imu
         self._waiting: deque[MotionSample] = deque(maxlen=MOST_WAITING)
         self.wheels = self.gyro = 0  # samples that have come
         self.dropped = 0  # because none took them, or their stamps are far ahead
@@ -29,6 +34,9 @@ class MotionInbox:
             self.wheels += 1
         else:
             self.gyro += 1
+            if self._R_base_imu is not None:
+                rates = self._R_base_imu @ (sample.x_radps, sample.y_radps, sample.z_radps)
+                sample = GyroSample(sample.stamp_ns, *rates.tolist())
         self.dropped += len(self._waiting) == MOST_WAITING
         self._waiting.append(sample)
 

@@ -60,6 +60,8 @@ class OdometryStage:
         self._config, self._features = config, features
         self._newest = _Start(np.eye(4), np.zeros((6, 6)), 0)
         self._use(0)
+        # A refined rig differs so little that the wheels do not notice.
+        self.sensors = MotionSensors(se3.inverse(self._versions[0].rig.T_base_rig @ self._T_rig_rect))
 
     def _use(self, version: int) -> None:
         """Begin at the last pose with a version of the geometry."""
@@ -68,7 +70,6 @@ class OdometryStage:
         self._method = _method(self._model, self._config, self._features)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
-        self.sensors = MotionSensors(se3.inverse(geometry.rig.T_base_rig @ self._T_rig_rect))
         self._last_ns: int | None = None
 
     def process(self, depth: StereoDepth) -> OdometryUpdate:
@@ -96,7 +97,7 @@ class OdometryStage:
             depth.seq, depth.stamp_ns, newest.T_odom_rig, in_axes(newest.T_odom_rig, covariance),
             self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, depth), newest.resets, estimate.inliers, estimate.tracked, depth,
-            estimate.features, depth.panoramas.light,
+            estimate.features, depth.panoramas.light, pair.motion,
         )
 
     def _in_rig(self, covariance: Array) -> Array:

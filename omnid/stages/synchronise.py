@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from statistics import median_low
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from drivers.motion import MotionSample
@@ -135,14 +138,15 @@ class Synchronise:
     `motion` by their sources.
     """
 
-    def __init__(self, rig: Rig, config: PairConfig) -> None:
+    def __init__(self, rig: Rig, config: PairConfig, R_base_imu: NDArray[np.float64] | None = None) -> None:
+        """R_base_imu: rotation from the axes of the gyro to those of the base; None: they are the same."""
         self._decode = Decoder(rig)
         self._matcher = FrameMatcher(round(config.tolerance_ms * 1e6))
         self._pairs = 0
         self._use_repeated = config.repeated_images == "use"
         self.repeated: dict[Camera, RepeatedImages] = {"lower": RepeatedImages(), "upper": RepeatedImages()}
         self.skew = Skew()
-        self.motion = MotionInbox()
+        self.motion = MotionInbox(R_base_imu)
         self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
 
     @property

@@ -21,6 +21,7 @@ WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
 RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
+MOTION: Final = f"{PREFIX}wheels and gyro"  # beside the cameras
 PLACES: Final = f"{PREFIX}places"
 MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from omnid.transport import codec, navigation_codec
+from omnid.transport import codec, motion_codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA
 
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
@@ -33,6 +33,8 @@ PUBLISHED: Final = {
     "panorama": Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
+    "wheel_odom": Topic(motion_codec.WHEEL_SCHEMA),
+    "imu": Topic(motion_codec.IMU_SCHEMA),
 }
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
@@ -42,6 +44,9 @@ NAVIGATION: Final = "cmd/navigation"
 ROUTE: Final = "cmd/route"
 NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH_SCHEMA,
                             NAVIGATION: navigation_codec.STRING_SCHEMA, ROUTE: navigation_codec.STRING_SCHEMA}
+WHEEL_ODOM: Final = "cmd/wheel_odom"
+IMU: Final = "cmd/imu"
+SENSOR_TOPICS: Final = {WHEEL_ODOM: motion_codec.WHEEL_SCHEMA, IMU: motion_codec.IMU_SCHEMA}
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
@@ -51,7 +56,7 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
     setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **named}
+    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **SENSOR_TOPICS, **named}
 
 
 def ros_name(robot: str, topic: str) -> str:

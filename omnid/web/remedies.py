@@ -17,6 +17,10 @@ _OF_PART: Final = {
     status_names.LOAD: "close other programs on the robot, or start it with --profile small",
     status_names.RIG: "omnid calibrate check on a recording",
     status_names.RIG_REFINEMENT: "omnid calibrate check on a recording",
+    status_names.MOTION: "check motor.drive in the configuration, and the grip of the wheels",
+    status_names.MAP_FILE: "make room on the disk, or change places.map",
+    status_names.NAVIGATION: "remove the cause that the robot names, then `omnid goto` or `omnid route repeat` again",
+    status_names.REQUESTS: "see the robot's log for the reason",
     status_names.PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
     status_names.RIG_AT_START: "name the right rig.toml, or calibrate again",
 }

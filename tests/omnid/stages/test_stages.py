@@ -253,7 +253,7 @@ def test_the_memory_of_a_path_is_constant() -> None:
 def test_playback_waits_for_the_stamps_until_woken(frames: list[Frame]) -> None:
     frames_an_hour_apart = stamped(frames, ("lower", 0), ("lower", 3_600_000))
     clock = PlaybackClock()
-    waiting = clock.frames(frames_an_hour_apart)
+    waiting = clock.messages(frames_an_hour_apart)
     assert next(waiting) is frames_an_hour_apart[0]
     clock.wake()
     assert next(waiting) is frames_an_hour_apart[1]
@@ -267,7 +267,7 @@ def paired(graph: Graph, rig_geometry: Geometry, frames: list[Frame]) -> tuple[S
 def test_a_slow_bus_drops_messages_and_delays_no_pose(rig_geometry: Geometry, frames: list[Frame]) -> None:
     drops = dropped(rig_geometry, frames, object)
     assert drops["bus"] > PAIRS // 2 and drops["bus-drive"] > PAIRS // 2
-    assert sum(drops.values()) == sum(drops[name] for name in ("bus", "bus-drive", "bus-map", "bus-places"))
+    assert sum(drops.values()) == sum(drops[name] for name in ("bus", "bus-drive", "bus-map", "bus-places", "bus-scan"))
 
 
 def test_a_slow_map_drops_no_pose(rig_geometry: Geometry, frames: list[Frame]) -> None:

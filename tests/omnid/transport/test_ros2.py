@@ -43,6 +43,11 @@ TOPICS = {
     "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",
     "/omnid/cmd/arm": "std_msgs/msg/Header", "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/planner/heading": "geometry_msgs/msg/Vector3Stamped",
+    "/omnid/navigation": "diagnostic_msgs/msg/DiagnosticArray", "/omnid/plan": "nav_msgs/msg/Path",
+    "/omnid/cmd/goal": "geometry_msgs/msg/PoseStamped", "/omnid/cmd/path": "nav_msgs/msg/Path",
+    "/omnid/cmd/navigation": "std_msgs/msg/String", "/omnid/cmd/route": "std_msgs/msg/String",
+    "/omnid/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/imu": "sensor_msgs/msg/Imu",
+    "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
 }
 COMMANDS = command_topics(("planner",))
 

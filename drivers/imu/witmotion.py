@@ -1,0 +1,128 @@
+"""Gyro of WitMotion's serial IMUs (WT61, WT901 and others), which send their measurements unasked.
+
+Their protocol: packets of 11 bytes, 0x55, a type, four numbers of 16 bits (little endian), and the sum of the ten bytes
+before. Type 0x52 holds angular velocities about x, y, z in units of 2000 / 32768 degrees per second.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import serial  # type: ignore[import-untyped]
+
+from drivers.errors import DriverError
+from drivers.motion import GyroSample
+
+START: Final = 0x55
+GYRO: Final = 0x52
+PACKET: Final = struct.Struct("<BB4hB")
+RADPS_PER_UNIT: Final = math.radians(2000.0) / 32768
+DEFAULT_BAUD: Final = 9600
+READ_S: Final = 0.1  # longest wait for bytes, so that `close` takes effect soon
+SILENT_S: Final = 2.0  # without a packet, after which the port is opened again
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0  # between two tries to open the port; doubles with each try
+_REASONS: Final = {
+    errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
+    errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
+}
+
+
+class PacketReader:
+    """Finds packets in a stream of bytes; broken counts packets whose sum is wrong."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.broken = 0
+
+    def feed(self, data: bytes) -> Iterator[tuple[float, float, float]]:
+        """Yield the angular velocities [rad/s] in the bytes."""
+        self._bytes += data
+        while (start := self._bytes.find(START)) >= 0 and len(self._bytes) - start >= PACKET.size:
+            packet = bytes(self._bytes[start:start + PACKET.size])
+            if sum(packet[:-1]) & 0xFF != packet[-1]:
+                self.broken += 1
+                del self._bytes[:start + 1]  # the start may have been a byte of a packet
+                continue
+            del self._bytes[:start + PACKET.size]
+            _, kind, x, y, z, _, _ = PACKET.unpack(packet)
+            if kind == GYRO:
+                yield x * RADPS_PER_UNIT, y * RADPS_PER_UNIT, z * RADPS_PER_UNIT
+        if start < 0:
+            self._bytes.clear()
+
+
+class WitMotionGyro:
+    """The gyro on a serial port; its rate and baud rate are those that it was set to by its maker's program.
+
+    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). A port that is gone is opened again.
+    """
+
+    def __init__(self, port: str, baud: int = DEFAULT_BAUD, on_event: Callable[[str], None] = lambda _: None) -> None:
+        """Open the port; raise DriverError where it cannot be opened. on_event: takes lines for the log."""
+        self._name, self._baud, self._on_event = port, baud, on_event
+        self._closed = False
+        self._reader = PacketReader()
+        self.restarts = 0
+        self._port = self._opened()
+
+    @property
+    def broken(self) -> int:
+        """Number of packets whose sum is wrong."""
+        return self._reader.broken
+
+    def samples(self) -> Iterator[GyroSample]:
+        """Yield the samples until `close` is called."""
+        received_s, wait_s = time.monotonic(), FIRST_WAIT_S
+        while not self._closed:
+            data = self._read()
+            stamp_ns = time.monotonic_ns()
+            rates = list(self._reader.feed(data))
+            for k, rate in enumerate(rates):  # what arrives together was sent one after the other
+                behind_s = (len(rates) - 1 - k) * PACKET.size * 10 / self._baud
+                yield GyroSample(stamp_ns - round(behind_s * 1e9), *rate)
+            if rates:
+                received_s, wait_s = time.monotonic(), FIRST_WAIT_S
+            elif time.monotonic() - received_s > SILENT_S:
+                self._reopen(wait_s)
+                received_s, wait_s = time.monotonic(), min(2 * wait_s, LONGEST_WAIT_S)
+
+    def close(self) -> None:
+        """End `samples`; may be called twice, from any thread."""
+        self._closed = True
+
+    def _read(self) -> bytes:
+        if self._port is None:
+            time.sleep(READ_S)
+            return b""
+        try:
+            return bytes(self._port.read(max(1, self._port.in_waiting)))
+        except (serial.SerialException, OSError) as error:
+            self._on_event(f"the IMU on {self._name} is gone: {error}")
+            self._port.close()
+            self._port = None
+            return b""
+
+    def _reopen(self, wait_s: float) -> None:
+        if self._port is not None:
+            self._on_event(f"the IMU on {self._name} sends nothing that is valid; check its baud rate, {self._baud}")
+            self._port.close()
+        until_s = time.monotonic() + wait_s
+        while not self._closed and time.monotonic() < until_s:
+            time.sleep(READ_S)
+        self.restarts += 1
+        try:
+            self._port = self._opened()
+        except DriverError:
+            self._port = None
+
+    def _opened(self) -> serial.Serial | None:
+        try:
+            return serial.Serial(self._name, self._baud, timeout=READ_S, exclusive=True)
+        except (serial.SerialException, OSError, ValueError) as error:
+            reason = _REASONS.get(getattr(error, "errno", None) or 0, str(error))
+            raise DriverError(f"cannot open the IMU on {self._name!r}: {reason}") from error

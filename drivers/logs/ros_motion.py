@@ -1,0 +1,59 @@
+"""Decodes nav_msgs/msg/Odometry of wheels and sensor_msgs/msg/Imu from the bytes of ROS 2 (CDR) or ROS 1."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import NamedTuple
+
+from drivers.errors import FrameDecodeError
+from drivers.logs.ros_image import MemberReader, cdr_members, header_stamp
+from drivers.motion import GyroSample, MotionSample, WheelSample
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+MOTION_TYPES = (ODOMETRY, IMU)
+
+_POSE_NUMBERS = 7 + 36  # position, orientation, covariance
+_ORIENTATION_NUMBERS = 4 + 9
+
+
+class MotionReading(NamedTuple):
+    """Rates in one message: forward velocity and yaw rate of wheels, or three angular velocities of an IMU."""
+
+    stamp_ns: int  # stamp of the header, 0 if unset
+    rates: tuple[float, ...]  # m/s and rad/s
+
+    def sample(self, log_time_ns: int) -> MotionSample:
+        """Return the sample; log_time_ns: its stamp where the header has none."""
+        stamp_ns = self.stamp_ns or log_time_ns
+        return WheelSample(stamp_ns, *self.rates) if len(self.rates) == 2 else GyroSample(stamp_ns, *self.rates)
+
+
+def parse_motion(schema_name: str, message: memoryview, *, aligned: bool = True) -> MotionReading:
+    """Return the rates in a message of type ODOMETRY or IMU; raise FrameDecodeError where it is invalid.
+
+    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
+    """
+    try:
+        members = cdr_members(message) if aligned else MemberReader(message, "<", aligned=False)
+        stamp_ns = header_stamp(members)
+        if schema_name == ODOMETRY:
+            members.string()  # child_frame_id: the twist is that of the base
+            _skip(members, _POSE_NUMBERS)
+            twist = [members.number("d") for _ in range(6)]
+            rates = (twist[0], twist[5])
+        else:
+            _skip(members, _ORIENTATION_NUMBERS)
+            rates = tuple(members.number("d") for _ in range(3))
+    except struct.error as error:
+        raise FrameDecodeError(f"a {schema_name} of {len(message)} bytes is truncated") from error
+    must_be_known = rates[:1] if schema_name == ODOMETRY else rates  # wheels may not tell their turn
+    if not all(map(math.isfinite, must_be_known)) or any(map(math.isinf, rates)):
+        raise FrameDecodeError(f"a {schema_name} has rates that are not finite")
+    return MotionReading(stamp_ns, rates)
+
+
+def _skip(members: MemberReader, numbers: int) -> None:
+    for _ in range(numbers):
+        members.number("d")

@@ -1,0 +1,36 @@
+"""Settings of wheels and gyro beside the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.settings import knob
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSensorSettings:
+    """Wheels and gyro beside the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
+
+    wheels: str = knob("auto", "speeds of the wheels: those that the motor controller reports, of the bus (cmd/"
+                       "wheel_odom) or of the log", choices=("auto", "off"))
+    imu: str = knob("auto", "gyro: that of imu_port, of the bus (cmd/imu) or of the log", choices=("auto", "off"))
+    imu_port: str = knob("", "serial port of an IMU of WitMotion (WT61, WT901 ...), by a persistent name; empty: none")
+    imu_baud: int = knob(9600, "its baud rate; 9600 carries 10 measurements a second: set it to 115200 and 100 Hz with "
+                         "its maker's program", low=1200, high=4_000_000)
+    wheel_topic: str = knob("", "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
+                            "name contains 'wheel'")
+    imu_topic: str = knob("", "topic of a log with sensor_msgs/msg/Imu; empty: the only one")
+    imu_roll_deg: float = knob(0.0, "orientation of the IMU on the base: roll about x, deg", low=-360, high=360)
+    imu_pitch_deg: float = knob(0.0, "... then pitch about y, deg", low=-360, high=360)
+    imu_yaw_deg: float = knob(0.0, "... then yaw about z, deg", low=-360, high=360)
+
+    @property
+    def R_base_imu(self) -> NDArray[np.float64]:
+        """Rotation (3, 3) from the axes of the IMU to those of the base."""
+        roll, pitch, yaw = np.radians([self.imu_roll_deg, self.imu_pitch_deg, self.imu_yaw_deg])
+        turns = ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])
+        return np.asarray(np.linalg.multi_dot([se3.rotation_exp(turn) for turn in turns]))

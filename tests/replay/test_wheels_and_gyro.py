@@ -1,0 +1,159 @@
+"""Logs with wheels and gyro beside the images: darkness is bridged, samples are recorded, wrong topics are told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+
+from calib import se3
+from calib.rig_file import read_rig
+from drivers.errors import DriverError, FrameDecodeError
+from drivers.logs.log_reader import LogReader
+from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
+from drivers.logs.topic_choice import MotionTopics
+from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.config import load_config
+from omnid.formats.tum import read_tum
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.runs.run_result import RunResult
+from omnid.tracking_state import TrackingState
+from omnid.transport.decode import decode_diagnostics
+from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
+from omnid.transport.status_names import MOTION
+from tests.conftest import PAIRS
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+from tests.replay.edited import dark, images
+from tests.simulation.motion_samples import SensorErrors, motion_samples
+
+DARK = range(12, 18)
+ERRORS = SensorErrors(distance=1.02, turn=0.97, wheel_offset_s=0.01, bias_radps=(0.0, 0.0, 0.01))
+WHEELS, GYRO = "/base/wheel_odometry", "/imu/data"
+
+
+def entry(sample: MotionSample) -> Entry:
+    if isinstance(sample, WheelSample):
+        return Entry(WHEELS, ODOMETRY, wheel_cdr(sample, sample.stamp_ns), sample.stamp_ns)
+    return Entry(GYRO, IMU, gyro_cdr(sample, sample.stamp_ns), sample.stamp_ns)
+
+
+@pytest.fixture(scope="module")
+def samples(scene: Path) -> list[MotionSample]:
+    truth = read_tum(scene / "truth.txt")
+    return motion_samples(truth.stamps_ns, truth.T, ERRORS, seed=1)
+
+
+@pytest.fixture(scope="module")
+def log(scene: Path, samples: list[MotionSample], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive of `scene`, dark in the middle, with wheels and gyro."""
+    folder = tmp_path_factory.mktemp("wheels")
+    return saved(folder / "log.mcap", scene, [entry(sample) for sample in samples])
+
+
+def run(log: Path, scene: Path, *overrides: str, inline: bool = False, record: Path | None = None) -> RunResult:
+    options = ReplayOptions(rig=read_rig(scene / "rig.toml"), collect=True, inline=inline, record=record)
+    return run_log(log, load_config(None, list(overrides)), options)
+
+
+def offsets_m(result: RunResult, scene: Path) -> NDArray[np.float64]:
+    """Return the distances of the poses from the true ones."""
+    truth = read_tum(scene / "truth.txt").T
+    true = (se3.inverse(truth[0]) @ truth)[:, :3, 3]
+    return np.asarray(np.linalg.norm(result.T_odom_rig[:, :3, 3] - true, axis=1))
+
+
+def recorded(path: Path, topic: str) -> list[bytes]:
+    with path.open("rb") as file:
+        return [message.data for _, _, message in make_reader(file).iter_messages([topic])]
+
+
+def saved(path: Path, scene: Path, more: Sequence[Entry]) -> Path:
+    topics = {"lower": LOWER, "upper": UPPER}
+    taken = [dark(image) if image.pair in DARK else image for image in images(scene / "log.mcap")]
+    entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.written_ns) for p in taken]
+    return write_log(path, sorted([*entries, *more], key=lambda each: each.log_time_ns))
+
+
+def test_darkness_is_bridged_and_the_bytes_are_the_same_threaded_and_inline(log: Path, scene: Path, tmp_path: Path
+                                                                            ) -> None:
+    record = tmp_path / "out.mcap"
+    result = run(log, scene, inline=True, record=record)
+    assert result.states.count(TrackingState.LOST) == 0
+    assert [state for state in result.states if state == TrackingState.DEGRADED]
+    assert offsets_m(result, scene).max() < 0.02 and result.counters.resets == 0
+    threaded = run(log, scene)
+    assert np.array(threaded.T_odom_rig).tobytes() == np.array(result.T_odom_rig).tobytes()
+    without = run(log, scene, "motion.wheels=off", "motion.imu=off")
+    assert without.states.count(TrackingState.LOST) > 0
+    assert len(recorded(record, "/omnid/wheel_odom")) > 80 and len(recorded(record, "/omnid/imu")) > 160
+    statuses = [status for data in recorded(record, "/omnid/status") for status in decode_diagnostics(data).statuses]
+    motion = next(status for status in statuses if status.name == MOTION)
+    assert float(motion.values["wheel_scale"]) == pytest.approx(1.02, abs=0.02)
+    assert float(motion.values["gyro_bias_z_radps"]) == pytest.approx(0.01, abs=0.005)
+
+
+def test_samples_are_read_in_the_order_of_their_stamps(log: Path, samples: list[MotionSample]) -> None:
+    reader = LogReader(log, motion=MotionTopics())
+    stamps = [message.stamp_ns for message in reader.messages()]
+    assert stamps == sorted(stamps)
+    read = [message for message in reader.messages() if isinstance(message, (WheelSample, GyroSample))]
+    until_ns = max(frame.stamp_ns for frame in reader.frames())
+    assert read == [sample for sample in samples if sample.stamp_ns <= until_ns]
+    assert len(list(reader.frames())) == 2 * PAIRS and not reader.warnings
+
+
+def test_broken_messages_are_counted_and_topics_that_are_not_clear_are_reported(scene: Path, samples: list[MotionSample],
+                                                                            tmp_path: Path) -> None:
+    sample = samples[0]
+    wrong = [entry(sample)._replace(data=entry(sample).data[:40]), Entry(GYRO, IMU, b"", sample.stamp_ns),
+             entry(next(each for each in samples if isinstance(each, GyroSample)))._replace(topic="/imu/other")]
+    log = saved(tmp_path / "log.mcap", scene, wrong)
+    reader = LogReader(log, motion=MotionTopics(imu=GYRO))
+    assert len(list(reader.messages())) == 2 * PAIRS and reader.counts["broken_motion"] == 2
+    assert "skipped 2 messages of wheels or IMU" in reader.warnings[0]
+    reader = LogReader(log, motion=MotionTopics())
+    list(reader.messages())
+    assert "several topics of sensor_msgs/msg/Imu" in reader.warnings[0] and "motion.imu_topic" in reader.warnings[0]
+    with pytest.raises(DriverError, match=r"'/nothing' is not in .*motion\.wheel_topic must be one of nav_msgs"):
+        LogReader(log, motion=MotionTopics(wheels="/nothing"))
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
+    """Serialised by rosbags, which knows both."""
+    store = get_typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
+    t = store.types
+    stamp = t["builtin_interfaces/msg/Time"](5, 7)
+    header = t["std_msgs/msg/Header"](*(() if aligned else (3,)), stamp, "a frame")
+    vector, quaternion = t["geometry_msgs/msg/Vector3"], t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    pose = t["geometry_msgs/msg/Pose"](t["geometry_msgs/msg/Point"](9.0, 9.0, 9.0), quaternion)
+    twist = t["geometry_msgs/msg/Twist"](vector(0.5, 9.0, 9.0), vector(9.0, 9.0, -0.25))
+    odometry = t[ODOMETRY](header, "base", t["geometry_msgs/msg/PoseWithCovariance"](pose, np.ones(36)),
+                           t["geometry_msgs/msg/TwistWithCovariance"](twist, np.ones(36)))
+    imu = t[IMU](header, quaternion, np.ones(9), vector(0.1, -0.2, 0.3), np.ones(9), vector(9.0, 9.0, 9.0), np.ones(9))
+    serialize = store.serialize_cdr if aligned else store.serialize_ros1
+    for message, kind, rates in ((odometry, ODOMETRY, (0.5, -0.25)), (imu, IMU, (0.1, -0.2, 0.3))):
+        data = memoryview(bytes(serialize(message, kind)))
+        reading = parse_motion(kind, data, aligned=aligned)
+        assert reading.rates == rates and reading.stamp_ns == 5_000_000_007
+        for size in range(0, len(data) - 8 * 36, 7):
+            with pytest.raises(FrameDecodeError):
+                parse_motion(kind, data[:size], aligned=aligned)
+
+
+def test_wheels_that_contradict_the_cameras_are_reported(scene: Path, samples: list[MotionSample], tmp_path: Path) -> None:
+    """Their sign is wrong: they are left out, the poses stay right, and a line says what to check."""
+    backwards = [replace(sample, velocity_mps=-sample.velocity_mps) if isinstance(sample, WheelSample) else sample
+                 for sample in samples]
+    log = saved(tmp_path / "log.mcap", scene, [entry(sample) for sample in backwards])
+    result = run(log, scene)
+    assert any("wheels" in warning for warning in result.warnings)
+    assert offsets_m(result, scene)[:DARK.start].max() < 0.01
+    assert TrackingState.LOST in result.states  # no wheels to be trusted in the dark
+
