@@ -108,8 +108,8 @@ def test_samples_are_read_in_the_order_of_their_stamps(log: Path, samples: list[
     assert len(list(reader.frames())) == 2 * PAIRS and not reader.warnings
 
 
-def test_broken_messages_are_counted_and_topics_that_are_not_clear_are_reported(scene: Path, samples: list[MotionSample],
-                                                                            tmp_path: Path) -> None:
+def test_broken_messages_and_topics_that_are_not_clear_are_reported(scene: Path, samples: list[MotionSample],
+                                                                    tmp_path: Path) -> None:
     sample = samples[0]
     wrong = [entry(sample)._replace(data=entry(sample).data[:40]), Entry(GYRO, IMU, b"", sample.stamp_ns),
              entry(next(each for each in samples if isinstance(each, GyroSample)))._replace(topic="/imu/other")]
@@ -147,7 +147,8 @@ def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
                 parse_motion(kind, data[:size], aligned=aligned)
 
 
-def test_wheels_that_contradict_the_cameras_are_reported(scene: Path, samples: list[MotionSample], tmp_path: Path) -> None:
+def test_wheels_that_contradict_the_cameras_are_reported(scene: Path, samples: list[MotionSample], tmp_path: Path
+                                                         ) -> None:
     """Their sign is wrong: they are left out, the poses stay right, and a line says what to check."""
     backwards = [replace(sample, velocity_mps=-sample.velocity_mps) if isinstance(sample, WheelSample) else sample
                  for sample in samples]
