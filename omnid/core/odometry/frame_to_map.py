@@ -74,9 +74,10 @@ class FrameToMap:
             return None
         T_guess_odom = se3.inverse(T_odom_guess)
         in_guess = se3.apply(T_guess_odom, self._map.store.table.points[tracks.landmarks])
+        slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
         shift = exposure.shift(in_guess) if exposure else None
         spread_px = 2 * shift.column_sigma(exposure.motion) if exposure and shift else 0.0
-        views, variance = self._views(frame, tracks, shift, spread_px)
+        views, variance = self._views(frame, tracks, slopes, shift, spread_px)
         disparity = views[:, 2] - views[:, 1]
         if shift:
             views += np.column_stack([shift.lower, shift.upper[:, 1]])
@@ -151,12 +152,12 @@ class FrameToMap:
                 break
         return best
 
-    def _views(self, frame: StereoFrame, tracks: Tracks, shift: ViewShift | None, spread_px: Array | float
-               ) -> tuple[Array, Array]:
+    def _views(self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift | None,
+               spread_px: Array | float) -> tuple[Array, Array]:
         """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
 
-        spread_px: standard deviations (M,) of the columns there, twice. Also returns the variances (M,) [px^2] of the
-        rows by noise.
+        slopes (M, 2) of their disparities; spread_px: standard deviations (M,) of the columns there, twice. Also
+        returns the variances (M,) [px^2] of the rows by noise.
         """
         pair = frame.lower, frame.upper
         guess = tracks.pixels.copy()
@@ -165,7 +166,7 @@ class FrameToMap:
             guess += shift.lower - shift.upper
         # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
         near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
-        rows, variance = align_rows(pair, tracks.pixels, near)
+        rows, variance = align_rows(pair, tracks.pixels, near, slopes, self._model)
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(

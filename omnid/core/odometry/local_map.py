@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
-from omnid.core.odometry.patch_alignment import AlignedPatches, affine_warps, align, templates_of
+from omnid.core.odometry.patch_alignment import AlignedPatches, align
+from omnid.core.odometry.plane_patches import moved_slopes, plane_templates
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
 from omnid.core.stereo.triangulation import view
@@ -104,7 +105,13 @@ class LocalMap:
         predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2] - shift
         anchors = table.anchor[landmarks]
         T_curr_ref = self.store.from_anchors(T_rect_odom, landmarks)
-        warps = affine_warps(table.views[landmarks], table.slopes[landmarks], T_curr_ref, self._model)
+        surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
-        templates = templates_of(images, anchors, table.anchor_pixels[landmarks], warps, predicted)
+        templates = plane_templates(images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model,
+                                    predicted)
         return align(templates, lower, predicted, anchors, REACH_PX)
+
+    def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
+        """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""
+        table, T_curr_ref = self.store.table, self.store.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
+from omnid.core.odometry.corners import clear_around, corners
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate, is_jump, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
@@ -22,7 +22,7 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
-from omnid.core.odometry.patch_alignment import align_rows, disparity_slopes, view_noise
+from omnid.core.odometry.new_landmarks import located
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -288,33 +288,16 @@ class VisualOdometry:
         return np.zeros((0, 2))
 
     def _add_keyframe(self, frame: StereoFrame, usable: Flags, known: Array, exposure: Exposure | None) -> Array:
-        """Add a keyframe with new landmarks between the known ones (N, 2); return the pixels (M, 2) of the new ones.
-
-        They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
-        """
+        """Add a keyframe with new landmarks between the known ones (N, 2); return the pixels (M, 2) of the new ones."""
         free = clear_around(usable, known, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._wanted() - len(known))
-        dense = frame.disparity_at(exposure)
-        guess = np.column_stack([points[:, 0], points[:, 1] + nearby_disparity(dense, points)])
-        spread_px: Array | float = 0.0
-        if exposure:
-            guess, spread_px = exposure.upper_pixels(points, guess[:, 1] - points[:, 1])
-        pair = frame.lower, frame.upper
-        near = pixels_in_upper(pair, points, guess, self._stereo_klt, spread_px)
-        rows, variance = align_rows(pair, points, near)
-        located = np.isfinite(rows)
+        new = located(frame, points, self._model, self._stereo_klt, exposure)
         keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._covariance)
-        points, rows, noise = points[located], rows[located], view_noise(np.zeros((2, 2)), variance[located])
-        views = np.column_stack([points, rows])
-        if exposure:
-            views, by_motion = exposure.corrected(points, rows)
-            noise += by_motion
-        slopes = disparity_slopes(dense, points, views[:, 2] - views[:, 1])
-        self._map.add_keyframe(keyframe, views, slopes, noise, points)
+        self._map.add_keyframe(keyframe, new.views, new.slopes, new.noise, new.pixels)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames_since_keyframe = 0
-        return points
+        return new.pixels
 
     def _wanted(self) -> int:
         """Return the number of landmarks wanted in a keyframe."""

@@ -16,11 +16,10 @@ from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
-from omnid.core.odometry.patch_alignment import align, disparity_slopes
-from omnid.core.odometry.patch_fit import TEMPLATE_PX
+from omnid.core.odometry.patch_alignment import align
+from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, plane_templates
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
-from omnid.core.rig.plane_patches import plane_templates
 from omnid.core.stereo.triangulation import triangulate, view
 
 Array = NDArray[np.float64]
@@ -125,6 +124,7 @@ class DriveLandmarks:
         pixels, above = pixels[found], above[found]
         views = np.column_stack([pixels, above[:, 1]])
         slopes = disparity_slopes(current.disparity, pixels, above[:, 1] - pixels[:, 1])
+        slopes = fitted_slopes((current.lower, current.upper), pixels, above, slopes, model)
         points = triangulate(views, model.cylinder, model.baseline_m)
         first = len(self._points)
         self._points = np.concatenate([self._points, se3.apply(current.T_odom_rect, points)])
@@ -151,15 +151,12 @@ class DriveLandmarks:
     def _aligned(self, current: View, index: Indices, near: Array, *, upper: bool) -> tuple[Array, Flags]:
         """Return pixels (M, 2) of landmarks near those given, by their first keyframes' patches, and which fit."""
         anchors = self._anchor[index]
-        templates = np.zeros((len(index), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
         T_rect_odom = se3.inverse(current.T_odom_rect)
         known = {int(a): T_rect_odom @ self._keyframes[a].T_odom_rect for a in np.unique(anchors).tolist()}
         T_curr_ref = np.array([known[a] for a in anchors.tolist()]).reshape(-1, 4, 4)
-        for a in known:
-            at = np.flatnonzero(anchors == a)
-            planes = self._views[index[at]], self._slopes[index[at]]
-            templates[at] = plane_templates(self._keyframes[a].lower, planes, T_curr_ref[at], self._model, near[at],
-                                            upper=upper)
+        views, images = self._views[index], {a: self._keyframes[a].lower for a in known}
+        surfaces = triangulate(views, self._model.cylinder, self._model.baseline_m), self._slopes[index]
+        templates = plane_templates(images, anchors, views[:, :2], surfaces, T_curr_ref, self._model, near, upper=upper)
         aligned = align(templates, current.upper if upper else current.lower, near, anchors, REACH_PX)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([pixels[:, 0] % self._model.cylinder.width, pixels[:, 1]]), aligned.found

@@ -1,0 +1,68 @@
+"""Location of a keyframe's new landmarks: in the upper panorama, in depth, and the slopes of their surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.odometry.corners import nearby_disparity, pixels_in_upper
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.patch_alignment import align_rows, view_noise
+from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings
+
+Array = NDArray[np.float64]
+
+SLOPE_STEP_PX = 4.0  # half the distance over which the correction of a slope for the motion is measured
+
+
+@dataclass(frozen=True, slots=True)
+class NewLandmarks:
+    """Landmarks that were located in both panoramas of a keyframe."""
+
+    pixels: Array  # (N, 2) px in the lower panorama
+    views: Array  # (N, 3) px, at the stamp
+    slopes: Array  # (N, 2) px/px of the disparity, at the stamp
+    noise: Array  # (N, 3, 3) px^2 of the views
+
+
+def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure | None
+            ) -> NewLandmarks:
+    """Return those of the corners (N, 2) of the lower panorama that are found in the upper one as well.
+
+    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel. exposure: None where
+    all pixels are exposed at the stamp.
+    """
+    dense = frame.disparity_at(exposure)
+    guess = np.column_stack([corners[:, 0], corners[:, 1] + nearby_disparity(dense, corners)])
+    spread_px: Array | float = 0.0
+    if exposure:
+        guess, spread_px = exposure.upper_pixels(corners, guess[:, 1] - corners[:, 1])
+    pair = frame.lower, frame.upper
+    near = pixels_in_upper(pair, corners, guess, klt, spread_px)
+    slopes = disparity_slopes(dense, corners, near[:, 1] - corners[:, 1])
+    slopes = fitted_slopes(pair, corners, near, slopes, model)
+    rows, variance = align_rows(pair, corners, near, slopes, model)
+    found = np.isfinite(rows)
+    pixels, rows, slopes = corners[found], rows[found], slopes[found]
+    noise = view_noise(np.zeros((2, 2)), variance[found])
+    if exposure is None:
+        return NewLandmarks(pixels, np.column_stack([pixels, rows]), slopes, noise)
+    views, by_motion = exposure.corrected(pixels, rows)
+    return NewLandmarks(pixels, views, _at_stamp(slopes, pixels, rows, exposure), noise + by_motion)
+
+
+def _at_stamp(slopes: Array, pixels: Array, rows: Array, exposure: Exposure) -> Array:
+    """Return slopes (N, 2) at the stamp from slopes between the exposures at pixels (N, 2) with upper rows (N,)."""
+    corrected = np.empty(slopes.shape)
+    for axis, step in enumerate(SLOPE_STEP_PX * np.eye(2)):
+        ends = []
+        for sign in (1, -1):
+            views, _ = exposure.corrected(pixels + sign * step, rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis]))
+            ends.append(views[:, 2] - views[:, 1])
+        corrected[:, axis] = (ends[0] - ends[1]) / (2 * SLOPE_STEP_PX)
+    return np.where(np.isfinite(corrected), corrected, slopes)

@@ -1,0 +1,107 @@
+"""Patches of planes, as another view shows them: the exact map, in closed form, and the slopes of the planes.
+
+A wall seen aslant is stretched more on its near side than on its far side, and that changes from view to view. Over a
+window of 13 px the quadratic part of the map shifts a patch by some hundredths of a pixel, in the same direction for a
+whole wall, so that no number of landmarks averages it out: an affine map is not enough.
+
+A plane n . p = 1 is seen from a motion p' = R p + t as n' . p' = 1 + n' . t with n' = R n. A ray u' from the origin o'
+meets it at the scale (1 + n' . t - n' . o') / (n' . u'), so that the point in the first frame is in the direction of
+R^T ((1 + n' . t - n' . o') u' + (o' - t) (n' . u')): a linear map of u', the homography of the plane (Hartley and
+Zisserman 2004, 13.1), here between cylinders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.odometry import plane_kernels, slope_kernels
+from omnid.core.odometry.patch_fit import TEMPLATE_PX
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.tracking import PaddedPanorama
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Image = NDArray[np.uint8]
+Indices = NDArray[np.intp]
+
+SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the dense disparity is measured
+SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface
+SLOPE_PRIOR = 50.0  # px^2, weight of slope zero (an upright surface facing the camera) in the least squares
+MIN_NOISE_GREY = 1.0  # of images: rounding and what the model leaves out
+
+
+def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixels: Array, surfaces: tuple[Array, Array],
+                    T_curr_ref: Array, model: StereoModel, predicted: Array, *, upper: bool = False) -> Image:
+    """Return templates (N, TEMPLATE, TEMPLATE) of patches at pixels (N, 2) of images, as the current view shows them.
+
+    anchors (N,): the key of the image of each. surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of
+    the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from these. upper: the current
+    panorama is the upper one. The templates' pixels are whole pixels of the current panorama, which shows the centres
+    at predicted (N, 2). Where a plane is seen edge on, the patch is not bent.
+    """
+    templates = np.empty((len(pixels), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
+    points, slopes = (np.ascontiguousarray(part) for part in surfaces)
+    T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.rint(predicted) - predicted
+    height_m = model.baseline_m if upper else 0.0
+    for key in np.unique(anchors).tolist():
+        plane_kernels.sample(images[key].image, np.flatnonzero(anchors == key), _padded(images[key], pixels), points,
+                             slopes, T_curr_ref, model.baseline_m, height_m, model.cylinder.focal_px, shift, templates)
+    return templates
+
+
+def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel) -> Array:
+    """Return the slopes (N, 2) of the disparity in the frames to which T_curr_ref (N, 4, 4) leads.
+
+    surfaces: points (N, 3) and slopes (N, 2). Zero where the plane is seen nearly edge on.
+    """
+    points, slopes = (np.ascontiguousarray(part) for part in surfaces)
+    moved = np.empty((len(points), 2))
+    plane_kernels.move_slopes(points, slopes, np.ascontiguousarray(T_curr_ref), model.baseline_m, moved)
+    return moved
+
+
+def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: int = SLOPE_REACH_PX) -> Array:
+    """Return slopes (N, 2) of the disparity [px/px] along column and row at points (N, 2) with disparity centre (N,).
+
+    A plane through the centre by regularised least squares; neighbours that differ by more than SAME_SURFACE_PX are
+    left out, and all where the centre is NaN. Dense stereo matches upright windows, so these slopes are too flat.
+    """
+    height, width = disparity.shape
+    offsets = np.arange(-reach_px, reach_px + 1)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
+    columns = (np.rint(points[:, :1]).astype(int) + dx) % width
+    rows = np.clip(np.rint(points[:, 1:]).astype(int) + dy, 0, height - 1)
+    change = disparity[rows, columns] - centre[:, None]
+    near = np.abs(change) < SAME_SURFACE_PX
+    change = np.where(near, change, 0.0)
+    xx, yy, xy = near @ (dx * dx) + SLOPE_PRIOR, near @ (dy * dy) + SLOPE_PRIOR, near @ (dx * dy)
+    x, y = change @ dx, change @ dy
+    return np.asarray(np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None])
+
+
+def fitted_slopes(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, near: Array, start: Array,
+                  model: StereoModel) -> Array:
+    """Return slopes (N, 2) of the disparity at pixels (N, 2) of the lower panorama, seen near (N, 2) in the upper one.
+
+    start (N, 2): first values, which stay where near is NaN or the fit fails. A plane makes the upper window a bent
+    lower one: its shift, its two slopes, gain and offset are fitted to both windows together, by Gauss-Newton with the
+    lower one's gradient as in `patch_fit`. The start is a weak prior. Dense slopes are a third too flat and scatter by
+    0.05; a landmark's patch, seen from elsewhere, would be shifted by tenths of a pixel.
+    """
+    known = np.flatnonzero(np.isfinite(near).all(axis=1))
+    lower, upper = pair
+    slopes, found = start.copy(), np.empty((len(known), 2))
+    heights = (model.cylinder.row0 - pixels[known, 1]) / model.cylinder.focal_px
+    noise_grey = max(lower.noise_grey, MIN_NOISE_GREY)
+    slope_kernels.fit(lower.image, upper.image, _padded(lower, pixels[known]), _padded(upper, near[known]),
+                      np.ascontiguousarray(start[known]), heights, model.cylinder.focal_px, noise_grey, found)
+    slopes[known] = found
+    return slopes
+
+
+def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
+    """Return pixels (N, 2) of the padded image, their columns first brought into [0, width)."""
+    return np.column_stack([pixels[:, 0] % panorama.width + panorama.pad_px, pixels[:, 1]])
