@@ -62,7 +62,8 @@ def _at_stamp(slopes: Array, pixels: Array, rows: Array, exposure: Exposure) -> 
     for axis, step in enumerate(SLOPE_STEP_PX * np.eye(2)):
         ends = []
         for sign in (1, -1):
-            views, _ = exposure.corrected(pixels + sign * step, rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis]))
+            there = rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis])
+            views, _ = exposure.corrected(pixels + sign * step, there)
             ends.append(views[:, 2] - views[:, 1])
         corrected[:, axis] = (ends[0] - ends[1]) / (2 * SLOPE_STEP_PX)
     return np.where(np.isfinite(corrected), corrected, slopes)

@@ -69,8 +69,8 @@ def move_slopes(points: Array, slopes: Array, T_curr_ref: Array, baseline_m: flo
 def write_normal(point: Array, slope: Array, baseline_m: float, normal: Array) -> None:
     """Write n (3,) [1/m] of the plane n . p = 1 through a point with slopes (2,) of the disparity.
 
-    The disparity f t / r is f t n . u for the ray u with r = 1, azimuth falls by 1 / f and the height of u by 1 / f from
-    pixel to pixel: so the slopes are -t times the components of n along azimuth and axis.
+    The disparity f t / r is f t n . u for the ray u with r = 1, azimuth and the height of u fall by 1 / f from pixel
+    to pixel: so the slopes are -t times the components of n along azimuth and axis.
     """
     per_r = 1 / math.hypot(point[0], point[1])
     x, y = point[0] * per_r, point[1] * per_r
@@ -81,9 +81,9 @@ def write_normal(point: Array, slope: Array, baseline_m: float, normal: Array) -
 
 @inner
 def write_homography(point: Array, normal: Array, T: Array, height_m: float, H: Array) -> float:
-    """Write the homography (3, 3) from rays of the current view to those of the keyframe, and return z / r of the patch.
+    """Write the homography (3, 3) from rays of the current view to those of the keyframe.
 
-    Both sides have their azimuth 0 at the patch. z / r: of the point in the current view.
+    Both have their azimuth 0 at the patch. Returns z / r of the patch in the current view.
     """
     turned, t, seen = np.empty(3), np.empty(3), np.empty(3)
     for a in range(3):
@@ -101,7 +101,7 @@ def write_homography(point: Array, normal: Array, T: Array, height_m: float, H: 
     c, s = seen[0] / r, seen[1] / r
     for a in range(3):
         H[a, 0], H[a, 1] = c * H[a, 0] + s * H[a, 1], c * H[a, 1] - s * H[a, 0]
-    height = seen[2] / r
+    height = float(seen[2] / r)
     r = math.hypot(point[0], point[1])
     c, s = point[0] / r, point[1] / r
     for b in range(3):
@@ -140,13 +140,13 @@ def write_sources(H: Array, own_height: float, height: float, focal_px: float, s
 
 
 @inner
-def cubic(image: Image, column: float, row: float) -> float:
+def cubic(image: Image, column: np.float32, row: np.float32) -> np.float32:
     """Return the grey between pixels by cubic convolution (Keys 1981, a = -1/2); the border is repeated.
 
     Bilinear interpolation shifts fine texture by up to 0.02 px, depending on the place between the pixels.
     """
     height, width = image.shape
-    left, top = int(math.floor(column)), int(math.floor(row))
+    left, top = math.floor(column), math.floor(row)
     x, y = column - np.float32(left), row - np.float32(top)
     u, v = ONE - x, ONE - y
     w0, w3 = -HALF * x * u * u, -HALF * u * x * x

@@ -33,8 +33,9 @@ SLOPE_PRIOR = 50.0  # px^2, weight of slope zero (an upright surface facing the 
 MIN_NOISE_GREY = 1.0  # of images: rounding and what the model leaves out
 
 
-def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixels: Array, surfaces: tuple[Array, Array],
-                    T_curr_ref: Array, model: StereoModel, predicted: Array, *, upper: bool = False) -> Image:
+def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixels: Array,
+                    surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel, predicted: Array, *,
+                    upper: bool = False) -> Image:
     """Return templates (N, TEMPLATE, TEMPLATE) of patches at pixels (N, 2) of images, as the current view shows them.
 
     anchors (N,): the key of the image of each. surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of
@@ -44,7 +45,7 @@ def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixe
     """
     templates = np.empty((len(pixels), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
     points, slopes = (np.ascontiguousarray(part) for part in surfaces)
-    T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.rint(predicted) - predicted
+    T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.ascontiguousarray(np.rint(predicted) - predicted)
     height_m = model.baseline_m if upper else 0.0
     for key in np.unique(anchors).tolist():
         plane_kernels.sample(images[key].image, np.flatnonzero(anchors == key), _padded(images[key], pixels), points,

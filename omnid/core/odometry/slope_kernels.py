@@ -37,7 +37,7 @@ def fit(lower: Image, upper: Image, pixels: Array, near: Array, start: Array, he
     design, normal = np.empty((UNKNOWNS, SIDE_PX, SIDE_PX)), np.empty((UNKNOWNS, UNKNOWNS))
     for n in range(len(pixels)):
         slopes[n, 0], slopes[n, 1] = start[n, 0], start[n, 1]
-        column, row = int(round(pixels[n, 0])), int(round(pixels[n, 1]))
+        column, row = round(pixels[n, 0]), round(pixels[n, 1])
         height, width = lower.shape
         if min(row, column) <= HALF_PX or row >= height - HALF_PX - 1 or column >= width - HALF_PX - 1:
             continue
@@ -51,8 +51,8 @@ def fit(lower: Image, upper: Image, pixels: Array, near: Array, start: Array, he
 def write_design(image: Image, column: int, row: int, design: Array, normal: Array) -> None:
     """Write the design (5, SIDE, SIDE), about its means, of the window about a pixel, and its products (5, 5).
 
-    Minus the gradients along column and row (Scharr's 3x3 operator), the second also times the pixel's column and row in
-    the window, and the window itself.
+    Minus the gradients along column and row (Scharr's 3x3 operator), the second also times the pixel's column and row
+    in the window, and the window itself.
     """
     for i in range(-HALF_PX, HALF_PX + 1):
         for j in range(-HALF_PX, HALF_PX + 1):
