@@ -54,7 +54,10 @@ def _parser(words: Sequence[str]) -> Parser:
     else:
         names = () if "--version" in words else COMMANDS
     for name in names:
-        import_module(f"omnid.commands.{MODULES.get(name, name)}").add_parser(subparsers)
+        module = import_module(f"omnid.commands.{MODULES.get(name, name)}")
+        listed = len(names) > 1 and not {"-h", "--help"}.isdisjoint(words)  # the help of all commands
+        add = getattr(module, "add_listed", module.add_parser) if listed else module.add_parser
+        add(subparsers)
     add_examples(parser)
     if _completes():
         with suppress(ImportError):  # the extra `completion`

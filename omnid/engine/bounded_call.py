@@ -1,4 +1,4 @@
-"""Calls that may block for longer than their caller can wait."""
+"""Calls in threads of their own, which may take longer than their caller can wait now."""
 
 from __future__ import annotations
 
@@ -16,3 +16,13 @@ def returns_within(action: Callable[[], None], timeout_s: float, name: str) -> b
     thread.start()
     thread.join(timeout_s)
     return not thread.is_alive()
+
+
+def started(action: Callable[[], None], name: str) -> Callable[[], None]:
+    """Call an action in a thread; return a function that waits for its end.
+
+    The thread does not keep the program from ending. What the action raises is lost.
+    """
+    thread = threading.Thread(target=action, name=name, daemon=True)
+    thread.start()
+    return thread.join

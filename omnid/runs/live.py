@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, suppress
 from functools import partial
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
@@ -29,6 +30,7 @@ from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.rig_monitor import RigMonitor, RigMonitorSink, start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.diagnostics.terminal_status import TerminalStatus
+from omnid.engine.bounded_call import started
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
@@ -91,7 +93,7 @@ class LiveRun:
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
-        prepare_kernels(self._report)
+        imported = started(_import_slow_modules, "imports")
         compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
         offset_ns = time.time_ns() - time.monotonic_ns()
         with ExitStack() as outputs:
@@ -99,6 +101,8 @@ class LiveRun:
                               offset_ns=offset_ns)
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
+            imported()
+            prepare_kernels(self._report)
             self._connected = True
             cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
             run_places = RunPlaces(self._config, geometry, session.warn)
@@ -282,6 +286,13 @@ class LiveRun:
             record(key, payload)
 
         bus.subscribe_commands(receive, topics)
+
+
+def _import_slow_modules() -> None:
+    """Import what takes half a second, while images are awaited; where it cannot be imported, its users raise."""
+    with suppress(Exception):
+        for module in ("numba", "filterpy.kalman"):
+            import_module(module)
 
 
 def _ready(config: Config) -> str:

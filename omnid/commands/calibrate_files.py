@@ -1,0 +1,135 @@
+"""`omnid calibrate import` and `export`: the rigs of other programs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+
+from calib import se3
+from calib.kalibr import export_kalibr, import_kalibr
+from calib.models.camera import field_of_view
+from calib.models.ocam import VIEWS, OcamCamera
+from calib.ocam_file import export_ocam, import_ocam
+from calib.rig import MountedCamera, Rig
+from calib.rig_file import read_rig, write_file, write_rig
+from calib.transform_file import read_transform, straight_up, transform_toml
+from omnid.errors import OmnidError
+from omnid.sinks.files import check_outputs
+
+
+def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `import` and `export` to the actions of `calibrate`."""
+    importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, or from two OCamCalib files")
+    exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
+    _add_import(importing)
+    _add_export(exporting)
+    for action in (importing, exporting):
+        action.set_defaults(run=run)
+
+
+def _add_import(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml")
+    parser.add_argument("--lower", default="", help="the lower camera: its name in the camchain (cam0), or its "
+                        "calib_results.txt")
+    parser.add_argument("--upper", default="", help="the same for the upper camera")
+    between = parser.add_mutually_exclusive_group()
+    between.add_argument("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers")
+    between.add_argument("--baseline", type=float, metavar="M", help="metres from the lower viewpoint straight up to "
+                         "the upper one; both cameras look up and are equally oriented")
+    parser.add_argument("--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly "
+                        "through a lens")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
+
+
+def _add_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("rig", type=Path, help="the rig.toml to read")
+    parser.add_argument("--format", choices=("kalibr", "ocam"), required=True)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="kalibr: the file to write; ocam: a folder, "
+                        "or PATH for PATH.lower.txt, PATH.upper.txt and PATH.transform.toml")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import or export a rig, and print one line about it."""
+    _must_be_writable(args.output)
+    if args.action == "import":
+        rig = _kalibr(args) if args.camchain else _ocam(args)
+        write_rig(args.output, rig)
+        print(f"{args.output}: {describe(rig)}")
+    else:
+        rig = read_rig(args.rig)
+        check_outputs([("--output", args.output)] * (args.format == "kalibr"), [("the rig that is read", args.rig)])
+        written = _export_kalibr(rig, args.output) if args.format == "kalibr" else _export_ocam(rig, args.output)
+        print(f"{', '.join(map(str, written))}: {describe(rig)}{_left_out(rig)}")
+    return 0
+
+
+def _must_be_writable(path: Path) -> None:
+    existing = path if path.exists() else path.parent
+    if not path.parent.is_dir():
+        raise OmnidError(f"--output {path}: there is no folder {path.parent}; make it first")
+    if not os.access(existing, os.W_OK):
+        raise OmnidError(f"--output {path}: {existing} is not writable")
+
+
+def _kalibr(args: argparse.Namespace) -> Rig:
+    if args.transform or args.baseline is not None or args.view:
+        raise OmnidError(f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
+                         "holds its transforms")
+    check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
+    return import_kalibr(args.camchain, args.lower, args.upper)
+
+
+def _ocam(args: argparse.Namespace) -> Rig:
+    if not (args.lower and args.upper):
+        raise OmnidError("calibrate import: expected a Kalibr camchain.yaml, or two OCamCalib files as --lower and "
+                         "--upper")
+    if args.transform is None and args.baseline is None:
+        raise OmnidError("calibrate import: OCamCalib files do not contain the transform between the cameras: give "
+                         "--transform FILE or --baseline METRES")
+    read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
+    check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
+    T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+    return import_ocam(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror")
+
+
+def _export_kalibr(rig: Rig, path: Path) -> list[Path]:
+    write_file(path, export_kalibr(rig).encode())
+    return [path]
+
+
+def _export_ocam(rig: Rig, path: Path) -> list[Path]:
+    base = path / "calib_results" if path.is_dir() else path
+    T_lower_upper = rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig)
+    texts = {f"{base}.lower.txt": export_ocam(rig.lower.camera), f"{base}.upper.txt": export_ocam(rig.upper.camera),
+             f"{base}.transform.toml": transform_toml(T_lower_upper)}
+    for name, text in texts.items():
+        write_file(Path(name), text.encode())
+    return [Path(name) for name in texts]
+
+
+def _left_out(rig: Rig) -> str:
+    masks = rig.lower.mask is not None or rig.upper.mask is not None
+    left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
+    left += ["covariance"] * (rig.covariance is not None)
+    return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
+
+
+def describe(rig: Rig) -> str:
+    """Return one line about a rig: models, sizes, fields of view, baseline, rotation between the cameras, topics."""
+    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
+    lower, upper = (_describe(mounted, topic)
+                    for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True))
+    return (f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
+            f"{rotation_deg:.2f} deg")
+
+
+def _describe(mounted: MountedCamera, topic: str) -> str:
+    camera = mounted.camera
+    model = f"ocam {camera.view}" if isinstance(camera, OcamCamera) else "omni"
+    nearest, farthest = np.rad2deg(field_of_view(camera, mounted.visible))
+    seen = f"{model} {camera.size[0]}x{camera.size[1]}, {nearest:.0f} to {farthest:.0f} deg from its axis"
+    return seen + (f" ({topic})" if topic else "")
