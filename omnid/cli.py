@@ -14,9 +14,9 @@ from typing import NoReturn
 from omnid.commands.examples import add_examples
 from omnid.version import __version__
 
-COMMANDS = ("run", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "drive", "goto", "route",
-            "listen", "view", "web", "batch", "record", "report", "log", "map", "diff", "doctor", "motor", "config",
-            "install-service")
+COMMANDS = ("run", "simulate", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "drive", "goto",
+            "route", "listen", "view", "web", "batch", "record", "report", "log", "map", "diff", "doctor",
+            "motor", "config", "install-service")
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
 WRONG_INPUT = 2
 

@@ -11,6 +11,7 @@ from typing import Final
 EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "run": ("run --config /etc/omnid/omnid.toml", "run --log drive.mcap --rig rig.toml --motor simulated",
             "run --lower /dev/video0 --upper /dev/video2 --rig rig.toml"),
+    "simulate": ("simulate room", "simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover"),
     "replay": ("replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
                "replay drive.mcap --record out.mcap --method paper", "replay drive.mcap --start-s 60 --seconds 20"),
     "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",

@@ -23,8 +23,9 @@ SAMPLES: Final = 2  # per pixel and axis
 class SimulatedCameras:
     """Renders raw grey frames; an image follows from world, people, pose, sequence number and seed alone."""
 
-    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int) -> None:
-        self._world, self._seed = world, seed
+    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int = SAMPLES) -> None:
+        """samples: per pixel and axis."""
+        self._world, self._seed, self._samples = world, seed, samples
         self._mounted = {"lower": rig.lower, "upper": rig.upper}
         self._sensors = {name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
                          for name, mounted in self._mounted.items()}
@@ -34,7 +35,8 @@ class SimulatedCameras:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
         mounted, sensor = self._mounted[camera], self._sensors[camera]
         scene = Scene((*self._world.standing, *people.faces()))
-        ideal = render_grey(scene, mounted, T_world_rig, SAMPLES) * np.float32(brightness * self._world.brightness)
+        light = np.float32(brightness * self._world.brightness)
+        ideal = render_grey(scene, mounted, T_world_rig, self._samples) * light
         rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
         width, height = mounted.camera.size
         return Frame(seq, stamp_ns, camera, "mono8", sensor.expose(ideal, rng), width, height)

@@ -8,6 +8,7 @@ import select
 import threading
 import time
 import tty
+from collections import deque
 from typing import Protocol
 
 from drivers.motor import VelocityCommand
@@ -15,6 +16,7 @@ from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
 
 READ_LIMIT_BYTES = 4096
+POSES_KEPT = 1000  # with their times: seconds
 LONGEST_ABSENCE_S = 0.05  # a thread that was not scheduled for longer does not advance: the host was not late
 
 
@@ -39,6 +41,7 @@ class SimulatedMotor:
         self.drop_replies = False  # fault: commands are carried out without a reply
         self.drop_input = False  # fault: received bytes are ignored
         self.garbage = b""  # fault: sent before each reply
+        self.poses: deque[tuple[int, Pose]] = deque(maxlen=POSES_KEPT)  # time (CLOCK_MONOTONIC) [ns] and pose
         self._device, self._host = os.openpty()
         tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
         os.set_blocking(self._device, False)
@@ -107,6 +110,7 @@ class SimulatedMotor:
             now_s = time.monotonic()
             self.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
             last_s = now_s
+            self.poses.append((round(now_s * 1e9), self.base.pose))
             if self._wake_read in readable:
                 return
             if self._expiring.is_set():

@@ -1,0 +1,121 @@
+"""`omnid simulate`: the daemon with a simulated robot in a simulated world, for users without a robot."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections import Counter, defaultdict
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.config import add_settings
+from omnid.commands.map_option import add_map, map_settings
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from omnid.config import Config
+    from omnid.runs.live import OpenCamera
+    from omnid.simulation.realtime import RealtimeRobot
+    from omnid.simulation.robot import SimulatedRobot
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `simulate` to the command line."""
+    parser = subparsers.add_parser(
+        "simulate", help="the daemon with a simulated robot in a simulated world",
+        description="Run the daemon with a simulated robot: both cameras are rendered, and the motor controller is "
+        "simulated behind a pseudo-terminal. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, "
+        "`omnid goto`, `omnid web`.")
+    parser.add_argument("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)")
+    parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
+    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")
+    parser.add_argument("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default "
+                        "%(default)s")
+    parser.add_argument("--no-people", action="store_true", help="leave the people of the world out")
+    parser.add_argument("--light", type=float, default=1.0, help="factor on the light; default %(default)s")
+    parser.add_argument("--other-posters", type=float, default=0.0, metavar="SHARE", help="share of the posters that "
+                        "is exchanged, 0 to 1; default %(default)s")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, "
+                        "at the end")
+    add_map(parser)
+    add_settings(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until a signal comes."""
+    from omnid.engine.malloc_settings import use_one_malloc_arena
+
+    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
+    from omnid.config import load_config, unused_settings
+    from omnid.engine.logging_setup import HANDLER, log
+    from omnid.runs.live import LiveRun
+    from omnid.simulation.realtime import RealtimeRobot
+    from omnid.simulation.world_file import WorldOptions, load_world
+    from omnid.sinks.files import check_outputs
+
+    check_outputs([("--truth", args.truth)] if args.truth else [], [])
+    config = load_config(args.config, [*args.overrides, *map_settings(args)])
+    for warning in unused_settings(config, "run", args.overrides):
+        log(logging.WARNING, warning)
+    if args.seed < 0:
+        from omnid.errors import OmnidError
+
+        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
+    options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
+    world = load_world(args.world, args.seed, options)
+    show = HANDLER.show if sys.stderr.isatty() else None
+    robot = RealtimeRobot(world, _robot(args), config.motor.protocol, config.motor.drive.geometry(), args.seed,
+                          lambda line: log(logging.WARNING, line))
+    with closing(robot):
+        config = replace(config, motor=replace(config.motor, port=robot.port))
+        code = LiveRun(config, _opener(robot), log, robot.rig, show).run()
+    if args.truth:
+        _write_truth(args.truth, robot, config)
+    log(logging.INFO, f"contacts with obstacles: {robot.contacts}")
+    return code
+
+
+def _robot(args: argparse.Namespace) -> SimulatedRobot:
+    from calib.rig_file import read_rig
+    from omnid.errors import OmnidError
+    from omnid.simulation.robot import make_robot
+
+    if not 64 <= args.size <= 2048:
+        raise OmnidError(f"--size {args.size}: expected 64 to 2048 px")
+    return make_robot(args.size, read_rig(args.rig) if args.rig else None)
+
+
+def _opener(robot: RealtimeRobot) -> OpenCamera:
+    """Return a function that opens cameras; those that are opened together have one clock."""
+    from drivers.cameras.log_camera import LogClock
+    from drivers.frame import Camera
+    from omnid.simulation.realtime import SimulatedCamera
+
+    clocks: defaultdict[int, LogClock] = defaultdict(LogClock)
+    opened: Counter[Camera] = Counter()
+
+    def open_camera(camera: Camera) -> SimulatedCamera:
+        opened[camera] += 1
+        return robot.open_camera(camera, clocks[opened[camera]])
+
+    return open_camera
+
+
+def _write_truth(path: Path, robot: RealtimeRobot, config: Config) -> None:
+    """Write the true poses of the base since the first one, with the stamps of the poses on the bus."""
+    import time
+
+    import numpy as np
+
+    from calib import se3
+    from omnid.sinks.files import write_trajectory
+
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    poses = np.array(list(robot.truth.values())).reshape(-1, 3)
+    zero = np.zeros(len(poses))
+    R = se3.rotation_exp(np.column_stack([zero, zero, poses[:, 2]]))
+    T = se3.transform(R, np.column_stack([poses[:, :2], zero]))
+    write_trajectory(path, np.array(list(robot.truth), np.int64) + offset_ns, se3.inverse(T[:1]) @ T)

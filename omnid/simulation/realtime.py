@@ -1,0 +1,144 @@
+"""A simulated robot in real time: cameras for `omnid run`, and a motor controller on a pseudo-terminal.
+
+The daemon is the same as on a robot: it opens the terminal as its serial port, and takes the frames as those of two
+cameras. Only the wheels decide what the cameras see next.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from drivers.cameras.camera_state import CameraState
+from drivers.cameras.log_camera import LogClock
+from drivers.frame import Camera, Frame
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
+from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
+from omnid.simulation.cameras import SimulatedCameras
+from omnid.simulation.clearance import clearance_m, footprints
+from omnid.simulation.lockstep import with_masks
+from omnid.simulation.people import Walkers
+from omnid.simulation.robot import SimulatedRobot, traction
+from omnid.simulation.world import World
+
+Array = NDArray[np.float64]
+POLL_S: Final = 0.002  # between two checks for the motion up to an exposure
+LONGEST_WAIT_S: Final = 0.2  # for the motion up to an exposure; then the newest pose is taken
+SAMPLES: Final = 1  # per pixel and axis: textures are filtered, only edges of surfaces are not
+MOST_POSES: Final = 200_000  # kept of the truth: five hours; older ones give way
+
+
+class RealtimeRobot:
+    """A robot whose time is that of the computer; `port` is its serial port."""
+
+    def __init__(self, world: World, robot: SimulatedRobot, protocol: str, drive: DifferentialDrive, seed: int = 0,
+                 report: Callable[[str], None] | None = None) -> None:
+        """Open the terminal. report: takes a line at each contact with an obstacle."""
+        self.rig = with_masks(robot.rig)
+        self._robot, self._world, self._report = robot, world, report
+        controller = SIMULATED_CONTROLLERS[protocol](drive)
+        base = controller.base
+        base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
+        self._motor = SimulatedMotor(controller)
+        self.port = self._motor.port
+        self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
+        self._standing = footprints(world.standing, robot.height_m)
+        self._touches = False
+        self.contacts = 0
+        self.truth: dict[int, Pose] = {}  # of the base in the world, by the stamps of the lower camera
+
+    def open_camera(self, camera: Camera, clock: LogClock) -> SimulatedCamera:
+        """Return a camera; clock: start of both cameras."""
+        return SimulatedCamera(self, camera, clock, self._robot.rate_hz)
+
+    def close(self) -> None:
+        """Close the terminal."""
+        self._motor.close()
+
+    def pose_at(self, stamp_ns: int) -> Pose:
+        """Return the pose at a time, as soon as the base has come to it."""
+        until_s = time.monotonic() + LONGEST_WAIT_S
+        poses = self._motor.poses
+        while (not poses or poses[-1][0] < stamp_ns) and time.monotonic() < until_s:
+            time.sleep(POLL_S)
+        recent: list[tuple[int, Pose]] = []
+        while not recent:
+            with suppress(RuntimeError):  # the base moved meanwhile
+                recent = list(poses)
+        times = np.array([ns for ns, _ in recent], np.int64) - stamp_ns
+        places = np.array([pose for _, pose in recent])
+        places[:, 2] = np.unwrap(places[:, 2])
+        x_m, y_m, heading_rad = (float(np.interp(0, times, column)) for column in places.T)
+        return x_m, y_m, math.remainder(heading_rad, math.tau)
+
+    def frame(self, camera: Camera, seq: int, stamp_ns: int, people: Walkers, time_s: float) -> Frame:
+        """Return the frame of a camera at a time."""
+        pose = self.pose_at(stamp_ns)
+        people.advance(time_s, pose[:2])
+        if camera == "lower":
+            self._keep(stamp_ns, pose, people)
+        T_world_base = se3.transform(se3.rotation_exp([0.0, 0.0, pose[2]]), [pose[0], pose[1], 0.0])
+        return self._rendered.frame(camera, seq, stamp_ns, T_world_base @ self.rig.T_base_rig, people)
+
+    def walkers(self) -> Walkers:
+        """Return the people at the start; each camera has its own, who walk alike."""
+        return Walkers(self._world.people)
+
+    def _keep(self, stamp_ns: int, pose: Pose, people: Walkers) -> None:
+        """Keep the truth, and report a contact."""
+        if len(self.truth) >= MOST_POSES:
+            del self.truth[next(iter(self.truth))]
+        self.truth[stamp_ns] = pose
+        walking = footprints(people.faces(), self._robot.height_m)
+        touches = min(clearance_m(segments, pose[:2], self._robot.radius_m) for segments in (self._standing, walking)
+                      ) <= 0
+        if touches and not self._touches:
+            self.contacts += 1
+            if self._report is not None:
+                self._report(f"contact with an obstacle at {pose[0]:.2f}, {pose[1]:.2f} m in the world")
+        self._touches = touches
+
+
+class SimulatedCamera:
+    """One camera of a RealtimeRobot; a frame that cannot be rendered in time is dropped and counted."""
+
+    def __init__(self, robot: RealtimeRobot, camera: Camera, clock: LogClock, rate_hz: float) -> None:
+        self._robot, self._camera, self._clock = robot, camera, clock
+        self._period_ns = round(1e9 / rate_hz)
+        self._closed = False
+        self.state = CameraState(mode="simulated")
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield the frames when they were exposed, until closed."""
+        start_ns, seq, people = self._clock.epoch_ns(), 0, self._robot.walkers()
+        while not self._closed:
+            stamp_ns = start_ns + seq * self._period_ns
+            self._sleep_until(stamp_ns)
+            late = max(0, time.monotonic_ns() - stamp_ns) // self._period_ns
+            if late:
+                self.state.drops += late
+                seq += late
+                continue
+            if not self._closed:
+                self.state.status = "streaming"
+                self.state.frames += 1
+                yield self._robot.frame(self._camera, seq, stamp_ns, people, seq * self._period_ns * 1e-9)
+            seq += 1
+        self.state.status = "closed"
+
+    def close(self) -> None:
+        """End frames(); may be called twice, from any thread."""
+        self._closed = True
+
+    def _sleep_until(self, due_ns: int) -> None:
+        while not self._closed and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
+            time.sleep(min(left_s, 0.02))
