@@ -18,9 +18,9 @@ from omnid.calibration.figures import (
     panorama_image,
     residual_image,
 )
-from omnid.report.page import figure, page, table
+from omnid.report.page import bar, figure, page, table, tiles
 
-MAX_SHOWN_VIEWS = 40
+MAX_VIEWS, SHOWN_VIEWS = 40, 8
 
 
 def camera_report_html(found: CameraCalibration, images: Mapping[str, Image], missing: Sequence[str],
@@ -28,16 +28,17 @@ def camera_report_html(found: CameraCalibration, images: Mapping[str, Image], mi
     """Return the page; images by the views' names, missing: names of images without a board."""
     first = images[found.views[0].name]
     pixels = np.array([view.pixels for view in found.views])
+    views = [(view.pixels, residuals) for view, residuals in zip(found.views, found.fit.residuals, strict=True)]
     parts = [_head(found), _warnings(found), "<h2>Parameters</h2>", _parameters(found), "<h2>Error by image</h2>",
              _views(found, missing), "<h2>Error by distance from the centre</h2>",
              table(("radius [px]", "mean error [px]", "corners"),
                     [(f"{r:.0f}", f"{e:.3f}", str(n)) for r, e, n in
                      error_by_radius(found.fit, pixels, found.camera.center)]),
-             "<h2>Coverage</h2>", figure(coverage_image(first, found), "all corners; arrows are the residuals, "
-                                          f"{ARROW:.0f} times as long; the cross is the centre"),
+             "<h2>Coverage</h2>", figure(coverage_image(first, views, found.camera.center), "all corners; arrows are "
+                                         f"the residuals, {ARROW:.0f} times as long; the cross is the centre"),
              "<h2>Unrolled</h2>", figure(panorama_image(first, found.camera, mask), f"{found.views[0].name} about "
                                           "the ray of the centre: what runs along it in the world stands upright"),
-             "<h2>Residuals</h2>", *_residuals(found, images)]
+             "<h2>Residuals</h2>", tiles(_residuals(found, images), SHOWN_VIEWS)]
     return page("Camera calibration", parts)
 
 
@@ -65,14 +66,14 @@ def _views(found: CameraCalibration, missing: Sequence[str]) -> str:
     worst = float(errors.max())
     corners = [int(np.isfinite(view.pixels[:, 0]).sum()) for view in found.views]
     rows = [(escape(view.name), f"{error:.3f}", str(count), f"{view.confidence:.2f}",
-             f"<span class='bar' style='width:{200 * error / worst:.0f}px'></span>")
+             bar(error / worst))
             for view, error, count in zip(found.views, errors, corners, strict=True)]
     none = f"<p>No board found in {escape(', '.join(missing))}.</p>" if missing else ""
     return table(("image", "mean error [px]", "corners", "confidence", ""), rows) + none
 
 
 def _residuals(found: CameraCalibration, images: Mapping[str, Image]) -> list[str]:
-    shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_SHOWN_VIEWS]
+    shown = list(zip(found.views, found.fit.residuals, found.view_errors_px, strict=True))[:MAX_VIEWS]
     return [figure(residual_image(images[view.name], view.pixels, residuals),
                     f"{view.name}: {error:.3f} px, arrows {ARROW:.0f} times as long")
-            for view, residuals, error in shown]
+            for view, residuals, error in sorted(shown, key=lambda entry: -entry[2])]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.fit.bundle import BundleResult
-from calib.fit.camera_fit import CameraCalibration
 from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 
 Image = NDArray[np.uint8]
@@ -29,24 +28,26 @@ MIN_PANORAMA_ANGLE_DEG = 15
 RINGS = 8
 
 
-def residual_image(image: Image, pixels: Array, residuals: Array, width: int = 640) -> Image:
-    """Return the part of an image around a board, with corners and ARROW times their residuals, width pixels wide."""
+def residual_image(image: Image, pixels: Array, residuals: Array, side: int = 320) -> Image:
+    """Return the square part of an image around a board, side pixels wide, with corners and ARROW times residuals."""
     known = pixels[np.isfinite(pixels[:, 0])]
-    low = np.maximum(np.floor(known.min(axis=0)) - MARGIN_PX, 0).astype(int)
-    high = np.minimum(np.ceil(known.max(axis=0)) + MARGIN_PX, image.shape[::-1]).astype(int)
-    part, scale = image[low[1]:high[1], low[0]:high[0]], width / (high[0] - low[0])
+    edge = int(min(np.ceil(np.ptp(known, axis=0).max()) + 2 * MARGIN_PX, *image.shape))
+    middle = (known.min(axis=0) + known.max(axis=0)) / 2
+    low = np.clip(np.round(middle - edge / 2).astype(int), 0, np.array(image.shape[::-1]) - edge)
+    part, scale = image[low[1]:low[1] + edge, low[0]:low[0] + edge], side / edge
     canvas = _color(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC))
     _arrows(canvas, (pixels - low + 0.5) * scale - 0.5, residuals * scale)
     return canvas
 
 
-def coverage_image(image: Image, found: CameraCalibration, width: int = 900) -> Image:
-    """Return one image with the corners of all views and ARROW times their residuals."""
+def coverage_image(image: Image, views: Sequence[tuple[Array, Array]], center: tuple[float, float],
+                   width: int = 700) -> Image:
+    """Return one image with the corners of all views (pixels, residuals) and ARROW times their residuals."""
     scale = width / image.shape[1]
     canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
-    for view, residuals in zip(found.views, found.fit.residuals, strict=True):
-        _arrows(canvas, (view.pixels + 0.5) * scale - 0.5, residuals * scale)
-    cv2.drawMarker(canvas, tuple(round(value * scale) for value in found.camera.center), CENTER,
+    for pixels, residuals in views:
+        _arrows(canvas, (pixels + 0.5) * scale - 0.5, residuals * scale)
+    cv2.drawMarker(canvas, tuple(round(value * scale) for value in center), CENTER,
                    cv2.MARKER_CROSS, CROSS_PX, 1)
     return canvas
 

@@ -12,11 +12,11 @@ from calib.errors import CalibError
 from calib.fit.rig_fit import MOTION_NAMES, RigCalibration
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
-from omnid.calibration.figures import ARROW, Image, residual_image
+from omnid.calibration.figures import ARROW, Image, coverage_image, residual_image
 from omnid.calibration.image_pairs import SIDES, PairedImages
-from omnid.report.page import figure, page, table
+from omnid.report.page import bar, figure, folded, page, table, tiles
 
-MAX_SHOWN_VIEWS = 20
+MAX_VIEWS, SHOWN = 20, 8
 # Number of columns drawn through both panoramas, and their colour (BGR).
 LINES, LINE_COLOR = 24, (80, 200, 0)
 PANORAMA_WIDTH = 1400
@@ -27,10 +27,12 @@ def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig) -> st
     parts = [_head(found), "<h2>Between the cameras</h2>", _motion(found)]
     for name, parameters in zip(SIDES, found.parameters, strict=True):
         rows = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in parameters]
-        parts += [f"<h2>The {name} camera</h2>", table(("parameter", "value", "standard deviation"), rows) if rows
+        parts += [f"<h2>The {name} camera</h2>",
+                  folded("parameters", table(("parameter", "value", "standard deviation"), rows)) if rows
                   else "<p>Not changed: the camera was given.</p>"]
-    parts += ["<h2>Error by instant</h2>", _views(found), "<h2>Rectified</h2>", *_rectified(found, images, rig),
-              "<h2>Residuals</h2>", *_residuals(found, images)]
+    parts += ["<h2>Coverage</h2>", *_coverage(found, images), "<h2>Error by instant</h2>", _views(found),
+              "<h2>Rectified</h2>", *_rectified(found, images, rig), "<h2>Residuals</h2>",
+              tiles(_residuals(found, images), SHOWN)]
     return page("Rig calibration", parts)
 
 
@@ -55,9 +57,27 @@ def _motion(found: RigCalibration) -> str:
 
 def _views(found: RigCalibration) -> str:
     lower, upper = (found.side_errors_px(side) for side in (0, 1))
-    return table(("instant", "lower [px]", "upper [px]"),
-                 [(escape(view.name), _number(a), _number(b))
-                  for view, a, b in zip(found.views, lower, upper, strict=True)])
+    worst = float(np.nanmax([lower, upper]))
+    rows = [(escape(view.name), _number(a), _bar(a, worst), _number(b), _bar(b, worst))
+            for view, a, b in zip(found.views, lower, upper, strict=True)]
+    return table(("instant", "lower [px]", "", "upper [px]", ""), rows)
+
+
+def _bar(error: float, worst: float) -> str:
+    return bar(error / worst if np.isfinite(error) else 0.0)
+
+
+def _coverage(found: RigCalibration, images: PairedImages) -> list[str]:
+    """Return a figure of each camera with all corners on one of its images."""
+    figures = []
+    for side, (name, camera) in enumerate(zip(SIDES, (found.lower, found.upper), strict=True)):
+        views = [(seen.pixels, np.split(found.fit.residuals[k], 2)[side])
+                 for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
+        first = next(view.name for view in found.views if view.seen[side] is not None)
+        image = coverage_image(images.sides[side][first], views, camera.center)
+        figures.append(figure(image, f"{name}: all corners; arrows are the residuals, {ARROW:.0f} times as long; the "
+                              "cross is the centre"))
+    return [f"<div class='tiles wide'>{''.join(figures)}</div>"]
 
 
 def _number(error: float) -> str:
@@ -81,7 +101,7 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> list[st
 
 def _residuals(found: RigCalibration, images: PairedImages) -> list[str]:
     shown = []
-    for k, view in enumerate(found.views[:MAX_SHOWN_VIEWS]):
+    for k, view in enumerate(found.views[:MAX_VIEWS]):
         for side, seen in enumerate(view.seen):
             if seen is not None:
                 image: Image = images.sides[side][view.name]

@@ -37,7 +37,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "drive": ("drive", "drive --robot rover --connect tcp/robot:7447"),
     "listen": ("listen", "listen --all --connect tcp/router:7447",
                "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap"),
-    "view": ("view out.mcap", "view out.mcap -o out.rrd"),
+    "view": ("view out.mcap", "view out.mcap -o out.rrd", "view out.mcap --web --port 9090"),
     "web": ("web", "web --connect tcp/robot:7447", "web --all --connect tcp/router:7447",
             "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml"),
     "record": ("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
@@ -55,7 +55,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "motor test": ("motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
                    "motor test --motor simulated --set motor.protocol=roboteq --write omnid.toml"),
     "config": ("config --minimal > omnid.toml", "config check omnid.toml", "config migrate old.toml > new.toml"),
-    "install-service": ("install-service --dry-run",),
+    "install-service": ("install-service --dry-run", "install-service --page"),
 })
 
 

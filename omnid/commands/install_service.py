@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from omnid.commands.web import require_packages
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `install-service` to the command line."""
@@ -13,6 +15,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                                    description="Install the systemd unit for this program, example udev rules, a "
                                    "minimal configuration and the user that it runs as. Files that people edit are "
                                    "kept where they exist.")
+    parser.add_argument("--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine "
+                        "only")
     parser.add_argument("--dry-run", action="store_true", help="list what would be done, change nothing")
     parser.add_argument("--yes", action="store_true", help="do not ask")
     parser.add_argument("--root", type=Path, default=Path("/"), metavar="DIR",
@@ -24,7 +28,9 @@ def run(args: argparse.Namespace) -> int:
     """List the steps, ask, and take them; return 1 where the answer is no."""
     from omnid.service.install import Installation
 
-    installation = Installation(args.root, Path(sys.prefix) / "bin" / "omnid")
+    if args.page:
+        require_packages()
+    installation = Installation(args.root, Path(sys.prefix) / "bin" / "omnid", page=args.page)
     steps = installation.steps()
     for step in steps:
         print(step.description)

@@ -23,6 +23,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     where.add_argument("-o", "--output", type=Path, metavar="FILE.rrd", help="a file that `rerun FILE.rrd` opens, here "
                        "or elsewhere; needs no display")
     where.add_argument("--web", action="store_true", help="a browser of this machine")
+    where.add_argument("--port", type=int, default=0, metavar="N", help="of --web: serve the page at port N and its "
+                       "data at N + 1, for ssh -L; default: any free ones")
     _add_log(parser)
     _add_robot(parser)
     add_settings(parser)
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config, args.overrides)
     check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
                ("the configuration that is read", args.config))
-    place = target_for(args.output, args.web)
+    place = target_for(args.output, args.web, args.port)
     return _robot(args, config, place) if args.log is None else _log(args, config, place)
 
 
@@ -94,6 +96,10 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
         raise OmnidError(f"{wrong[0]} does not go with {'a robot' if args.log is None else args.log}: {instead}")
     if args.output is not None and args.web:
         raise OmnidError("-o and --web exclude each other: leave one of them out")
+    if args.port and not args.web:
+        raise OmnidError("--port belongs to --web: add it, or leave the port out")
+    if not 0 <= args.port < 65535:
+        raise OmnidError(f"--port {args.port}: expected a port of 1 to 65534")
     if args.seconds is not None and not 0 < args.seconds < 1e9:
         raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
 

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.errors import OmnidError
     from omnid.monitor.fleet import check_all
 
-    _require_packages()
+    require_packages()
     from omnid.web.server import WebSettings, serve
 
     if (args.tls_certificate is None) != (args.tls_key is None):
@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _require_packages() -> None:
+def require_packages() -> None:
+    """Raise OmnidError where a package of the page is missing."""
     import sys
     from importlib.util import find_spec
 

@@ -18,7 +18,10 @@ JPEG_QUALITY: Final = 80
 STYLE: Final = """body{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
 td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1em 0}figcaption{color:#555}
-.bar{background:#d33;height:.7em;display:inline-block}.warn{color:#a40}"""
+td.bar{text-align:left;min-width:220px}.bar span{background:#777;height:.7em;display:inline-block}.warn{color:#a40}
+.tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:.6em}
+.tiles.wide{grid-template-columns:repeat(auto-fill,minmax(400px,1fr))}.tiles figure{margin:0}
+.tiles figcaption{font-size:.8em;line-height:1.3}details{margin:1em 0}summary{cursor:pointer}"""
 
 
 # A page shows text from logs of unknown origin: it loads nothing and runs nothing.
@@ -37,10 +40,27 @@ def page(title: str, parts: Sequence[str], style: str = "") -> str:
     return _CONTROL.sub(_REPLACEMENT, text)
 
 
+def tiles(figures: Sequence[str], shown: int) -> str:
+    """Return small figures in rows; those after the first so many can be unfolded."""
+    rest = figures[shown:]
+    more = f"<details><summary>{len(rest)} more</summary><div class='tiles'>{''.join(rest)}</div></details>"
+    return f"<div class='tiles'>{''.join(figures[:shown])}</div>{more if rest else ''}"
+
+
+def folded(title: str, text: str) -> str:
+    """Return a part of the page that can be unfolded; both are HTML."""
+    return f"<details><summary>{title}</summary>{text}</details>"
+
+
+def bar(share: float) -> str:
+    """Return a horizontal bar that begins at the left, as a cell of a table; share: of its full length, 0 to 1."""
+    return f"<td class='bar'><span style='width:{200 * share:.0f}px'></span></td>"
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table; cells are HTML."""
+    """Return a table; cells are HTML, those that begin with <td as they are."""
     titles = "".join(f"<th>{title}</th>" for title in head)
-    lines = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+    lines = ["".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in row) for row in rows]
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
 
 

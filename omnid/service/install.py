@@ -45,6 +45,7 @@ class Installation:
 
     root: Path
     program: Path
+    page: bool = False  # the page's unit as well
 
     def steps(self) -> list[Step]:
         """Return the steps that are still to be taken; OmnidError for a program that the unit cannot start."""
@@ -56,15 +57,19 @@ class Installation:
     @property
     def next_steps(self) -> str:
         """Instructions for what only the user knows."""
+        units = "omnid omnid-web" if self.page else "omnid"
         return ("Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
                 "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
                 "  sudo udevadm control --reload && sudo udevadm trigger\n"
                 f"  sudo {self.program} doctor --config /etc/omnid/omnid.toml\n"
-                "  sudo systemctl daemon-reload && sudo systemctl enable --now omnid")
+                f"  sudo systemctl daemon-reload && sudo systemctl enable --now {units}")
 
     def _steps(self) -> Iterator[Step]:
         unit = service_file("omnid.service").replace(SHIPPED_PROGRAM, str(self.program))
         yield from self._file("etc/systemd/system/omnid.service", unit, replace=True)
+        if self.page:
+            page = service_file("omnid-web.service").replace(SHIPPED_PROGRAM, str(self.program))
+            yield from self._file("etc/systemd/system/omnid-web.service", page, replace=True)
         yield from self._file("etc/udev/rules.d/90-omnid.rules", service_file("90-omnid.rules"), replace=False)
         yield from self._file("etc/omnid/omnid.toml", dump_minimal(Config(), FIRST_SETTINGS), replace=False)
         if self.root == Path("/") and not _user_exists():

@@ -7,8 +7,7 @@ from typing import Any, Final
 import rerun.blueprint as rrb
 
 TIMELINE: Final = "stamp"
-ROBOT: Final = "odom/base_link"  # entity that the eye of the 3-D view follows
-EYE_M: Final = (-5.0, -4.0, 8.0)  # behind, to the right and above
+EYE_M: Final = (-5.0, -4.0, 8.0)  # behind the start, to the right and above; an eye that follows an entity falls to 1 m
 
 
 def layout(image: str, depth: bool) -> Any:
@@ -42,7 +41,7 @@ def _world() -> Any:
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()))
     return rrb.Spatial3DView(origin="odom", name="World", overrides={"odom/path": [until_now]},
                              eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=(0.0, 0.0, 0.0),
-                                                            eye_up=(0.0, 0.0, 1.0), tracking_entity=ROBOT))
+                                                            eye_up=(0.0, 0.0, 1.0)))
 
 
 def _image(name: str, title: str) -> Any:

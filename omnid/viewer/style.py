@@ -105,9 +105,9 @@ def depth_image(disparity: NDArray[np.float32], focal_baseline: float) -> NDArra
 
 
 def depth_range(distance_mm: NDArray[np.uint16]) -> tuple[float, float]:
-    """Return the 1st and 95th percentile of the known distances [mm]."""
+    """Return 0 and the 95th percentile of the known distances [mm]: what is unknown, 0, is darker than the nearest."""
     known = distance_mm[distance_mm > 0]
-    return tuple(np.percentile(known, (1, 95)).tolist()) if known.size else (0.0, 1.0)
+    return (0.0, float(np.percentile(known, 95))) if known.size else (0.0, 1.0)
 
 
 def evenly(most: int, *rows: NDArray[Any]) -> tuple[NDArray[Any], ...]:

@@ -104,8 +104,9 @@ class RrdFile:
 class Viewer:
     """rerun's viewer in a process of its own; a window outlives this program, the server for a browser does not."""
 
-    def __init__(self, web: bool) -> None:
-        self._web = web
+    def __init__(self, web: bool, port: int = 0) -> None:
+        """web: serve a browser, at a port of this machine and the next one; port 0: any two that are free."""
+        self._web, self._port = web, port
         self._process: subprocess.Popen[bytes] | None = None
         self._stream: rr.RecordingStream | None = None
         self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the viewer
@@ -115,7 +116,7 @@ class Viewer:
     def start(self, layout: Any) -> rr.RecordingStream:
         """Start the viewer and wait until it accepts connections."""
         opt_out()
-        port, web_port = _free_port(), _free_port()
+        web_port, port = self._ports()
         url = f"rerun+http://{LOCALHOST}:{port}/proxy"
         served = ["--serve-web", "--web-viewer-port", str(web_port)] if self._web else ["--expect-data-soon"]
         self._process = _started(self._output, ["--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen",
@@ -127,8 +128,20 @@ class Viewer:
         self._stream = stream
         if self._web:
             page = f"http://{LOCALHOST}:{web_port}/?url={quote(url, safe='')}"
-            print(f"omnid: open {page} on this machine", file=sys.stderr, flush=True)
+            forwarded = f"-L {web_port}:{LOCALHOST}:{web_port} -L {port}:{LOCALHOST}:{port}"
+            print(f"omnid: open {page} on this machine; on another one after: ssh {forwarded} {socket.gethostname()}",
+                  file=sys.stderr, flush=True)
         return stream
+
+    def _ports(self) -> tuple[int, int]:
+        """Return the ports of the page and of its data. Raise OmnidError where one that is named is taken."""
+        if not self._port:
+            return _free_port(), _free_port()
+        for port in (self._port, self._port + 1):
+            if _accepts_connections(port):
+                raise OmnidError(f"--port {self._port}: another program listens on {port}; it needs that port and the "
+                                 "next one: stop the other program, or name another port")
+        return self._port, self._port + 1
 
     def flush(self) -> None:
         """Wait until everything has arrived."""

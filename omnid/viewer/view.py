@@ -41,9 +41,9 @@ class Log:
     settings: Path | None = None  # file of the configuration
 
 
-def target_for(out: Path | None, web: bool) -> ViewerTarget:
-    """Return the named file as target, else a viewer."""
-    return RrdFile(out) if out is not None else Viewer(web)
+def target_for(out: Path | None, web: bool, port: int = 0) -> ViewerTarget:
+    """Return the named file as target, else a viewer; port: of a viewer for browsers, 0: any."""
+    return RrdFile(out) if out is not None else Viewer(web, port)
 
 
 def check_file(out: Path | None, *inputs: tuple[str, Path | None]) -> None:

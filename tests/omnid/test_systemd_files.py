@@ -72,6 +72,16 @@ def test_the_unit_is_well_locked_up(installed: Path) -> None:
     assert float(found[1]) <= WORST_EXPOSURE, done.stdout
 
 
+@with_systemd
+def test_the_unit_of_the_page_is_taken_without_a_word_and_locked_up(tmp_path: Path) -> None:
+    unit = tmp_path / "omnid-web.service"
+    unit.write_text((SYSTEMD / unit.name).read_text().replace("/opt/omnid/bin/omnid", sys.executable))
+    assert verify(unit) == (0, "")
+    found = re.search(r"Overall exposure level for omnid-web.service: (\S+)",
+                      analyze("security", "--offline=true", "--no-pager", unit).stdout)
+    assert found and float(found[1]) <= WORST_EXPOSURE
+
+
 def settings() -> dict[str, str]:
     """The unit's keys, each with its last value."""
     lines = [line for line in UNIT.read_text().splitlines() if re.match(r"[A-Z]\w*=", line)]

@@ -42,6 +42,14 @@ def test_writes_the_unit_of_this_program_and_keeps_edited_files(omnid: Command, 
     assert rules.read_text() == "mine" and "ExecStart" in unit.read_text()
 
 
+def test_the_page_is_a_unit_of_its_own(omnid: Command, tmp_path: Path) -> None:
+    done = omnid("install-service", "--root", tmp_path, "--yes", "--page")
+    assert done.code == 0 and "enable --now omnid omnid-web" in done.out
+    unit = (tmp_path / "etc/systemd/system/omnid-web.service").read_text()
+    assert "ExecStart=/srv/robot/bin/omnid web --config /etc/omnid/omnid.toml" in unit and "/opt/omnid" not in unit
+    assert omnid("install-service", "--root", tmp_path, "--page").out == "nothing to do\n"
+
+
 def test_asks_first(omnid: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("builtins.input", lambda _: "n")
     done = omnid("install-service", "--root", tmp_path)

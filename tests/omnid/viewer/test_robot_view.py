@@ -101,11 +101,12 @@ def test_reports_a_robot_that_cannot_be_reached(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_serves_a_browser_until_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     need_rerun()
-    with viewing(tmp_path, made(tmp_path / "made.mcap"), "--web") as it:
+    named = int(free_endpoint().rpartition(":")[2])
+    with viewing(tmp_path, made(tmp_path / "made.mcap"), "--web", "--port", str(named)) as it:
         assert it.stderr is not None
         lines = [it.stderr.readline() for _ in range(3)]
         found = re.search(r"http://127\.0\.0\.1:(\d+)/\S+127\.0\.0\.1%3A(\d+)%2Fproxy", lines[0])
-        assert found, lines
+        assert found and list(map(int, found.groups())) == [named, named + 1], lines
         with urllib.request.urlopen(found[0], timeout=DEADLINE_S) as page:
             assert page.status == 200 and b"rerun" in page.read().lower()
         assert "Ctrl-C" in lines[2]

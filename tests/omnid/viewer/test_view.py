@@ -138,6 +138,8 @@ def test_shows_one_of_several_robots(tmp_path: Path, omnid: Command) -> None:
 @pytest.mark.parametrize(("words", "expected"), [
     (("--web", "-o", "x.rrd"), "-o and --web"),
     (("--replay",), "--replay"),
+    (("--port", "9090"), "--web"),
+    (("--web", "--port", "65535"), "65534"),
     (("--seconds", "-1"), "--seconds"),
     (("log.mcap", "--connect", "tcp/127.0.0.1:1"), "--connect"),
     (("log.mcap", "--seconds", "3"), "--seconds"),
