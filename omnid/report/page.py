@@ -17,6 +17,7 @@ Image = NDArray[np.uint8]
 JPEG_QUALITY: Final = 80
 STYLE: Final = """body{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
+@media (max-width:800px){table{display:block;overflow-x:auto}}
 td:first-child,th:first-child{text-align:left}img{max-width:100%}figure{margin:1em 0}figcaption{color:#555}
 td.bar{text-align:left;min-width:220px}.bar span{background:#777;height:.7em;display:inline-block}.warn{color:#a40}
 .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:.6em}
