@@ -14,6 +14,7 @@ import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
+from calib.fit.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.models.camera import Array
 
 MAX_STEPS = 60
@@ -35,8 +36,8 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 CONVERGED_PART, CONVERGED_DAMPING = 1e-9, 1e-7
 # Added to the diagonal of a pose's block, so that a pose without corners stays invertible.
 POSE_REGULARISATION = 1e-12
-# Relative cut-offs of singular values: of the step's system and of the covariance.
-STEP_RCOND, COVARIANCE_RCOND = 1e-15, 1e-14
+# Relative cut-off of singular values of the step's system.
+STEP_RCOND = 1e-15
 # Step of numeric derivatives. Parameters are scaled so that one unit moves the image by about a pixel; points are moved
 # by this part of their distance.
 DIFFERENCE_STEP = 1e-4
@@ -58,6 +59,7 @@ class Observations:
 
     pixels: Array
     points: Array
+    cameras: int = 1  # the points of a view are equal parts of so many cameras
 
     def select(self, chosen: Array) -> Observations:
         """Return the images of an index or mask."""
@@ -83,7 +85,8 @@ class BundleResult:
     parameters: Array  # (P,)
     T_cam_board: Array  # (K, 4, 4)
     residuals: Array  # (K, N, 2)
-    covariance: Array  # (P, P)
+    covariance: Array  # (P, P), with the misfit of the model
+    misfit_px: float = 0.0  # size of the smooth error of the model, most of which the parameters absorb
 
     @property
     def errors_px(self) -> Array:
@@ -169,10 +172,10 @@ class _NormalEquations:
         pose = np.linalg.solve(C, (self.c - intrinsic @ self.B)[..., None])[..., 0]
         return intrinsic, pose
 
-    def covariance(self) -> Array:
-        """Return the inverse (P, P) of the reduced system: the covariance for residuals of standard deviation 1."""
-        reduced = self.A - (self.B @ np.linalg.inv(self.C) @ self.B.swapaxes(1, 2)).sum(axis=0)
-        return np.asarray(np.linalg.pinv(reduced, rcond=COVARIANCE_RCOND, hermitian=True))
+    def reduced(self) -> tuple[Array, Array]:
+        """Return the system (P, P) and right side (P,) of the intrinsics, the poses eliminated."""
+        BC = self.B @ np.linalg.inv(self.C)
+        return self.A - (BC @ self.B.swapaxes(1, 2)).sum(axis=0), self.a - (BC @ self.c[..., None]).sum(axis=0)[:, 0]
 
 
 def _diagonals(C: Array) -> Array:
@@ -199,7 +202,8 @@ def _levenberg_marquardt(state: _State, kernel_px: float) -> _State:
     return state
 
 
-def _normal_equations(state: _State, kernel_px: float) -> _NormalEquations:
+def _normal_equations(state: _State, kernel_px: float, fields: Array | None = None) -> _NormalEquations:
+    """Return the normal equations; fields (K, N, 2, F): further unknowns after the intrinsics, 0 now."""
     residual, weight = _huber_weights(state.residuals, kernel_px)
     J_in, J_pose = _jacobians(state)
     K = len(residual)
@@ -207,10 +211,14 @@ def _normal_equations(state: _State, kernel_px: float) -> _NormalEquations:
     J_in, J_pose = ((root * J).reshape(K, 2 * residual.shape[1], J.shape[-1]) for J in (J_in, J_pose))
     r = (root[..., 0] * residual).reshape(K, -1)
     prior = state.prior.weights(kernel_px)
+    to_prior = prior * (state.parameters - state.prior.center)
+    if fields is not None:
+        J_in = np.concatenate([J_in, (root * fields).reshape(K, 2 * residual.shape[1], -1)], axis=2)
+        prior, to_prior = (np.pad(part, (0, fields.shape[3])) for part in (prior, to_prior))
     return _NormalEquations(
         A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=J_in.swapaxes(1, 2) @ J_pose,
         C=J_pose.swapaxes(1, 2) @ J_pose,
-        a=np.einsum("kri,kr->i", J_in, r) - prior * (state.parameters - state.prior.center),
+        a=np.einsum("kri,kr->i", J_in, r) - to_prior,
         c=np.einsum("kri,kr->ki", J_pose, r))
 
 
@@ -248,5 +256,9 @@ def _bundle_result(state: _State, kernel_px: float) -> BundleResult:
     residual, weight = _huber_weights(state.residuals, kernel_px)
     freedom = 2 * float(weight.sum()) - state.parameters.size - 6 * len(residual)
     variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
-    covariance = variance * _normal_equations(state, kernel_px).covariance()
-    return BundleResult(state.parameters, state.poses, state.residuals, covariance)
+    if not state.parameters.size:
+        return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
+    fields = smooth_fields(state.observed.pixels, state.observed.cameras)
+    system = _normal_equations(state, kernel_px, fields).reduced()
+    covariance, misfit_px = covariance_with_misfit(*system, state.parameters.size, variance)
+    return BundleResult(state.parameters, state.poses, state.residuals, covariance, misfit_px)

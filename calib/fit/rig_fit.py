@@ -249,7 +249,7 @@ def _observations(good: Sequence[PairView], board: CalibrationBoard) -> Observat
     none = np.full((len(board.points), 2), np.nan)
     pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen])
                        for view in good])
-    return Observations(pixels, np.tile(board.points, (2, 1)))
+    return Observations(pixels, np.tile(board.points, (2, 1)), cameras=2)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:

@@ -1,0 +1,71 @@
+"""Covariance of a fit whose model does not describe the cameras exactly.
+
+The error of a camera model is a smooth function of the image position, the same in all views. Most of it is absorbed
+by the parameters, which it shifts, so residuals do not show it directly; but their remaining correlation shows its
+size. So residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields (Gaussian
+functions on a grid). tau is estimated by restricted maximum likelihood (Patterson and Thompson 1971).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.camera import Array
+
+# Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each in parts of their
+# distance. Five nodes follow three waves over the azimuth and a turning point over the radius.
+NODES, WIDTH = 5, 1.0
+# Nodes farther from the centre, in parts of the largest radius, tell nothing.
+MAX_RADIUS = 1.3
+# Values of tau / sigma that are compared.
+RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 120)])
+# Least part of the largest eigenvalue of what the fields explain beyond the parameters.
+LEAST_PART = 1e-9
+
+
+def smooth_fields(pixels: Array, cameras: int) -> Array:
+    """Return the fields (K, N, 2, F) at pixels (K, N, 2), of which equal parts belong to each camera.
+
+    Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
+    """
+    K, N, _ = pixels.shape
+    own = []
+    for part in np.split(pixels, cameras, axis=1):
+        known = part[np.isfinite(part).all(axis=2)]
+        center = known.mean(axis=0)
+        radius = float(np.linalg.norm(known - center, axis=1).max())
+        line = np.linspace(-1, 1, NODES)
+        nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        nodes = nodes[np.linalg.norm(nodes, axis=1) <= MAX_RADIUS]
+        away = np.linalg.norm((part[:, :, None] - center) / radius - nodes, axis=3)
+        own.append(np.nan_to_num(np.exp(-0.5 * (away / (WIDTH * 2 / (NODES - 1))) ** 2)))
+    counts = [each.shape[2] for each in own]
+    fields = np.zeros((K, N, 2, 2 * sum(counts)))
+    first, size = 0, N // cameras
+    for camera, values in enumerate(own):
+        rows = slice(camera * size, (camera + 1) * size)
+        for axis in range(2):
+            fields[:, rows, axis, first:first + counts[camera]] = values
+            first += counts[camera]
+    return fields
+
+
+def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> tuple[Array, float]:
+    """Return the covariance (P, P) of the parameters, and tau [px].
+
+    normal (P + F, P + F), gradient (P + F,): of the weighted residuals by parameters and fields, poses eliminated, at
+    the fit's minimum; variance: sigma^2 of a coordinate [px^2].
+    """
+    P = parameters
+    inverse = np.linalg.pinv(normal[:P, :P], rcond=1e-14, hermitian=True)
+    # What the fields explain beyond the parameters: y ~ N(0, sigma^2 d + tau^2 d^2) along each eigenvector.
+    by_field = normal[P:, :P] @ inverse
+    left = normal[P:, P:] - by_field @ normal[:P, P:]
+    d, axes = np.linalg.eigh((left + left.T) / 2)
+    known = d > LEAST_PART * max(float(d[-1]), 1.0)
+    d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
+    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
+    ratio = float(RATIOS[int(np.argmin((np.log(spread) + y**2 / spread).sum(axis=1)))])
+    # The fit does not know the fields: each shifts the parameters by its row of by_field, which has the prior tau.
+    covariance = variance * (inverse + ratio**2 * by_field.T @ by_field)
+    return np.asarray(covariance), ratio * float(np.sqrt(variance))
