@@ -19,8 +19,8 @@ NODES, WIDTH = 5, 1.0
 MAX_RADIUS = 1.3
 # Values of tau / sigma that are compared.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 120)])
-# Least part of the largest eigenvalue of what the fields explain beyond the parameters.
-LEAST_PART = 1e-9
+# Least part of the largest eigenvalue of what the fields explain beyond the parameters: less is rounding.
+LEAST_PART = 1e-3
 
 
 def smooth_fields(pixels: Array, cameras: int) -> Array:

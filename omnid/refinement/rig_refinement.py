@@ -19,6 +19,7 @@ from typing import IO, TypeAlias
 import numpy as np
 
 from calib import se3
+from calib.fit.drive_parameters import UPPER_DELAY
 from omnid.calibration.drive_observations import DriveCollector, KeyframeChoice
 from omnid.config import RigConfig
 from omnid.messages import OdometryUpdate
@@ -36,6 +37,8 @@ ADVICE = ("the landmarks of this run do not fit the rig: a camera or a mirror ha
           "good: run omnid calibrate drive on a recording")
 
 
+DELAY_ADVICE = ("the upper camera is exposed at other times than its stamps say: set camera.upper_delay_ms, or run "
+                "omnid calibrate drive on a recording")
 PENDING = "the landmarks of this run do not fit the rig: the refined one is used as soon as the robot stands"
 TOO_LARGE = ADVICE + "; the change is too large to be applied while the robot runs"
 APPLIED = "a refined rig is in use: not estimated again yet"
@@ -64,14 +67,15 @@ class RigRefinement:
     """A sink of poses that estimates the rig's errors; its inbox drops the oldest (policy NEWEST)."""
 
     def __init__(self, place: Geometry | GeometryVersions, settings: RigConfig,
-                 has_time: Callable[[], bool] = always, apply: Apply | None = None) -> None:
+                 has_time: Callable[[], bool] = always, apply: Apply | None = None, *, has_delay: bool = True) -> None:
         """has_time: False under overload, when no keyframe is added.
 
+        has_delay: False if the upper camera's delay is given by the configuration, and not estimated.
         apply: takes a change that counts, once the robot stands, and begins a version of the geometry with its rig;
         None: changes are only told.
         """
         self._versions = place if isinstance(place, GeometryVersions) else GeometryVersions(place)
-        self._settings, self._has_time, self._apply = settings, has_time, apply
+        self._settings, self._has_time, self._apply, self._has_delay = settings, has_time, apply, has_delay
         self._version = 0
         self._standing = _Standing()
         self._pending: RigChange | None = None  # to be applied when the robot stands
@@ -133,7 +137,7 @@ class RigRefinement:
         if window.keyframes >= self._settings.refine_keyframes:
             drives = window.drives(update.T_odom_rig)
             rig = self._versions[self._version].rig
-            self._child = _Estimate(RefinementRequest(rig, drives.state, drives.observations))
+            self._child = _Estimate(RefinementRequest(rig, drives.state, drives.observations, self._has_delay))
             self._window, self._next_ns = None, update.stamp_ns + self._settings.refine_s * 1e9
 
     def _take_answer(self) -> None:
@@ -176,10 +180,12 @@ class RigRefinement:
                    "landmarks": str(change.landmarks), "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
         if not change.is_significant:
             return DiagnosticStatus(RIG_REFINEMENT, OK, "the rig fits the landmarks of this run",
-                                    values | _lengths(change))
+                                    values | _lengths(change) | _delay(change))
         values |= _parameters(change)
         if self._pending is not None:
             return DiagnosticStatus(RIG_REFINEMENT, WARN, PENDING, values)
+        if not change.has_moved:
+            return DiagnosticStatus(RIG_REFINEMENT, WARN, DELAY_ADVICE, values)
         return DiagnosticStatus(RIG_REFINEMENT, WARN, ADVICE if change.is_small else TOO_LARGE, values)
 
 
@@ -189,10 +195,21 @@ def _lengths(change: RigChange, prefix: str = "") -> dict[str, str]:
             f"{prefix}lengths_sigma_percent": f"{100 * change.lengths_sigma:.3f}"}
 
 
+def _delay(change: RigChange, prefix: str = "") -> dict[str, str]:
+    """Return the estimated delay of the upper camera's exposures against the stamps, with its sigma."""
+    if change.delay_ms is None:
+        return {}
+    before, after, sigma = change.delay_ms
+    return {f"{prefix}upper_delay_ms_before": f"{before:.3f}", f"{prefix}upper_delay_ms_after": f"{after:.3f}",
+            f"{prefix}upper_delay_ms_sigma": f"{sigma:.3f}"}
+
+
 def _parameters(change: RigChange, prefix: str = "") -> dict[str, str]:
     """Return every parameter before and after a change, with its sigma, and the change of lengths."""
-    values = _lengths(change, prefix)
+    values = _lengths(change, prefix) | _delay(change, prefix)
     for name, before, after, sigma in zip(change.names, change.before, change.after, change.sigmas, strict=True):
+        if name == UPPER_DELAY:
+            continue
         key = prefix + name.replace(" ", "_")
         values |= {f"{key}_before": f"{before:.6g}", f"{key}_after": f"{after:.6g}", f"{key}_sigma": f"{sigma:.2g}"}
     return values

@@ -167,7 +167,8 @@ class LiveRun:
         if config.rig.refine != "off":
             has_time = partial(_has_time, ladder)
             refinement = session.outputs.enter_context(closing(
-                RigRefinement(versions, config.rig, has_time, application)))
+                RigRefinement(versions, config.rig, has_time, application,
+                              has_delay=config.camera.upper_delay_ms == 0)))
         if refinement is not None:
             poses["refine"] = refinement
         if controller and config.obstacles.enabled and floor_is_assumed(geometry, config.obstacles):
