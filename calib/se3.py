@@ -1,6 +1,12 @@
-"""Rigid transforms as 4x4 matrices, `p_a = T_a_b @ p_b`; functions accept stacks (..., 4, 4)."""
+"""Rigid transforms as 4x4 matrices, `p_a = T_a_b @ p_b`; functions accept stacks (..., 4, 4).
+
+A single transform is computed with Python's floats where it can be: a call of numpy takes longer than ten of them, and
+the odometry makes some fifty such calls a frame.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +28,11 @@ def transform(R: ArrayLike, t: ArrayLike) -> Array:
 def inverse(T: ArrayLike) -> Array:
     """Return T_b_a of T_a_b: (R^T, -R^T t)."""
     T = np.asarray(T, float)
+    if T.ndim == 2:
+        found = np.eye(4)
+        found[:3, :3] = T[:3, :3].T
+        found[:3, 3] = -(found[:3, :3] @ T[:3, 3])
+        return found
     R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
@@ -35,6 +46,9 @@ def apply(T: ArrayLike, points: ArrayLike) -> Array:
 def hat(w: ArrayLike) -> Array:
     """Return the cross-product matrix (..., 3, 3) of w (..., 3): hat(w) @ v = w x v."""
     w = np.asarray(w, float)
+    if w.ndim == 1:
+        x, y, z = w.tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
     return W - np.swapaxes(W, -1, -2)
@@ -50,6 +64,14 @@ def _series(angle: Array) -> tuple[Array, Array, Array]:
     return first[..., None, None], second[..., None, None], third[..., None, None]
 
 
+def _series_of_one(angle: float) -> tuple[float, float, float]:
+    """Return `_series` of one angle."""
+    if angle < SMALL_ANGLE_RAD:
+        return 1 - angle**2 / 6, 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
+    sine = math.sin(angle)
+    return sine / angle, 2 * (math.sin(angle / 2) / angle) ** 2, (angle - sine) / angle**3
+
+
 def rotation_exp(w: ArrayLike) -> Array:
     """Return the rotation matrix (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
     w = np.asarray(w, float)
@@ -61,6 +83,10 @@ def rotation_exp(w: ArrayLike) -> Array:
 def rotation_log(R: ArrayLike) -> Array:
     """Return the rotation vector (..., 3) [rad] of a rotation matrix, for angles from 0 to pi inclusive."""
     q = quaternion(R)
+    if q.ndim == 1:
+        x, y, z, real = q.tolist()
+        length = math.hypot(x, y, z)
+        return np.asarray(q[:3] * (2.0 if length < SMALL_NORM else 2 * math.atan2(length, real) / length))
     norm = np.linalg.norm(q[..., :3], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 3])
     small = norm < SMALL_NORM
@@ -71,16 +97,32 @@ def rotation_log(R: ArrayLike) -> Array:
 def exp(xi: ArrayLike) -> Array:
     """Return the transform (..., 4, 4) of a twist xi (..., 6) = [translation; rotation vector]."""
     xi = np.asarray(xi, float)
+    if xi.ndim == 1:
+        return _exp_of_one(xi)
     a, b, c = _series(np.linalg.norm(xi[..., 3:], axis=-1))
     W = hat(xi[..., 3:])
     R, V = np.eye(3) + a * W + b * W @ W, np.eye(3) + b * W + c * W @ W
     return transform(R, (V @ xi[..., :3, None])[..., 0])
 
 
+def _exp_of_one(xi: Array) -> Array:
+    """Return `exp` of one twist (6,)."""
+    first, second, third = _series_of_one(math.hypot(*xi[3:].tolist()))
+    W, T = hat(xi[3:]), np.eye(4)
+    square = W @ W
+    T[:3, 3] = xi[:3] + (second * W + third * square) @ xi[:3]
+    T[:3, :3] += first * W + second * square
+    return T
+
+
 def log(T: ArrayLike) -> Array:
     """Return the twist (..., 6) = [translation; rotation vector] whose exp is T."""
     T = np.asarray(T, float)
     w = rotation_log(T[..., :3, :3])
+    if T.ndim == 2:
+        _, second, third = _series_of_one(math.hypot(*w.tolist()))
+        W = hat(w)
+        return np.concatenate([np.linalg.solve(np.eye(3) + second * W + third * W @ W, T[:3, 3]), w])
     _, b, c = _series(np.linalg.norm(w, axis=-1))
     W = hat(w)
     V = np.eye(3) + b * W + c * W @ W
@@ -106,6 +148,8 @@ def interpolate(T_a: ArrayLike, T_b: ArrayLike, s: float) -> Array:
 def quaternion(R: ArrayLike) -> Array:
     """Return the unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
     R = np.asarray(R, float)
+    if R.ndim == 2:
+        return _quaternion_of_one(R)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product q q^T: its longest column is the best conditioned estimate of q.
     K = np.empty((*R.shape[:-2], 4, 4))
@@ -121,6 +165,18 @@ def quaternion(R: ArrayLike) -> Array:
     q = np.take_along_axis(K, longest[..., None, None], axis=-1)[..., 0]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def _quaternion_of_one(R: Array) -> Array:
+    """Return `quaternion` of one matrix (3, 3)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    columns = ((1 + xx - yy - zz, xy + yx, xz + zx, zy - yz), (xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx),
+               (xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy), (zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz))
+    diagonal = [column[k] for k, column in enumerate(columns)]
+    longest = columns[diagonal.index(max(diagonal))]
+    length = math.hypot(*longest)
+    sign = -1.0 if longest[3] < 0 else 1.0
+    return np.array([sign * value / length for value in longest])
 
 
 def rotation(q: ArrayLike) -> Array:

@@ -8,16 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.odometry.patch_kernels import WINDOW_PX
+from omnid.core.odometry.patch_kernels import LANES, WINDOW_PX
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
+Places = NDArray[np.int32]
 
 TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the gradient's border
 MAX_REACH_PX = 2.0 * TEMPLATE_PX  # a patch that reaches farther in the keyframe is no patch of this plane
 MAX_SLOPE = 0.7  # of a disparity: a steeper plane is seen so much aslant that it has no patch
+AROUND_PX = int(2 * MAX_REACH_PX) + 8  # side of the square of pixels from which a template is interpolated
+FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
+FIRST, SECOND, THIRD = np.uint64(1), np.uint64(2), np.uint64(3)
 ZERO, HALF, ONE, LARGEST_GREY = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
 INNER_CUBE, INNER_SQUARE = np.float32(1.5), np.float32(2.5)  # coefficients of the inner part of Keys' kernel
 
@@ -31,18 +35,25 @@ def sample(image: Image, chosen: Indices, centres: Array, points: Array, slopes:
     centres (N, 2) [px] in the image, shift (N, 2) [px] of the templates' middle pixels from the centres in the current
     panorama, whose viewpoint is height_m above the lower one.
     """
-    H, normal = np.empty((3, 3)), np.empty(3)
-    columns, rows = np.empty((TEMPLATE_PX, TEMPLATE_PX), np.float32), np.empty((TEMPLATE_PX, TEMPLATE_PX), np.float32)
+    H, normal, greys = np.empty((3, 3)), np.empty(3), np.zeros(AROUND_PX * AROUND_PX, np.float32)
+    columns, rows = np.zeros((TEMPLATE_PX, LANES), np.float32), np.zeros((TEMPLATE_PX, LANES), np.float32)
+    weights, first, found = np.empty((8, LANES), np.float32), np.empty(LANES, np.int32), np.empty(LANES, np.float32)
     for n in chosen:
+        # A place that is NaN or absurd has no template; it would lead out of the image's memory.
+        if not (max(abs(shift[n, 0]), abs(shift[n, 1])) <= 1.0 and abs(centres[n, 0]) < FARTHEST_PX
+                and abs(centres[n, 1]) < FARTHEST_PX):
+            templates[n] = 0
+            continue
         write_normal(points[n], slopes[n], baseline_m, normal)
         height = write_homography(points[n], normal, T_curr_ref[n], height_m, H)
         own_height = points[n, 2] / math.hypot(points[n, 0], points[n, 1])
         write_sources(H, own_height, height, focal_px, shift[n], columns, rows)
-        left, top = np.float32(centres[n, 0]), np.float32(centres[n, 1])
-        for row in range(TEMPLATE_PX):
-            for column in range(TEMPLATE_PX):
-                grey = cubic(image, left + columns[row, column], top + rows[row, column])
-                templates[n, row, column] = np.uint8(min(max(grey + HALF, ZERO), LARGEST_GREY))
+        left, top = copy_around(image, columns, rows, centres[n], greys)
+        x, y = np.float32(centres[n, 0]), np.float32(centres[n, 1])
+        for column in range(TEMPLATE_PX):
+            write_cubic(greys, columns[column], rows[column], x, y, left, top, weights, first, found)
+            for row in range(TEMPLATE_PX):
+                templates[n, row, column] = np.uint8(min(max(found[row] + HALF, ZERO), LARGEST_GREY))
 
 
 @compiled("(f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1])", writes=("moved",))
@@ -112,61 +123,92 @@ def write_homography(point: Array, normal: Array, T: Array, height_m: float, H: 
 @inner
 def write_sources(H: Array, own_height: float, height: float, focal_px: float, shift: Array, columns: Floats,
                   rows: Floats) -> None:
-    """Write where the keyframe shows the template's pixels: offsets [px] from the patch.
+    """Write where the keyframe shows the template's pixels: offsets [px] from the patch, by column and row.
+
+    The arctangent is its series: an angle of 15 degrees is exact to 1e-7 rad, and a patch is smaller than that.
 
     own_height, height: z / r of the patch in the keyframe and in the current view. Where the plane explains no patch,
     the offsets are those of the template.
     """
-    half, farthest = TEMPLATE_PX // 2, 0.0
+    half, inside, per_focal, shift_rows = TEMPLATE_PX // 2, 0, 1 / focal_px, shift[1]
+    h02, h12, h22 = H[0, 2], H[1, 2], H[2, 2]
     for column in range(TEMPLATE_PX):
         azimuth = -(column - half + shift[0]) / focal_px
         c, s = math.cos(azimuth), math.sin(azimuth)
         q0, q1, q2 = H[0, 0] * c + H[0, 1] * s, H[1, 0] * c + H[1, 1] * s, H[2, 0] * c + H[2, 1] * s
+        along_of, down_of = columns[column], rows[column]
         for row in range(TEMPLATE_PX):
-            h = height - (row - half + shift[1]) / focal_px
-            ahead = q0 + H[0, 2] * h
-            tangent = (q1 + H[1, 2] * h) / ahead
-            along = -focal_px * math.atan(tangent)
-            down = focal_px * (own_height - (q2 + H[2, 2] * h) / (ahead * math.sqrt(1 + tangent * tangent)))
-            columns[row, column], rows[row, column] = along, down
-            reach = max(abs(along), abs(down))
-            if not (ahead > 0 and reach < MAX_REACH_PX):  # true for NaN as well
-                farthest = MAX_REACH_PX
-    if farthest < MAX_REACH_PX:
+            h = height - (row - half + shift_rows) * per_focal
+            ahead = q0 + h02 * h
+            per_ahead = 1 / ahead
+            tangent = (q1 + h12 * h) * per_ahead
+            square = tangent * tangent
+            along = -focal_px * tangent * (1 - square * (1 / 3 - square * (1 / 5 - square * (1 / 7 - square / 9))))
+            down = focal_px * (own_height - (q2 + h22 * h) * per_ahead / math.sqrt(1 + square))
+            along_of[row], down_of[row] = along, down
+            inside += (ahead > 0) & (abs(along) < MAX_REACH_PX) & (abs(down) < MAX_REACH_PX)  # false for NaN
+    if inside == TEMPLATE_PX * TEMPLATE_PX:
         return
-    for row in range(TEMPLATE_PX):
-        for column in range(TEMPLATE_PX):
-            columns[row, column], rows[row, column] = column - half + shift[0], row - half + shift[1]
+    for column in range(TEMPLATE_PX):
+        for row in range(TEMPLATE_PX):
+            columns[column, row], rows[column, row] = column - half + shift[0], row - half + shift[1]
 
 
 @inner
-def cubic(image: Image, column: np.float32, row: np.float32) -> np.float32:
-    """Return the grey between pixels by cubic convolution (Keys 1981, a = -1/2); the border is repeated.
+def copy_around(image: Image, columns: Floats, rows: Floats, centre: Array, greys: Floats) -> tuple[int, int]:
+    """Write the pixels from which a template is interpolated, the border repeated; return the first one's place.
 
-    Bilinear interpolation shifts fine texture by up to 0.02 px, depending on the place between the pixels.
+    columns, rows (T, T): offsets [px] from the centre (2,), less than MAX_REACH_PX.
     """
+    lowest, highest, first, last = ZERO, ZERO, ZERO, ZERO
+    for column in range(TEMPLATE_PX):
+        for row in range(TEMPLATE_PX):
+            lowest, highest = min(lowest, columns[column, row]), max(highest, columns[column, row])
+            first, last = min(first, rows[column, row]), max(last, rows[column, row])
+    left, top = math.floor(centre[0] + lowest) - 2, math.floor(centre[1] + first) - 2
+    right, bottom = math.floor(centre[0] + highest) + 4, math.floor(centre[1] + last) + 4
     height, width = image.shape
-    left, top = math.floor(column), math.floor(row)
-    x, y = column - np.float32(left), row - np.float32(top)
-    u, v = ONE - x, ONE - y
-    w0, w3 = -HALF * x * u * u, -HALF * u * x * x
-    w1, w2 = ONE + x * x * (INNER_CUBE * x - INNER_SQUARE), ONE + u * u * (INNER_CUBE * u - INNER_SQUARE)
-    v0, v3 = -HALF * y * v * v, -HALF * v * y * y
-    v1, v2 = ONE + y * y * (INNER_CUBE * y - INNER_SQUARE), ONE + v * v * (INNER_CUBE * v - INNER_SQUARE)
-    a, b, c, d = left - 1, left, left + 1, left + 2
-    e, f, g, h = top - 1, top, top + 1, top + 2
-    if a < 0 or e < 0 or d >= width or h >= height:
-        a, b, c, d = within(a, width), within(b, width), within(c, width), within(d, width)
-        e, f, g, h = within(e, height), within(f, height), within(g, height), within(h, height)
-    first, second, third, fourth = image[e], image[f], image[g], image[h]
-    return (v0 * (w0 * np.float32(first[a]) + w1 * np.float32(first[b]) + w2 * np.float32(first[c])
-                  + w3 * np.float32(first[d]))
-            + v1 * (w0 * np.float32(second[a]) + w1 * np.float32(second[b]) + w2 * np.float32(second[c])
-                    + w3 * np.float32(second[d]))
-            + v2 * (w0 * np.float32(third[a]) + w1 * np.float32(third[b]) + w2 * np.float32(third[c])
-                    + w3 * np.float32(third[d]))
-            + v3 * (w0 * np.float32(fourth[a]) + w1 * np.float32(fourth[b]) + w2 * np.float32(fourth[c])
-                    + w3 * np.float32(fourth[d])))
+    if left >= 0 and top >= 0 and right <= width and bottom <= height:
+        for row in range(bottom - top):
+            for column in range(right - left):
+                greys[row * AROUND_PX + column] = np.float32(image[top + row, left + column])
+    else:
+        for row in range(bottom - top):
+            line = image[within(top + row, height)]
+            for column in range(right - left):
+                greys[row * AROUND_PX + column] = np.float32(line[within(left + column, width)])
+    return left, top
+
+
+@inner
+def write_cubic(greys: Floats, columns: Floats, rows: Floats, x: np.float32, y: np.float32, left: int, top: int,
+                weights: Floats, first: Places, found: Floats) -> None:
+    """Write greys (LANES,) between pixels by cubic convolution (Keys 1981, a = -1/2).
+
+    columns, rows (LANES,): offsets [px] from x, y; greys: see `copy_around`, whose first pixel is that at left, top.
+    weights (8, LANES), first (LANES,): room. Bilinear interpolation shifts fine texture by up to 0.02 px, depending on
+    the place between the pixels.
+    """
+    for lane in range(LANES):
+        column, row = x + columns[lane], y + rows[lane]
+        whole_column, whole_row = np.floor(column), np.floor(row)
+        first[lane] = ((np.int32(whole_row) - np.int32(top + 1)) * np.int32(AROUND_PX)
+                       + (np.int32(whole_column) - np.int32(left + 1)))
+        u, v = column - whole_column, row - whole_row
+        p, q = ONE - u, ONE - v
+        weights[0, lane], weights[3, lane] = -HALF * u * p * p, -HALF * p * u * u
+        weights[1, lane] = ONE + u * u * (INNER_CUBE * u - INNER_SQUARE)
+        weights[2, lane] = ONE + p * p * (INNER_CUBE * p - INNER_SQUARE)
+        weights[4, lane], weights[7, lane] = -HALF * v * q * q, -HALF * q * v * v
+        weights[5, lane] = ONE + v * v * (INNER_CUBE * v - INNER_SQUARE)
+        weights[6, lane] = ONE + q * q * (INNER_CUBE * q - INNER_SQUARE)
+    found[:] = ZERO
+    for k in range(4):
+        for lane in range(LANES):
+            at = np.uint64(first[lane] + k * AROUND_PX)
+            found[lane] += weights[4 + k, lane] * (
+                weights[0, lane] * greys[at] + weights[1, lane] * greys[at + FIRST]
+                + weights[2, lane] * greys[at + SECOND] + weights[3, lane] * greys[at + THIRD])
 
 
 @inner

@@ -117,7 +117,7 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
     components = len(shared.covariance)
     T, error, squared = np.array(T, order="C"), np.zeros(components), np.empty(len(views))
     spread = np.empty((6 + components, 6 + components))
-    prior = np.asarray(np.linalg.inv(shared.covariance), float)
+    prior = np.asarray(np.linalg.inv(shared.covariance), float) if components else shared.covariance
     pose_kernels.gauss_newton(landmarks, views, W, np.ascontiguousarray(shared.derivatives), prior, model.camera, steps,
                               converged, T, error, spread, squared)
     return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])
