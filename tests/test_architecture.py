@@ -162,8 +162,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.engine omnid.errors omnid.messages omnid.monitor omnid.recordings omnid.runs omnid.sinks "
         "omnid.stages omnid.tracking_state omnid.transport",
     "omnid.web":
-        "drivers.errors drivers.logs omnid.client omnid.engine omnid.errors omnid.monitor omnid.tracking_state "
-        "omnid.transport",
+        "drivers.errors drivers.logs omnid.client omnid.core.navigation omnid.engine omnid.errors omnid.monitor "
+        "omnid.tracking_state omnid.transport",
 }
 
 

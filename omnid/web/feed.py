@@ -18,12 +18,12 @@ from omnid.client import Diagnostics, Map, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import Pose, decode_map
+from omnid.transport.decode import Pose, decode_map, decode_navigation
 from omnid.transport.scan_codec import decode_scan
 from omnid.transport.status_names import WHEELS
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
-from omnid.web.snapshot import MOST_CELLS, map_message, parts_message, scan_message, state_message
+from omnid.web.snapshot import MOST_CELLS, map_message, navigation_message, parts_message, scan_message, state_message
 
 PERIOD_S: Final = 0.03  # least time between two messages of the state
 QUIET_S: Final = 0.5  # without a message of the robot, after which the state is sent all the same
@@ -31,9 +31,11 @@ RETRY_S: Final = 0.5
 REQUEST_S: Final = 0.2  # between two looks for channels that browsers ask for
 PANORAMA: Final = "panorama"
 SCAN: Final = "scan"
+NAVIGATION: Final = "navigation"
 MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
 _LARGEST: Final = {"odom": 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
-                   PANORAMA: 1 << 23}  # bytes
+                   PANORAMA: 1 << 23, NAVIGATION: 1 << 16}  # bytes
+_NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 _JPEG: Final = b"\xff\xd8"
 Receiver = Callable[[str, bytes, bytes], None]
 
@@ -43,7 +45,7 @@ class RobotFeed:
 
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
-        self._bus = bus
+        self.bus = bus
         self.state, self.path = RobotState(), LivePath()
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
@@ -53,16 +55,19 @@ class RobotFeed:
         self._panorama: Encoded = b""
         self._scan: Encoded = ""
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
-        self._large: dict[str, bytes] = {}  # newest map, panorama and scan that are not processed yet
+        self._navigation: Encoded = ""
+        self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
         self._state_channel = Newest("state", self._encode_state)
         self._parts_channel = Newest("parts", lambda: parts_message(self.state))
         self._map_channel = Newest("map", lambda: self._map)
         self._panorama_channel = Newest(PANORAMA, lambda: self._panorama)
         self._scan_channel = Newest(SCAN, lambda: self._scan)
+        self._navigation_channel = Newest(NAVIGATION, lambda: self._navigation)
         self._end_panorama: Callable[[], None] | None = None
         self.browsers = Browsers((self._state_channel, self.path, self._parts_channel, self._map_channel,
-                                  self._panorama_channel, self._scan_channel), on_request=frozenset((PANORAMA,)))
+                                  self._panorama_channel, self._scan_channel, self._navigation_channel),
+                                 on_request=frozenset((PANORAMA,)))
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
@@ -89,12 +94,12 @@ class RobotFeed:
         loop = asyncio.get_running_loop()
         while self.robot is None:
             try:
-                self.robot = await asyncio.to_thread(Robot, settings=self._bus)
+                self.robot = await asyncio.to_thread(Robot, settings=self.bus)
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(RETRY_S)
         self.link = ""
-        for topic in ("odom", "status", "map", SCAN):
+        for topic in ("odom", "status", "map", SCAN, NAVIGATION):
             self.robot.on_message(self._receiver(loop), topic)
         self.robot.on_alive(self.state.set_alive)
         diagnostics, grid = await asyncio.to_thread(_latched, self.robot)
@@ -114,7 +119,7 @@ class RobotFeed:
             if len(payload) > _LARGEST.get(topic, 0):
                 self.state.broken += 1
                 return
-            if topic in ("map", PANORAMA, SCAN):
+            if topic in _NEWEST_ONLY:
                 self._large[topic] = payload  # in place of one that was not processed yet
             else:
                 self.inbox.put(topic, payload, attachment)
@@ -155,7 +160,7 @@ class RobotFeed:
         while True:
             await self._large_wake.wait()
             self._large_wake.clear()
-            for topic in (SCAN, "map", PANORAMA):
+            for topic in _NEWEST_ONLY:
                 payload = self._large.pop(topic, None)
                 if payload is not None:
                     await self._take_large(topic, payload)
@@ -166,6 +171,9 @@ class RobotFeed:
             if topic == SCAN:
                 self._scan = scan_message(decode_scan(payload), self._poses)
                 self._scan_channel.changed()
+            elif topic == NAVIGATION:
+                self._navigation = navigation_message(decode_navigation(payload))
+                self._navigation_channel.changed()
             elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
             else:
@@ -188,7 +196,7 @@ class RobotFeed:
             await asyncio.to_thread(end)
 
     def _encode_state(self) -> str:
-        return state_message(self._bus.robot, self.state, self.link,
+        return state_message(self.bus.robot, self.state, self.link,
                              {"dropped": self.inbox.dropped, "browsers": len(self.browsers),
                               "panoramas": self._panorama_channel.version})
 

@@ -10,6 +10,7 @@ from starlette.websockets import WebSocket
 from omnid.web.feed import RobotFeed
 from omnid.web.guard import Guard
 from omnid.web.metrics import metrics
+from omnid.web.route_requests import RouteRequests
 from omnid.web.wheel_commands import Answer, WheelCommands
 
 
@@ -17,12 +18,13 @@ class RobotPage:
     """The answers about one robot."""
 
     def __init__(self, feed: RobotFeed) -> None:
-        self.feed, self.wheels = feed, WheelCommands(feed)
+        self.feed, self.wheels, self._routes = feed, WheelCommands(feed), RouteRequests(feed.bus)
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
         return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
-                Route("/arm", self._arm, methods=["POST"])]
+                Route("/arm", self._arm, methods=["POST"]), Route("/route", self._route, methods=["POST"]),
+                Route("/navigation", self._navigation, methods=["POST"])]
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of the robot and of this server."""
@@ -37,6 +39,12 @@ class RobotPage:
 
     async def _arm(self, _: Request) -> Response:
         return answered(await self.wheels.arm())
+
+    async def _route(self, request: Request) -> Response:
+        return answered(await self._routes.route(request))
+
+    async def _navigation(self, request: Request) -> Response:
+        return answered(await self._routes.navigation(request))
 
 
 def answered(answer: Answer) -> Response:

@@ -12,7 +12,7 @@ import numpy as np
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, plain
 from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.decode import Map, Pose
+from omnid.transport.decode import Map, NavigationReport, Pose
 from omnid.transport.scan_codec import Scan
 from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
@@ -88,6 +88,13 @@ def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
     return compact({"type": "scan", "points": [[finite(x), finite(y)] for x, y in points.round(3)],
                     "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)]})
+
+
+def navigation_message(report: NavigationReport) -> str:
+    """Return the message `navigation`: what is driven or taught, and what became of the newest request."""
+    return compact({"type": "navigation", "state": plain(report.state), "reason": plain(report.reason),
+                    "task": plain(report.task), "left_m": finite(report.left_m), "teaching": plain(report.teaching),
+                    "taught_m": finite(report.taught_m), "refusal": plain(report.refusal)})
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -86,11 +86,11 @@ export function wireCommands() {
 }
 
 // Sends a command; again and again for so many ms where the server cannot be reached. Returns {done, text}.
-export async function post(address, patience, onFailure) {
+export async function post(address, patience, onFailure, body = undefined) {
   const end = performance.now() + patience;
   for (;;) {
     try {
-      const response = await fetch(address, { method: "POST" });
+      const response = await fetch(address, { method: "POST", body });
       if (response.headers.get("content-type")?.startsWith("application/json")) return await response.json();
       return { done: false, text: `${EMERGENCY}: ${await response.text()}` };
     } catch (error) {

@@ -3,6 +3,7 @@ import { Connection } from "./connection.js";
 import { Plan } from "./plan.js";
 import { wireCommands } from "./commands.js";
 import { showCalibration } from "./calibration.js";
+import { showNavigation, wireRoutes } from "./routes.js";
 import { wireRecordings } from "./recordings.js";
 import { byId, element, fixed } from "./elements.js";
 
@@ -26,6 +27,7 @@ function onMessage(message, body) {
     case "parts":
       showCalibration(message.parts.find((part) => part.name === "calibration"));
       return showParts(message.parts);
+    case "navigation": return showNavigation(message);
     case "scan":
       nearest = message.nearest;
       return plan.setObstacles(message.points);
@@ -138,4 +140,5 @@ if (location.pathname.startsWith("/robot/")) { // one of several: recordings of 
 } else {
   wireRecordings();
 }
+wireRoutes();
 connection.open();

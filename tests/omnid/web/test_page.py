@@ -27,6 +27,7 @@ from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
 from tests.omnid.web.servers import PATIENCE_S, WebServer, served
 from tests.omnid.web.test_fleet_page import Robots
+from tests.omnid.web.test_routes import Navigator
 from tests.replay.live import robot, wait_until
 from tests.replay.test_arming import MANUAL
 
@@ -196,6 +197,38 @@ def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
                 shows(page, "pose", "1.50 m")
                 expect_it_fits(page, size)
                 screenshot(page, f"{size}-calibration")
+
+
+def test_routes_are_taught_and_repeated(browser: Any) -> None:
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as ends:
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
+        navigator = Navigator(bus)
+        server = ends.enter_context(served("--connect", endpoint))
+        publishing = threading.Event()
+        thread = threading.Thread(target=lambda: [navigator.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
+        thread.start()
+        ends.callback(thread.join)
+        ends.callback(publishing.set)
+        for size in SIZES:
+            with opened(browser, server, size) as page:
+                shows(page, "navigation", "route dock: driving, 3.5 m left")
+                count = len(navigator.asked)
+                page.fill("#route-name", "../x")
+                page.click("#route-teach")
+                page.fill("#route-name", "dock 1")
+                page.click("#route-repeat")
+                assert len(navigator.asked) == count
+                page.fill("#route-name", "dock-1")
+                page.click("#route-teach")
+                shows(page, "route-answer", "driving")
+                page.click("#route-repeat")
+                assert navigator.asked[-1] == "teach dock-1", "one press only asks"
+                page.click("#route-repeat")
+                wait_until(lambda: navigator.asked[-1] == "repeat dock-1", "the repetition")
+                page.locator("#navigation-box").scroll_into_view_if_needed()
+                expect_it_fits(page, size)
+                screenshot(page, f"{size}-routes")
 
 
 def test_the_page_of_all_robots(browser: Any) -> None:

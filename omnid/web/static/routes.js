@@ -1,0 +1,53 @@
+// Routes: teach, finish, repeat, stop, pause and resume. A repetition moves the robot, so its button asks first.
+import { post } from "./commands.js";
+import { byId, fixed } from "./elements.js";
+
+const SURE_MS = 4000;
+
+export function wireRoutes() {
+  const name = byId("route-name");
+  let sureUntil = 0;
+  const ask = async (address, text) => {
+    byId("route-answer").textContent = "asking the robot ...";
+    const answer = await post(address, 0, () => {}, text);
+    byId("route-answer").textContent = answer.text;
+  };
+  const named = (verb) => {
+    if (name.reportValidity()) ask("route", `${verb} ${name.value}`);
+  };
+  const repeat = byId("route-repeat");
+  const unsure = () => {
+    sureUntil = 0;
+    repeat.textContent = "Repeat";
+    repeat.classList.remove("sure");
+  };
+  repeat.addEventListener("click", () => {
+    if (!name.reportValidity()) return;
+    if (performance.now() > sureUntil) {
+      sureUntil = performance.now() + SURE_MS;
+      repeat.textContent = "It will drive: again";
+      repeat.classList.add("sure");
+      setTimeout(unsure, SURE_MS);
+      return;
+    }
+    unsure();
+    named("repeat");
+  });
+  byId("route-teach").addEventListener("click", () => named("teach"));
+  byId("route-finish").addEventListener("click", () => ask("route", "finish"));
+  byId("route-stop").addEventListener("click", () => ask("route", "stop"));
+  byId("route-pause").addEventListener("click", () => ask("navigation", "pause"));
+  byId("route-resume").addEventListener("click", () => ask("navigation", "resume"));
+}
+
+export function showNavigation(report) {
+  byId("navigation-box").hidden = false;
+  const left = report.left_m === null ? "" : `, ${fixed(report.left_m, 1)} m left`;
+  const what = report.task ? `${report.task}: ` : "";
+  const why = report.reason ? `: ${report.reason}` : "";
+  byId("navigation").textContent = report.teaching
+    ? `teaching ${report.teaching}: ${fixed(report.taught_m, 1)} m; drive it, then Finish`
+    : `${what}${report.state}${why}${left}`;
+  byId("route-teach").hidden = Boolean(report.teaching);
+  byId("route-finish").hidden = !report.teaching;
+}
