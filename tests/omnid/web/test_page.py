@@ -206,7 +206,8 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
         navigator = Navigator(bus)
         server = ends.enter_context(served("--connect", endpoint))
         publishing = threading.Event()
-        thread = threading.Thread(target=lambda: [navigator.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
+        thread = threading.Thread(
+            target=lambda: [navigator.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
         thread.start()
         ends.callback(thread.join)
         ends.callback(publishing.set)
