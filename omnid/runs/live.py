@@ -22,7 +22,6 @@ from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.core.control.arming import MANUAL
 from omnid.core.control.command_sources import PLANNER
-from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
@@ -41,7 +40,7 @@ from omnid.messages import OdometryUpdate
 from omnid.refinement.rig_application import RigApplication
 from omnid.refinement.rig_refinement import RigRefinement
 from omnid.runs.map_saver import MapSaver
-from omnid.runs.pipeline import NavigationParts, Sinks, wire
+from omnid.runs.pipeline import NavigationParts, Sinks, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.sensor_sources import SensorSources
@@ -255,12 +254,9 @@ class LiveRun:
             session.warn(f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off")
             return None
 
-        def wheels() -> WheelState:
-            state = controller.statistics.state
-            return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source)
-
         routes = RouteFolder(Path(self._config.navigation.routes))
-        return NavigationParts(requests, wheels, PlannerDrive(controller), routes, self._config.places.map)
+        return NavigationParts(requests, lambda: wheel_state(controller.statistics.state), PlannerDrive(controller),
+                               routes, self._config.places.map)
 
     def _command_receiver(self, controller: ControllerLink) -> CommandReceiver:
         settings = self._config.controller

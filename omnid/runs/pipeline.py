@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
@@ -76,6 +77,12 @@ class NavigationParts(NamedTuple):
     drive: Sink[NavigationUpdate]
     routes: RouteStore
     map_name: str  # of the file of the map; empty: it is not saved
+
+
+def wheel_state(state: ControllerState) -> WheelState:
+    """Return the part of the controller's state that the navigation needs."""
+    return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source,
+                      state.obstacle if state.blocked else "")
 
 
 class WiredStages(NamedTuple):
@@ -149,7 +156,8 @@ def _navigation(geometry: Geometry, config: Config, parts: NavigationParts, plac
     """Return the stage of the navigation, whose setpoints go to the controller."""
     T_base_rig = geometry.rig.T_base_rig
     route_map = None if places is None else RunRouteMap(places, T_base_rig, parts.map_name)
-    return NavigationStage(config.navigation, T_base_rig, parts.wheels, Routes(parts.routes, route_map))
+    return NavigationStage(config.navigation, config.controller.collision, T_base_rig, parts.wheels,
+                           Routes(parts.routes, route_map))
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

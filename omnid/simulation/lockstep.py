@@ -32,7 +32,7 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.runs.pipeline import NavigationParts, Sinks, wire
+from omnid.runs.pipeline import NavigationParts, Sinks, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
@@ -210,8 +210,7 @@ class _Lockstep:
                 self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns))
 
     def _wheels(self) -> WheelState:
-        state = self._vehicle.controller.state
-        return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source)
+        return wheel_state(self._vehicle.controller.state)
 
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig = self._rig.T_base_rig

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.local_planner import room_ahead
@@ -45,13 +46,16 @@ FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
 class NavigationStage:
     """Drive to goals, along paths and routes. Its frames are those of the base, as on the bus."""
 
-    def __init__(self, settings: NavigationSettings, T_base_rig: Array, wheels: Callable[[], WheelState],
-                 routes: Routes) -> None:
-        """wheels: returns the controller's state; called at each pose and request."""
+    def __init__(self, settings: NavigationSettings, collision: CollisionSettings, T_base_rig: Array,
+                 wheels: Callable[[], WheelState], routes: Routes) -> None:
+        """collision: the outline of the base.
+
+        wheels: returns the controller's state; called at each pose and request."""
         self._settings, self._T_base_rig, self._routes = settings, T_base_rig, routes
         self._T_rig_base = se3.inverse(T_base_rig)
         self._wheels = wheels
-        self._navigator = Navigator(settings)
+        self._navigator = Navigator(settings, collision)
+        self._half_width_m = collision.half_width_m
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: KeyframeTie | None = None
@@ -85,7 +89,7 @@ class NavigationStage:
         self._seq = odometry.seq
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
         obstacles = self._obstacles(odometry.stamp_ns)
-        nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._settings.radius_m
+        nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._half_width_m
         self._now = now = Situation(
             odometry.stamp_ns, pose, speed_mps, float(velocity[5]), odometry.state, odometry.reset_counter,
             self._wheels(), self._in_map, obstacles, nearest_m)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.settings import NavigationSettings
 
@@ -36,9 +37,14 @@ SPEEDS: Final = 4
 YAW_RATES: Final = 17
 SHARE: Final = 0.7  # of the speed, on a detour
 HEADING_M_PER_RAD: Final = 0.25  # weights of the judgement, as metres of way
-CLEARANCE_WEIGHT_M: Final = 0.15
+BACK_MPS: Final = -0.12  # to get out of a place that has become too narrow
+BACK_WEIGHT_M: Final = 0.5
+NARROW: Final = 2.0  # weight of narrow places
+NEAR_M: Final = 1.5  # of obstacles that arcs are tested against
+NEARER_M: Final = 0.005
+CLEARANCE_WEIGHT_M: Final = 0.4
+MARGIN_M: Final = 0.02  # beside the room that the collision monitor demands
 FAR_M: Final = 1e3  # way left where no way leads to the path
-SHORTEST_ARC_M: Final = 0.02
 BEHIND_SHARE: Final = -0.17  # cosine of the direction beyond which an obstacle is behind
 
 
@@ -52,19 +58,26 @@ class Detour(NamedTuple):
 class LocalPlanner:
     """Decide at each pose whether the path can be followed, and go around what stands on it. All in odom."""
 
-    def __init__(self, settings: NavigationSettings) -> None:
+    def __init__(self, settings: NavigationSettings, collision: CollisionSettings) -> None:
+        """collision: the outline of the base, and the room that the collision monitor demands."""
         self._settings = settings
+        self._half_m = collision.half_width_m + collision.side_m
+        self._ahead = collision.front_m + collision.stop_m, collision.rear_m  # m, of the base that drives on
+        self._behind = collision.front_m, collision.rear_m + collision.stop_m
+        self._turning = collision.front_m, collision.rear_m
+        self._width_m = collision.half_width_m
+        self._front_m = collision.front_m
         self._avoiding = False
         self._edges = _neighbours()
-        speeds = np.linspace(0.0, SHARE * settings.pursuit.velocity_mps, SPEEDS)
+        speeds = np.append(np.linspace(0.0, SHARE * settings.pursuit.velocity_mps, SPEEDS), BACK_MPS)
         rates = np.linspace(-settings.pursuit.yaw_rate_radps, settings.pursuit.yaw_rate_radps, YAW_RATES)
         self._v, self._w = (grid.ravel() for grid in np.meshgrid(speeds, rates))
-        t = np.linspace(0.0, ARC_S, ARC_STEPS + 1)[1:]
+        t = np.linspace(0.0, ARC_S, ARC_STEPS + 1)
         turned = self._w[:, None] * t
         # Chord of an arc: v t sin(w t / 2) / (w t / 2), in the direction w t / 2.
         chord = self._v[:, None] * t * np.sinc(turned / (2 * np.pi))
         self._arc_x, self._arc_y = chord * np.cos(turned / 2), chord * np.sin(turned / 2)
-        self._turned = turned[:, -1]
+        self._turned = turned
 
     def restart(self) -> None:
         """Forget the detour of the last drive."""
@@ -86,7 +99,7 @@ class LocalPlanner:
         ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         near = ways <= min(AHEAD_M, leg_left_m + CELL_M)
         room_m = _distances(path, obstacles)
-        is_blocked = room_m < settings.radius_m + settings.clearance_m
+        is_blocked = room_m < self._half_m + settings.clearance_m
         leaves = is_blocked[0] and _gets_farther(room_m)  # it stands there already, and drives away
         first_m = math.inf if leaves or not is_blocked[near].any() else float(ways[np.argmax(is_blocked)])
         if first_m == math.inf and (not self._avoiding or offset_m < BACK_ON_PATH_M):
@@ -100,7 +113,7 @@ class LocalPlanner:
                 self._avoiding = True
                 return Detour(motion, True)
         # 3. No way: up to the obstacle, and wait.
-        left_m = first_m - settings.radius_m - BEFORE_M
+        left_m = first_m - self._front_m - BEFORE_M
         if self._avoiding or left_m <= 0:
             return Detour(None, self._avoiding)
         speed_mps = min(wanted.velocity_mps, math.sqrt(2 * WAIT_MPS2 * left_m))
@@ -112,34 +125,50 @@ class LocalPlanner:
         settings = self._settings
         corner = pose[:2] - HALF_CELLS * CELL_M
         room_m = _grid_distances(obstacles, corner)
-        beside_m = _grid_distances(path, corner)
-        own = room_m[HALF_CELLS, HALF_CELLS]
-        least_m = min(settings.radius_m + 0.5 * settings.clearance_m, max(0.0, float(own) - CELL_M))
-        is_free = (room_m > least_m) & (beside_m <= settings.corridor_m)
+        own_m = max(0.0, float(room_m[HALF_CELLS, HALF_CELLS]) - CELL_M)
+        least_m = min(self._half_m + 0.5 * settings.clearance_m, own_m)
+        is_free = (room_m > least_m) & (_grid_distances(path, corner) <= settings.corridor_m)
         is_free[HALF_CELLS, HALF_CELLS] = True
-        left_m = _wave_front(self._edges, is_free, _cells(goal[None], corner)[0])
+        # Ways through narrow places count as longer ones.
+        wide_m = self._half_m + 3 * settings.clearance_m
+        narrow = 1.0 + NARROW * np.clip((wide_m - room_m) / wide_m, 0, 1)
+        left_m = _wave_front(self._edges, is_free, narrow, _cells(goal[None], corner)[0])
         if left_m is None or left_m[HALF_CELLS, HALF_CELLS] >= FAR_M:
             return None
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        x = pose[0] + c * self._arc_x - s * self._arc_y
-        y = pose[1] + s * self._arc_x + c * self._arc_y
-        cells = _cells(np.stack([x, y], axis=-1), corner)
-        rows, columns = cells[..., 1], cells[..., 0]
-        clear = room_m[rows, columns].min(axis=1)
-        open_ = is_free[rows, columns].all(axis=1) & (left_m[rows[:, -1], columns[:, -1]] < FAR_M)
-        stands = self._v < SHORTEST_ARC_M
-        open_ |= stands & (np.abs(self._w) > 0)
+        places = pose[:2] + np.stack([c * self._arc_x - s * self._arc_y, s * self._arc_x + c * self._arc_y], axis=-1)
+        cells = _cells(places, corner)
+        clear_m = room_m[cells[..., 1], cells[..., 0]].min(axis=1)
+        rows, columns = cells[:, -1, 1], cells[:, -1, 0]
+        way_m = left_m[rows, columns]
+        is_open = self._keeps_clear(pose, obstacles) & (way_m < FAR_M) & is_free[rows, columns]
         # The heading at the end against the way down the distances.
-        ends = left_m[rows[:, -1], columns[:, -1]]
-        down = _descent(left_m, rows[:, -1], columns[:, -1])
-        off = np.abs(np.remainder(pose[2] + self._turned - down + np.pi, 2 * np.pi) - np.pi)
-        wide_m = settings.radius_m + 2 * settings.clearance_m
-        cost = ends + HEADING_M_PER_RAD * off + CLEARANCE_WEIGHT_M * np.clip((wide_m - clear) / wide_m, 0, 1)
-        cost = np.where(open_, cost, np.inf)
+        down = _descent(left_m, rows, columns)
+        off = np.abs(np.remainder(pose[2] + self._turned[:, -1] - down + np.pi, 2 * np.pi) - np.pi)
+        cost = way_m + HEADING_M_PER_RAD * off + BACK_WEIGHT_M * (self._v < 0)
+        cost += CLEARANCE_WEIGHT_M * np.clip((wide_m - clear_m) / wide_m, 0, 1)
+        cost = np.where(is_open & ((self._v != 0) | (self._w != 0)), cost, np.inf)
         best = int(np.argmin(cost))
-        if not np.isfinite(cost[best]):
-            return None
-        return Setpoint(float(self._v[best]), None, float(self._w[best]))
+        return Setpoint(float(self._v[best]), None, float(self._w[best])) if np.isfinite(cost[best]) else None
+
+    def _keeps_clear(self, pose: Array, obstacles: Array) -> NDArray[np.bool_]:
+        """Return which arcs keep the room that the collision monitor demands on the side to which the base moves."""
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        d = obstacles - pose[:2]
+        d = d[np.hypot(d[:, 0], d[:, 1]) < NEAR_M]
+        x, y = c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]
+        dx, dy = x - self._arc_x[..., None], y - self._arc_y[..., None]
+        cos, sin = np.cos(self._turned)[..., None], np.sin(self._turned)[..., None]
+        along, aside = cos * dx + sin * dy, np.abs(cos * dy - sin * dx)
+        reach = np.array([self._turning if v == 0 else self._ahead if v > 0 else self._behind for v in self._v])
+        inside = ((along < reach[:, 0, None, None] + MARGIN_M) & (along > -reach[:, 1, None, None] - MARGIN_M)
+                  & (aside < self._half_m + MARGIN_M))
+        # What is within that room already: it must not come nearer to the outline.
+        gap_m = np.hypot(np.maximum(np.maximum(along - self._turning[0], -self._turning[1] - along), 0.0),
+                         np.maximum(aside - self._width_m, 0.0))
+        nearer = (gap_m < gap_m[:, :1] - NEARER_M).any(axis=1)
+        hits = np.where(inside[:, 0], nearer, inside.any(axis=1))
+        return np.asarray(~hits.any(axis=1))
 
 
 def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
@@ -211,8 +240,8 @@ def _neighbours() -> _Neighbours:
     return _Neighbours(first.astype(np.int32), second.astype(np.int32), CELL_M * np.hypot(dx, dy)[inside])
 
 
-def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], goal: NDArray[np.intp]) -> Array | None:
-    """Return the way from each free cell to the goal [m], FAR_M where there is none; None where the goal is not free.
+def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], weight: Array, goal: NDArray[np.intp]) -> Array | None:
+    """Return the weighted way from each free cell to the goal [m], FAR_M without one; None where the goal is not free.
     """
     column, row = int(goal[0]), int(goal[1])
     if not is_free[row, column]:
@@ -220,7 +249,8 @@ def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], goal: NDArray[np
     free = is_free.ravel()
     usable = free[edges.first] & free[edges.second]
     counts = np.bincount(edges.first[usable], minlength=free.size)
-    graph = csr_matrix((edges.length_m[usable], edges.second[usable], np.concatenate([[0], np.cumsum(counts)])),
+    lengths = edges.length_m[usable] * weight.ravel()[edges.first[usable]]
+    graph = csr_matrix((lengths, edges.second[usable], np.concatenate([[0], np.cumsum(counts)])),
                        shape=(free.size, free.size))
     found = dijkstra(graph, indices=row * len(is_free) + column)
     return np.asarray(np.where(np.isfinite(found), found, FAR_M).reshape(is_free.shape))

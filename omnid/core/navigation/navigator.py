@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
@@ -66,9 +67,10 @@ class Navigation(NamedTuple):
 class Navigator:
     """Holds the drive that is under way, if there is one."""
 
-    def __init__(self, settings: NavigationSettings) -> None:
+    def __init__(self, settings: NavigationSettings, collision: CollisionSettings | None = None) -> None:
+        """collision: the outline of the base; None: the default one."""
         self._settings = settings
-        self._planner = LocalPlanner(settings)
+        self._planner = LocalPlanner(settings, collision or CollisionSettings())
         self._last_ns: int | None = None
         self._stops = 0  # still to be sent
         self.drive: Drive | None = None
@@ -141,6 +143,10 @@ class Navigator:
         if plan.setpoint is None:
             return self._wait(drive, NavigationState.BLOCKED, "something stands on the path", dt_s)._replace(
                 left_m=following.left_m, offset_m=following.offset_m)
+        if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
+            held = self._wait(drive, NavigationState.BLOCKED, now.wheels.held_by, dt_s)
+            return held._replace(setpoint=plan.setpoint if self.drive else held.setpoint, left_m=following.left_m,
+                                 offset_m=following.offset_m)
         # 5. What holds the wheels, and progress.
         if self._is_stuck(drive, now, following.left_m, dt_s):
             return self._failed(f"no progress for {self._settings.stuck_s:g} s"

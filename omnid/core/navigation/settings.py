@@ -34,8 +34,8 @@ class NavigationSettings:
     pursuit: PursuitSettings = field(default_factory=PursuitSettings)
     goal_cm: float = knob(2.0, "a goal is reached within that distance, cm", low=0.1, high=200)
     goal_deg: float = knob(0.6, "and within that heading error, deg", low=0.1, high=180)
-    radius_m: float = knob(0.25, "radius of a circle about base_link that holds the robot, m", low=0.02, high=5)
-    clearance_m: float = knob(0.1, "distance to obstacles that is kept beside it, m", low=0, high=5)
+    clearance_m: float = knob(0.1, "distance to obstacles beside the path that is kept, beyond what the collision "
+                              "monitor demands (controller.collision), m", low=0, high=5)
     corridor_m: float = knob(0.8, "how far beside the path it may go around obstacles, m; 0: it stays on it and waits",
                              low=0, high=20)
     blocked_s: float = knob(30.0, "wait for a free way before it fails, s", low=1, high=86_400)

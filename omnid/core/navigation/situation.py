@@ -23,6 +23,7 @@ class WheelState(NamedTuple):
     disarmed_by: str = ""  # empty while armed
     reason: str = ""  # why the wheels must stop now; empty: they may turn
     source: str = ""  # of the commands that drive; empty while none does
+    held_by: str = ""  # why the collision monitor stops the base; empty: it does not
 
 
 class MapPosition(NamedTuple):

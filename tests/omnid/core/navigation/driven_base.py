@@ -38,6 +38,8 @@ class Sample(NamedTuple):
 class DrivenBase:
     """Poses in, commands out; odom is the true frame, and the map may lie elsewhere."""
 
+    has_ring = False  # else nothing looks for obstacles
+
     def __init__(self, navigator: Navigator, seed: int, *, start: tuple[float, float, float] = (0.0, 0.0, 0.0),
                  pose_hz: float = 10.0, T_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.navigator = navigator
@@ -50,7 +52,8 @@ class DrivenBase:
         self.resets = 0
         self.slip = 1.0  # share of the commanded motion that happens
         self.T_map_odom = np.array(T_map_odom)
-        self.law = ControlLaw(ControllerSettings(arming=AUTOMATIC, motion=MotionSettings(check=False)), -1)
+        settings = ControllerSettings(arming=AUTOMATIC, motion=MotionSettings(check=False))
+        self.law = ControlLaw(settings if self.has_ring else settings.without_obstacles, -1)
         self.law.set_pose(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
         self.law.step(0, 0.0)
         self._gain = 1.0 + 0.02 * self.rng.standard_normal(2)
@@ -63,7 +66,8 @@ class DrivenBase:
     def wheels(self) -> WheelState:
         arming, law = self.law.arming, self.law
         source = "" if law.reason or law.commands.current is None else law.commands.current.source
-        return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source)
+        held_by = law.collision.reason if law.collision.share == 0.0 else ""
+        return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
 
     def seen(self) -> Situation:
         """Return the pose as it is estimated now."""

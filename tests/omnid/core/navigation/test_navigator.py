@@ -1,0 +1,177 @@
+"""State machine of the navigation: every end is a stop, every halt has a reason, and only a person lifts a fault."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.navigator import STOPS, Navigation, Navigator
+from omnid.core.navigation.path import DrivePath, straight_leg
+from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.navigation_state import NavigationState
+from omnid.tracking_state import MapState, TrackingState
+from tests.omnid.core.navigation.driven_base import DrivenBase
+
+SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
+
+
+def driving(frame: NavigationFrame = NavigationFrame.ODOM, seed: int = 1) -> DrivenBase:
+    """Return a base that is on its way to a goal 5 m ahead."""
+    base = DrivenBase(Navigator(SETTINGS), seed)
+    path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
+    base.navigator.start("goal", frame, [path], base.seen(), command_ns=7)
+    base.run(20, lambda answer: answer.left_m < 4.0, rest_s=0)
+    assert base.v > 0.3 and base.navigator.state is NavigationState.DRIVING
+    return base
+
+
+def rest(base: DrivenBase, seconds: float) -> Navigation:
+    """Let the time pass; return the last answer."""
+    for _ in range(round(seconds / 0.02)):
+        base.tick()
+    return base.samples[-1].navigation
+
+
+def assert_stands(base: DrivenBase) -> None:
+    assert abs(base.v) < 0.01 and abs(base.w) < 0.02
+
+
+def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
+    base = driving()
+    base.navigator.cancel("cancelled by a request")
+    answers = [base.samples[-1].navigation]
+    while len(answers) <= STOPS + 1:
+        answer = base.tick()
+        answers += [answer] if answer else []
+    assert all(a.setpoint is not None and a.setpoint.velocity_mps == 0.0 for a in answers[1:STOPS + 1])
+    assert answers[-1].setpoint is None and answers[-1].state is NavigationState.CANCELLED
+    rest(base, 1.0)
+    assert_stands(base)
+    assert base.pose[0] < 1.6
+
+
+def test_pause_halts_and_resume_goes_on() -> None:
+    base = driving()
+    base.navigator.pause("paused by a request")
+    assert rest(base, 2.0).state is NavigationState.PAUSED
+    assert_stands(base)
+    assert base.navigator.resume(base.seen()) == ""
+    assert base.run(60).state is NavigationState.REACHED
+
+
+def test_a_stop_ends_the_drive_and_arming_does_not_start_it_again() -> None:
+    base = driving()
+    base.law.stop(round(base.t_s * 1e9))
+    assert rest(base, 1.0).state is NavigationState.CANCELLED
+    base.law.arm(ArmRequest(round(base.t_s * 1e9)))
+    x = base.pose[0]
+    rest(base, 2.0)
+    assert base.pose[0] == pytest.approx(x, abs=1e-3)
+
+
+def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
+    base = driving()
+    base.law.arming._automatic = False  # as with controller.arming = "manual"
+    base.state = TrackingState.LOST
+    rest(base, 0.5)
+    base.state = TrackingState.TRACKING
+    answer = rest(base, 1.0)
+    assert answer.state is NavigationState.PAUSED
+    assert "omnid arm" in answer.reason and "the pose is lost" in answer.reason
+    assert_stands(base)
+    assert "not armed" in base.navigator.resume(base.seen()), "it must be armed first"
+    base.law.arm(ArmRequest(round(base.t_s * 1e9)))
+    x = base.pose[0]
+    assert rest(base, 1.0).state is NavigationState.PAUSED
+    assert base.pose[0] == pytest.approx(x, abs=1e-3), "arming alone does not move it"
+    assert base.navigator.resume(base.seen()) == ""
+    assert base.run(60).state is NavigationState.REACHED
+
+
+def test_stops_where_the_map_is_lost_for_too_far_and_goes_on_when_it_is_found() -> None:
+    base = driving(NavigationFrame.MAP)
+    base.localised, x = False, base.pose[0]
+    base.run(20, lambda answer: answer.state is NavigationState.NOT_LOCALISED)
+    assert base.pose[0] - x == pytest.approx(SETTINGS.unlocalised_m, abs=0.25)
+    assert_stands(base)
+    base.localised = True
+    assert base.run(60).state is NavigationState.REACHED
+
+
+def test_fails_where_the_map_is_not_found_again() -> None:
+    base = driving(NavigationFrame.MAP)
+    base.localised = False
+    answer = base.run(60)
+    assert answer.state is NavigationState.FAILED and "not localised for 4 s" in answer.reason
+    assert_stands(base)
+
+
+def test_a_new_odom_ends_a_drive_in_it_and_a_drive_in_the_map_waits_for_its_place() -> None:
+    base = driving()
+    base.resets = 1
+    answer = base.run(2)
+    assert answer.state is NavigationState.FAILED and "begun again" in answer.reason
+    base = driving(NavigationFrame.MAP)
+    base.resets, base.localised = 1, False
+    assert rest(base, 1.0).state is NavigationState.NOT_LOCALISED
+    assert_stands(base)
+
+
+def test_gives_up_without_progress() -> None:
+    base = driving()
+    base.slip = 0.0
+    answer = base.run(20)
+    assert answer.state is NavigationState.FAILED and "no progress for 3 s" in answer.reason
+
+
+def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
+    base = driving()
+    for _ in range(100):
+        base.law.set_command(TimedSetpoint(round(base.t_s * 1e9), Setpoint(0.0), OPERATOR))
+        base.tick()
+    answer = base.samples[-1].navigation
+    assert answer.state is NavigationState.PAUSED and answer.reason == "operator drives"
+    assert_stands(base)
+    base.pose = base.pose + np.array([0.0, 2.0, 0.0])
+    assert "beside the path" in base.run(10).reason
+
+
+def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
+    base = driving()
+    wheels = base.wheels._replace(held_by="an obstacle is in the way")
+    answer = base.navigator.step(base.seen()._replace(wheels=wheels))
+    assert answer.state is NavigationState.BLOCKED and answer.reason == "an obstacle is in the way"
+    assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
+
+
+@pytest.mark.parametrize(("change", "frame", "words"), [
+    ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
+    ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
+    ({"in_map": None}, "map", "not localised"),
+    ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
+    ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, 0.5)}, "map", "uncertain by 0.50 m"),
+    ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, math.nan)}, "map", "uncertain"),
+    ({"in_map": None}, "odom", "")])
+def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: str) -> None:
+    now = Situation(0, np.zeros(3), 0.0, 0.0, TrackingState.TRACKING, 0, WheelState(True, False),
+                    MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02))._replace(**change)  # type: ignore[arg-type]
+    refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
+    assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
+    assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
+
+
+def test_nothing_is_sent_before_a_request() -> None:
+    base = DrivenBase(Navigator(SETTINGS), 2)
+    assert rest(base, 1.0) == Navigation(None, NavigationState.IDLE, "", pytest.approx(math.nan, nan_ok=True),
+                                         pytest.approx(math.nan, nan_ok=True))
+    assert base.navigator.resume(base.seen()).startswith("nothing is under way")
+    base.navigator.cancel("x")
+    base.navigator.pause("x")
+    assert base.navigator.state is NavigationState.IDLE
