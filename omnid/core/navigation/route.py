@@ -143,12 +143,16 @@ def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: i
     robot is not near it.
     """
     there = route.reversed() if reverse else route
-    back = there if route.is_closed else there.reversed()
     poses = there.in_map(keyframe)
     first = _entry(poses, pose)
     paths = [_path(there, poses, first, pose)]
-    whole = {True: _path(there, poses, 0, None), False: _path(back, back.in_map(keyframe), 0, None)}
-    return paths + [whole[k % 2 == 0] for k in range(1, loops)]
+    if loops == 1:
+        return paths
+    first_way = other_way = _path(there, poses, 0, None)
+    if not route.is_closed:
+        back = there.reversed()
+        other_way = _path(back, back.in_map(keyframe), 0, None)
+    return paths + [other_way if k % 2 else first_way for k in range(1, loops)]
 
 
 def _entry(poses: Array, pose: Array) -> int:

@@ -1,0 +1,178 @@
+"""Routes: recorded, tied to keyframes, repeated from anywhere on them, bound to their map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.navigation.navigator import Navigator
+from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
+from omnid.core.navigation.settings import NavigationSettings
+from omnid.errors import OmnidError
+from omnid.navigation_state import NavigationState
+from tests.omnid.core.navigation.driven_base import DrivenBase
+
+Array = NDArray[np.float64]
+SPACING_M = 1.0  # between keyframes
+
+
+def way(length_m: float = 12.0) -> Array:
+    """Return poses (N, 3) each 2 cm along a way with curves."""
+    s = np.arange(0.0, length_m, 0.02)
+    heading = 0.6 * np.sin(s / 1.5)
+    xy = np.cumsum(0.02 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+    return np.column_stack([xy, heading])
+
+
+class Map:
+    """Keyframes along a way; `move` does to them what an optimisation does."""
+
+    def __init__(self, poses: Array) -> None:
+        self.poses = {k: pose for k, pose in enumerate(poses[::round(SPACING_M / 0.02)])}
+        self.stamps = {k: 1000 + 7 * k for k in self.poses}
+
+    def __call__(self, id: int) -> KeyframePose | None:
+        return KeyframePose(self.stamps[id], self.poses[id]) if id in self.poses else None
+
+    def nearest(self, pose: Array) -> int:
+        return min(self.poses, key=lambda k: math.dist(self.poses[k][:2], pose[:2]))
+
+    def move(self, by: Callable[[Array], Array]) -> None:
+        self.poses = {k: by(pose) for k, pose in self.poses.items()}
+
+
+def taught(poses: Array, places: Map, speed_mps: float = 0.3) -> Route:
+    """Return the route of a drive along poses."""
+    recorder = RouteRecorder("hall")
+    for pose in poses:
+        id = places.nearest(pose)
+        recorder.add(pose, speed_mps, id, places.poses[id])
+    return recorder.route(places, places.stamps, 1_700_000_000, "site.omap")
+
+
+def bent(pose: Array) -> Array:
+    """Return a pose of a map that was bent by 8 cm and 2 degrees a metre."""
+    return pose + np.array([0.0, 0.005 * pose[0] ** 2, 0.01 * pose[0]])
+
+
+def test_points_are_apart_and_keep_the_way() -> None:
+    poses = way()
+    route = taught(poses, Map(poses))
+    steps = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
+    assert steps.min() > 0.09 and steps.max() < 0.13
+    assert route.length_m == pytest.approx(12.0, abs=0.2)
+    assert not route.is_closed
+
+
+def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
+    poses = way()
+    places = Map(poses)
+    route = taught(poses, places)
+    np.testing.assert_allclose(route.in_map(places), route.poses, atol=1e-12)
+    places.move(bent)
+    moved = route.in_map(places)
+    expected = np.array([bent(pose) for pose in route.poses])
+    assert np.abs(moved - expected)[:, :2].max() < 0.06, "a metre behind the last keyframe, the map is still bent"
+    assert np.abs(moved - route.poses)[-1, 1] > 0.4, "it has moved by much"
+    for id in (3, 4, 5):
+        del places.poses[id]
+    assert np.abs(route.in_map(places) - expected)[:, :2].max() < 0.08, "neighbours stand in for keyframes that are gone"
+
+
+def test_a_keyframe_of_another_map_does_not_count() -> None:
+    poses = way()
+    places = Map(poses)
+    route = taught(poses, places)
+    assert route.fits(places)
+    other = Map(poses)
+    other.stamps = {k: stamp + 1 for k, stamp in other.stamps.items()}
+    other.move(bent)
+    assert not route.fits(other)
+    np.testing.assert_allclose(route.in_map(other), route.poses)
+    assert not replace(route, stamps_ns={}).fits(places)
+    some = Map(poses)
+    some.poses = {k: pose for k, pose in some.poses.items() if k % 2}
+    assert route.fits(some), "an aged map is still the same"
+
+
+def test_reversed_faces_the_other_way_and_comes_back() -> None:
+    poses = way()
+    places = Map(poses)
+    route = taught(poses, places)
+    back = route.reversed()
+    np.testing.assert_allclose(back.poses[0, :2], route.poses[-1, :2])
+    assert math.cos(back.poses[0, 2] - route.poses[-1, 2]) == pytest.approx(-1.0)
+    places.move(bent)
+    np.testing.assert_allclose(back.in_map(places)[::-1, :2], route.in_map(places)[:, :2], atol=0.01)
+
+
+@pytest.mark.parametrize("start", [(0.0, 0.2, 0.0), (4.0, 2.0, 0.3), (0.3, -0.6, 2.0)])
+def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> None:
+    poses = way()
+    places = Map(poses)
+    route = taught(poses, places)
+    base = DrivenBase(Navigator(NavigationSettings()), 3, start=start)
+    paths = repeated_paths(route, places, base.pose, loops=1, reverse=False)
+    base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
+    assert base.run(120).state is NavigationState.REACHED
+    away_m, turned_rad = base.error(tuple(route.poses[-1]))
+    assert away_m < 0.03 and turned_rad < math.radians(1)
+    on_way = [np.hypot(*(poses[:, :2] - sample.pose[:2]).T).min() for sample in base.samples]
+    joined = next(k for k, away in enumerate(on_way) if away < 0.03)
+    assert np.percentile(on_way[joined:], 95) < 0.05
+
+
+def test_is_driven_back_and_there_again_and_in_rounds() -> None:
+    poses = way(4.0)
+    places = Map(poses)
+    route = taught(poses, places)
+    base = DrivenBase(Navigator(NavigationSettings()), 4)
+    paths = repeated_paths(route, places, base.pose, loops=2, reverse=False)
+    base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
+    assert base.run(120).state is NavigationState.REACHED
+    assert math.dist(base.pose[:2], route.poses[0, :2]) < 0.03, "there and back"
+    assert max(sample.pose[0] for sample in base.samples) > 3.0
+    a = np.arange(0, math.tau, 0.01)
+    ring = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
+    closed = taught(ring, Map(ring))
+    assert closed.is_closed
+    rounds = repeated_paths(closed, Map(ring), np.zeros(3), loops=3, reverse=False)
+    assert len(rounds) == 3 and rounds[1] is rounds[2] and rounds[1].length_m == pytest.approx(4 * math.pi, abs=0.3)
+
+
+def test_in_a_way_there_and_back_the_heading_decides_where_it_begins() -> None:
+    there = np.column_stack([np.arange(0, 4, 0.02), np.zeros(200), np.zeros(200)])
+    back = np.column_stack([np.arange(4, 0, -0.02), np.full(200, 0.05), np.full(200, math.pi)])
+    poses = np.vstack([there, back])
+    route = taught(poses, Map(poses))
+    one, other = (repeated_paths(route, Map(poses), np.array([2.0, 0.0, heading]), loops=1, reverse=False)[0].length_m
+                  for heading in (0.0, math.pi))
+    assert one == pytest.approx(6.0, abs=0.3) and other == pytest.approx(2.0, abs=0.3)
+
+
+def test_a_robot_that_is_not_near_is_refused() -> None:
+    poses = way()
+    with pytest.raises(OmnidError, match=r"3\.\d m away from the route: drive it there"):
+        repeated_paths(taught(poses, Map(poses)), Map(poses), np.array([0.0, 3.5, 0.0]), loops=1, reverse=False)
+
+
+def test_what_is_too_short_is_no_route() -> None:
+    poses = way(0.3)
+    with pytest.raises(OmnidError, match="drive it, then finish"):
+        taught(poses, Map(poses))
+
+
+def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
+    ahead = np.column_stack([np.arange(0, 2, 0.02), np.zeros(100), np.zeros(100)])
+    recorder, places = RouteRecorder("dock"), Map(ahead)
+    for pose, speed in [*((pose, 0.3) for pose in ahead), *((pose, -0.2) for pose in ahead[:40:-1])]:
+        recorder.add(pose, speed, 0, places.poses[0])
+    route = recorder.route(places, places.stamps, 0, "m")
+    (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
+    assert [leg.backwards for leg in path.legs] == [False, True]
