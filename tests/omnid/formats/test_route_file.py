@@ -34,7 +34,7 @@ def test_a_route_comes_back(tmp_path: Path) -> None:
     assert route_bytes(found) == route_bytes(route()), "the same route gives the same bytes"
     folder.delete("hall")
     assert folder.names() == ["b-2"]
-    with pytest.raises(OmnidError, match="no route hall in .*: there are: b-2"):
+    with pytest.raises(OmnidError, match=r"no route hall in .*: there are: b-2"):
         folder.read("hall")
     with pytest.raises(OmnidError, match="nothing was deleted"):
         folder.delete("hall")
@@ -58,7 +58,8 @@ def test_a_copy_under_another_name_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"version": 2}, "version 2, expected 1"), ({"version": "1" * 50}, "of version"), ({"format": "x"}, "no route file"),
+    ({"version": 2}, "version 2, expected 1"), ({"version": "1" * 50}, "of version"),
+    ({"format": "x"}, "no route file"),
     ({"points": []}, "no points"), ({"points": [[1] * 8] * 2}, "checksum"), ({"points": [[1] * 7] * 2}, "8 numbers"),
     ({"points": {"a": 1}}, "a list"), ({"points": [[1, 2, 3, 4, 1.5, 0, 0, 0]] * 3}, "keyframe is no number"),
     ({"points": [[True] * 8] * 2}, "8 numbers"), ({"keyframes": [[1, -1]]}, "keyframes are no numbers"),
@@ -73,7 +74,8 @@ def test_what_does_not_fit_is_refused_in_one_line(change: dict[str, object], wor
 
 @pytest.mark.parametrize("content", [
     b"", b"\0" * 50, b"[" * 100_000, b"{}", b"null", b"[1]", b'{"format":"omnid route"', b"\xff\xfe", b"1" * 5000,
-    b'{"format":"omnid route","version":1}', b" " * (MAX_BYTES + 1), b"NaN", b'{"format": "omnid route", "version": NaN}'])
+    b'{"format":"omnid route","version":1}', b" " * (MAX_BYTES + 1), b"NaN",
+    b'{"format": "omnid route", "version": NaN}'])
 def test_other_bytes_are_refused(content: bytes) -> None:
     with pytest.raises(OmnidError):
         parse_route(content, "r")

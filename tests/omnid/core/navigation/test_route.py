@@ -82,7 +82,7 @@ def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
     assert np.abs(moved - route.poses)[-1, 1] > 0.4, "it has moved by much"
     for id in (3, 4, 5):
         del places.poses[id]
-    assert np.abs(route.in_map(places) - expected)[:, :2].max() < 0.08, "neighbours stand in for keyframes that are gone"
+    assert np.abs(route.in_map(places) - expected)[:, :2].max() < 0.08, "neighbours stand in for what is gone"
 
 
 def test_a_keyframe_of_another_map_does_not_count() -> None:
