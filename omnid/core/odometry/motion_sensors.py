@@ -105,21 +105,36 @@ class MotionSensors:
             return None
         if wheels is not None and self._stands(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
+        if wheels is not None and gyro is not None and self._disagree(wheels[0], gyro[0], dt_s):
+            wheels = None
+            self.slips += 1
         twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
         if wheels is not None:
             distance, turn = wheels[0]
-            scale = self.values
-            twist[0], twist[5] = scale[DISTANCE] * distance, scale[TURN] * turn
-            sigma[:3] = (math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
-                         math.hypot(SIDE_SHARE * distance, SIDE_M), HEIGHT_M)
-            sigma[3:] = TILT_RAD, TILT_RAD, math.hypot(TURN_SHARE * turn, WHEEL_RAD)
-            slopes[0, DISTANCE], slopes[5, TURN] = distance, turn
+            twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
+            sigma[:5] = (math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
+                         math.hypot(SIDE_SHARE * distance, SIDE_M), HEIGHT_M, TILT_RAD, TILT_RAD)
+            if math.isfinite(turn):
+                twist[5], slopes[5, TURN] = self.values[TURN] * turn, turn
+                sigma[5] = math.hypot(TURN_SHARE * turn, WHEEL_RAD)
         if gyro is not None:
             twist[3:] = gyro[0] - self.values[BIAS] * dt_s
             sigma[3:] = GYRO_RADPS_SQRT_S * math.sqrt(dt_s)
             slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
-        turns = gyro is not None or (wheels is not None and math.isfinite(twist[5]))
-        return self._in_rect(np.nan_to_num(twist), sigma, slopes, complete=wheels is not None and turns)
+        return self._in_rect(twist, sigma, slopes, complete=wheels is not None and sigma[5] < UNKNOWN_RAD)
+
+    def _disagree(self, wheels: Array, gyro: Array, dt_s: float) -> bool:
+        """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips."""
+        turn = wheels[1]
+        if not math.isfinite(turn):
+            return False
+        H = np.zeros(len(START))
+        H[TURN], H[BIAS.stop - 1] = turn, dt_s
+        difference = self.values[TURN] * turn - (gyro[2] - self.values[BIAS][2] * dt_s)
+        variance = (TURN_SHARE * turn) ** 2 + WHEEL_RAD**2 + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
+        # The offsets of both clocks are not known exactly either: a turn begins in one before it does in the other.
+        variance += (self.sigmas[WHEEL_OFFSET] ** 2 + self.sigmas[GYRO_OFFSET] ** 2) * (gyro[2] / dt_s) ** 2
+        return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
 
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
         """Learn from a step of the rectified frame that the cameras measured, with its covariance (6, 6)."""

@@ -176,3 +176,30 @@ def test_late_samples_and_any_order_give_the_same_motion() -> None:
     one, other = ordered.between(*stamps(0.9)), mixed.between(*stamps(0.9))
     assert one is not None and other is not None
     assert np.allclose(one.twist, other.twist, atol=1e-12)
+
+
+def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
+    """The base goes straight on, one wheel turns faster: the distance is not to be believed either."""
+    sensors, end_s = driven(SensorErrors(), 30)
+    rng, moving = np.random.default_rng(4), 4 * np.pi * round(end_s / (4 * np.pi)) + 2.0
+    for seconds, slip in ((0.4, 0.0), (0.8, 0.15)):
+        found = []
+        for step_end in np.arange(moving + PAIR_S, moving + seconds, PAIR_S):
+            new = samples(SensorErrors(), step_end - PAIR_S, step_end, rng)
+            sensors.add([replace(sample, yaw_rate_radps=sample.yaw_rate_radps + slip)
+                         if isinstance(sample, WheelSample) else sample for sample in new])
+            found.append(sensors.between(*stamps(step_end)))
+        assert all(sensed is not None and sensed.is_complete == (slip == 0) for sensed in found)
+        moving += seconds
+
+
+def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
+    """As those of controllers that hold a heading by themselves."""
+    for gyro in (True, False):
+        rng, sensors = np.random.default_rng(4), MotionSensors(T_RECT_BASE)
+        new = samples(SensorErrors(), 0.0, 2.0, rng)
+        sensors.add([replace(sample, yaw_rate_radps=np.nan) if isinstance(sample, WheelSample) else sample
+                     for sample in new if gyro or isinstance(sample, WheelSample)])
+        sensed = sensors.between(*stamps(1.5))
+        assert sensed is not None and np.isfinite(sensed.twist).all() and np.isfinite(sensed.covariance).all()
+        assert sensed.is_complete == gyro

@@ -1,0 +1,63 @@
+"""Samples of wheels and gyro from the network: strict, bounded, counted."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+
+from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
+from omnid.transport.sensor_receiver import SensorReceiver
+from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM
+
+OFFSET_NS = 10**18
+WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5)
+
+
+@pytest.fixture
+def lines() -> list[str]:
+    return []
+
+
+def receiver(taken: list[MotionSample], lines: list[str], *topics: str) -> SensorReceiver:
+    return SensorReceiver(taken.append, OFFSET_NS, frozenset(topics or SENSOR_TOPICS), lines.append)
+
+
+def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    sensors.receive(WHEEL_ODOM, wheel_cdr(WHEELS, WHEELS.stamp_ns + OFFSET_NS))
+    sensors.receive(IMU, gyro_cdr(GYRO, GYRO.stamp_ns + OFFSET_NS))
+    assert taken == [WHEELS, GYRO] and not lines and not sensors.refused
+    assert sensors.handles(IMU) and not sensors.handles("cmd/twist")
+
+
+def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
+    """No stamp, absurd or infinite rates, another source in use, damaged bytes: counted, one line for each topic."""
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    bad = [wheel_cdr(WHEELS, 0), wheel_cdr(WheelSample(1, 1000.0, 0.0), OFFSET_NS),
+           wheel_cdr(WheelSample(1, np.inf, 0.0), OFFSET_NS), wheel_cdr(WheelSample(1, np.nan, 0.0), OFFSET_NS),
+           wheel_cdr(WHEELS, OFFSET_NS) + bytes(10_000), b""]
+    for payload in bad:
+        sensors.receive(WHEEL_ODOM, payload)
+    assert taken == [] and sensors.refused[WHEEL_ODOM] == len(bad) and len(lines) == 1
+    only_imu = receiver(taken, lines, IMU)
+    only_imu.receive(WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS))
+    assert taken == [] and "motion.wheels" in lines[-1]
+
+
+def test_damaged_bytes_never_raise_and_give_finite_samples(lines: list[str]) -> None:
+    rng, taken = random.Random(3), list[MotionSample]()
+    sensors = receiver(taken, lines)
+    for topic, payload in ((WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)), (IMU, gyro_cdr(GYRO, OFFSET_NS + 1))):
+        for _ in range(2000):
+            damaged = bytearray(payload[:rng.randrange(len(payload) + 1)] if rng.random() < 0.3 else payload)
+            for _ in range(rng.randrange(1, 6)):
+                if damaged:
+                    damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+            sensors.receive(topic, bytes(damaged))
+    rates = [sample.velocity_mps if isinstance(sample, WheelSample) else sample.z_radps for sample in taken]
+    assert len(taken) > 500 and np.isfinite(rates).all() and np.abs(rates).max() <= 100
