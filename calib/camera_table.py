@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
+from calib.models.lens import LENS_KEYS, LensCamera, lens_camera, lens_parameters
+from calib.models.names import model_name
 from calib.models.ocam import DISTANCE_M, NO_WAVEFRONT, VIEWS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.validation import ValidatedTable, read_bytes
@@ -25,6 +27,7 @@ PNG_CHUNK_BYTES = 12
 MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"
 OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
+PINHOLE_KEYS = ("fu", "fv", "pu", "pv")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
 # Optional terms of an ocam camera: tangential [1/px], secondary astigmatism [1/px^2]; files without them are read as 0.
 TANGENTIAL_KEYS, ASTIGMATISM_KEYS = ("p1", "p2"), ("s1", "s2")
@@ -35,9 +38,9 @@ WAVEFRONT_KEYS = ("wavefront", "distance_m")
 def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
                       ) -> tuple[OmniCamera, Mask | None]:
     """Read camera and mask of a table; others: further keys that it may have; folder contains the mask's image."""
-    model = table.choice("model", ("omni", "ocam"))
+    model = table.choice("model", ("omni", "ocam", *LENS_KEYS))
     table.allow_only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
-    camera = _omni(table) if model == "omni" else _ocam(table)
+    camera: OmniCamera = _omni(table) if model == "omni" else _ocam(table) if model == "ocam" else _lens(table, model)
     return camera, _mask(table, folder) if table.has("mask") else None
 
 
@@ -49,6 +52,16 @@ def _omni(table: ValidatedTable) -> UnifiedCamera:
     size = table.size("size")
     try:
         return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
+    except CalibError as error:
+        raise CalibError(f"{table.file}: {values.path}: {error}") from error
+
+
+def _lens(table: ValidatedTable, model: str) -> LensCamera:
+    values, keys = table.table("intrinsics"), LENS_KEYS[model]
+    values.allow_only((*keys, *PINHOLE_KEYS))
+    parameters, (fu, fv, pu, pv) = [values.number(key) for key in keys], [values.number(key) for key in PINHOLE_KEYS]
+    try:
+        return lens_camera(model, parameters, (fu, fv), (pu, pv), table.size("size"))
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
@@ -146,7 +159,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
     """Return the head of a camera's table; topic "" if unknown."""
-    lines = ["", f"[{name}]", f'model = "{"ocam" if isinstance(camera, OcamCamera) else "omni"}"',
+    lines = ["", f"[{name}]", f'model = "{model_name(camera)}"',
              f"size = {[int(pixels) for pixels in camera.size]}"]
     if isinstance(camera, OcamCamera):
         lines.append(f'view = "{camera.view}"')
@@ -170,8 +183,12 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
         if any(camera.wavefront):
             named += [f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
                       f"distance_m = {number_text(camera.distance_m)}"]
+    elif isinstance(camera, LensCamera):
+        lens = zip((*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS),
+                   (*lens_parameters(camera), *camera.focal, *camera.center), strict=True)
+        named = [f"{key} = {number_text(value)}" for key, value in lens]
     else:
-        raise CalibError(f"rig file: {name}: expected an omni or ocam camera, found {type(camera).__name__}")
+        raise CalibError(f"rig file: {name}: expected a camera of a known model, found {type(camera).__name__}")
     return "\n".join(["", f"[{name}.intrinsics]", *named]) + "\n"
 
 

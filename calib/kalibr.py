@@ -1,4 +1,4 @@
-"""Kalibr's `camchain.yaml`, read and written: camera model omni, T_cam_imu taken for T_cam_rig.
+"""Kalibr's `camchain.yaml`, read and written: T_cam_imu is taken for T_cam_rig. The model omni is written.
 
 Kalibr: p_cam = T_cam_imu @ p_imu and p_cam1 = T_cn_cnm1 @ p_cam0; omni intrinsics are [xi, fu, fv, pu, pv].
 """
@@ -17,7 +17,9 @@ from ruamel.yaml.error import YAMLError
 from calib import se3
 from calib.bounded_yaml import MAX_BYTES, parse_yaml
 from calib.errors import CalibError
-from calib.models.camera import Array
+from calib.models.camera import Array, OmniCamera
+from calib.models.lens import lens_camera
+from calib.models.names import model_name
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_frame import rig_between
@@ -136,16 +138,27 @@ def _topic(table: ValidatedTable) -> str:
     return table.text("rostopic") if table.has("rostopic") else ""
 
 
-def _camera(table: ValidatedTable) -> UnifiedCamera:
-    if table.text("camera_model") != "omni":
-        table.fail("camera_model", "omni (the only model of Kalibr that is supported)")
-    xi, fu, fv, pu, pv = table.numbers("intrinsics", 5)
-    model = table.choice("distortion_model", ("radtan", "none"))
-    k1, k2, p1, p2 = table.numbers("distortion_coeffs", 4) if model == "radtan" else (0.0, 0.0, 0.0, 0.0)
+def _camera(table: ValidatedTable) -> OmniCamera:
+    """Return a camera of Kalibr's models omni, ds and eucm, and pinhole with radtan or equidistant distortion."""
+    model = table.choice("camera_model", ("omni", "ds", "eucm", "pinhole"))
     size = table.size("resolution")
     try:
+        if model in ("ds", "eucm"):
+            table.choice("distortion_model", ("none",))
+            first, second, fu, fv, pu, pv = table.numbers("intrinsics", 6)
+            return lens_camera(model, (first, second), (fu, fv), (pu, pv), size)
+        numbers = table.numbers("intrinsics", 5 if model == "omni" else 4)
+        xi, fu, fv, pu, pv = numbers if model == "omni" else (0.0, *numbers)
+        names = ("radtan", "none") if model == "omni" else ("radtan", "none", "equidistant")
+        distortion = table.choice("distortion_model", names)
+        terms = table.numbers("distortion_coeffs", 4) if distortion != "none" else (0.0, 0.0, 0.0, 0.0)
+        if distortion == "equidistant":
+            return lens_camera("equidistant", terms, (fu, fv), (pu, pv), size)
+        k1, k2, p1, p2 = terms
         return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
     except CalibError as error:
+        if str(error).startswith(table.file):
+            raise
         raise CalibError(f"{table.file}: {table.path}: {error}") from error
 
 
@@ -161,7 +174,8 @@ def export_kalibr(rig: Rig) -> str:
 def _camera_text(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     if not isinstance(camera, UnifiedCamera):
-        raise CalibError("export: Kalibr's camchain.yaml holds omni cameras, found an ocam camera; use --format ocam")
+        raise CalibError("export: Kalibr's camchain.yaml holds omni cameras, "
+                         f"found one of the model {model_name(camera)}; an ocam camera: --format ocam")
     has_distortion = any(camera.distortion)
     return (f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
             f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"

@@ -56,7 +56,8 @@ def parameterise(camera: OmniCamera, distortion: Collection[str] = (), *, wavefr
         units = np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
         return CameraParameterisation(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
     if not isinstance(camera, OcamCamera):
-        raise CalibError(f"calibrate: expected an omni or ocam camera, found {type(camera).__name__}")
+        raise CalibError(f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "
+                         f"{type(camera).__name__}: calibrate lenses by Kalibr")
     powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
     # p1 and p2 are correlated, so both are adjusted or neither.
     tangential = camera.tangential if any(camera.tangential) else ()

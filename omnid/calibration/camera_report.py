@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.fit.camera_fit import CameraCalibration
 from calib.models.camera import Mask
+from calib.models.names import model_name
 from calib.models.ocam import OcamCamera
 from omnid.calibration.figures import (
     ARROW,
@@ -44,7 +45,7 @@ def camera_report_html(found: CameraCalibration, images: Mapping[str, Image], mi
 
 def _head(found: CameraCalibration) -> str:
     camera, board = found.camera, found.board
-    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
+    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
     used = int(np.isfinite(found.fit.errors_px).sum())
     return (f"<h1>Camera calibration</h1><p>Model {model}, {camera.size[0]}x{camera.size[1]} px. "
             f"{escape(f'{board}')}, {board.square_m * 1e3:g} mm. "

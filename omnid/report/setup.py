@@ -10,6 +10,7 @@ import numpy as np
 
 from calib import se3
 from calib.bounded_toml import parse_toml
+from calib.models.names import model_name
 from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
@@ -62,7 +63,7 @@ def _rig_rows(rig: Rig) -> list[tuple[str, str]]:
 
 def _camera(mounted: MountedCamera) -> str:
     camera = mounted.camera
-    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else "omni"
+    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
     return f"{model}, {camera.size[0]}x{camera.size[1]} px, {'with a' if mounted.mask else 'without a'} mask"
 
 

@@ -10,10 +10,13 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
+from calib.fit.parameterisation import parameterise
 from calib.kalibr import export_kalibr, import_kalibr, parse_kalibr
-from calib.models.camera import Array
+from calib.models.camera import Array, OmniCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
+from calib.rig_file import read_rig, write_rig
 
 CAMERA = """
   camera_model: omni
@@ -58,8 +61,34 @@ def test_rig_round_trip_is_exact(omni_rig: Rig) -> None:
 
 
 def test_refuses_to_export_an_ocam_rig(ocam_rig: Rig) -> None:
-    with pytest.raises(CalibError, match="found an ocam camera; use --format ocam"):
+    with pytest.raises(CalibError, match="model ocam; an ocam camera: --format ocam"):
         export_kalibr(ocam_rig)
+
+
+@pytest.mark.parametrize(("model", "distortion", "intrinsics", "coefficients", "expected"), [
+    ("ds", "none", "[-0.27, 0.55, 310.0, 315.0, 380.0, 390.0]", "[]",
+     DoubleSphereCamera(-0.27, 0.55, (310.0, 315.0), (380.0, 390.0), (768, 770))),
+    ("eucm", "none", "[0.63, 1.1, 240.0, 244.0, 380.0, 390.0]", "[]",
+     ExtendedUnifiedCamera(0.63, 1.1, (240.0, 244.0), (380.0, 390.0), (768, 770))),
+    ("pinhole", "equidistant", "[225.0, 228.0, 380.0, 390.0]", "[-0.012, 0.003, -0.001, 0.0002]",
+     EquidistantCamera((-0.012, 0.003, -0.001, 0.0002), (225.0, 228.0), (380.0, 390.0), (768, 770))),
+    ("pinhole", "radtan", "[225.0, 228.0, 380.0, 390.0]", "[-0.1, 0.01, 0.001, 0.0002]",
+     UnifiedCamera(0.0, (225.0, 228.0), (380.0, 390.0), (768, 770), (-0.1, 0.01, 0.001, 0.0002))),
+])
+def test_reads_lenses_and_keeps_them_in_rig_files(tmp_path: Path, model: str, distortion: str, intrinsics: str,
+                                                  coefficients: str, expected: OmniCamera) -> None:
+    camera = (f"  camera_model: {model}\n  intrinsics: {intrinsics}\n  distortion_model: {distortion}\n"
+              f"  distortion_coeffs: {coefficients}\n  resolution: [768, 770]\n")
+    near = "  T_cam_imu: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, {}], [0.0, 0.0, 0.0, 1.0]]\n"
+    rig = parse_kalibr(f"cam0:\n{camera}{near.format(0.0)}cam1:\n{camera}{near.format(-0.2)}")
+    assert rig.lower.camera == rig.upper.camera == expected
+    write_rig(tmp_path / "rig.toml", rig)
+    assert read_rig(tmp_path / "rig.toml").upper.camera == expected
+    if model != "pinhole" or distortion == "equidistant":
+        with pytest.raises(CalibError, match="holds omni cameras, found one of the model"):
+            export_kalibr(rig)
+        with pytest.raises(CalibError, match="by Kalibr"):
+            parameterise(rig.lower.camera)
 
 
 def test_uses_the_camera_chain_without_imu_transforms() -> None:
@@ -118,14 +147,14 @@ def test_selects_two_of_three_cameras_by_name() -> None:
         parse_kalibr(text, lower="cam0")
     rig = parse_kalibr(text, lower="cam0", upper="cam2")
     np.testing.assert_allclose(rig.upper.T_cam_rig, T_UPPER_LOWER @ BOTH[1], atol=1e-14)
-    unused = text.replace("camera_model: omni", "camera_model: ds", 1)
+    unused = text.replace("camera_model: omni", "camera_model: fov", 1)
     assert parse_kalibr(unused, lower="cam1", upper="cam2").topics == (NAMED[1], "")
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("camera_model: omni", "camera_model: pinhole", "cam0.camera_model: expected omni.*found 'pinhole'"),
-    ("camera_model: omni", "camera_model: eucm", "found 'eucm'"),
-    ("camera_model: omni", "camera_model: ds", "found 'ds'"),
+    ("camera_model: omni", "camera_model: fov", "cam0.camera_model: expected omni.*found 'fov'"),
+    ("camera_model: omni", "camera_model: pinhole", "cam0.intrinsics"),
+    ("camera_model: omni", "camera_model: ds", "cam0"),
     ("distortion_model: radtan", "distortion_model: equidistant", "distortion_model: expected radtan or none"),
     ("[0.01, -0.02, 0.003, 0.004]", "[]", "cam0.distortion_coeffs: expected 4 finite numbers"),
     ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[-207.0, 208.0, 383.5, 384.5]", "cam0.intrinsics: expected 5"),

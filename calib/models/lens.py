@@ -1,0 +1,195 @@
+"""Models of fisheye lenses that Kalibr calibrates: double sphere, extended unified, and pinhole with equidistant lens.
+
+A lens sees the world directly, and nothing is flipped. What belongs to mirrors does not apply to it: a hub in the
+middle of the image, and aberrations of a reflected wavefront.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.models.camera import Array
+
+NEWTON_STEPS = 20
+TOLERANCE_RAD = 1e-10
+# Angles at which the image radius of an equidistant lens is tested for growing.
+ANGLES = 720
+
+
+@dataclass(frozen=True, slots=True)
+class DoubleSphereCamera:
+    """Model `ds` of Usenko, Demmel, Cremers 2018: xi, alpha, focal lengths (fu, fv) [px], centre (pu, pv) [px]."""
+
+    xi: float
+    alpha: float
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        _check("ds", (self.xi, self.alpha), self.focal, self.center, self.size)
+        if not (-1 < self.xi < 1 and 0 <= self.alpha <= 1):
+            raise CalibError(f"ds camera: expected xi between -1 and 1 and alpha of 0 to 1, found {self.xi} and "
+                             f"{self.alpha}")
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them. Eq. (40) to (45)."""
+        x, y, z = np.asarray(points, float).T
+        d1 = np.sqrt(x * x + y * y + z * z)
+        shifted = self.xi * d1 + z
+        d2 = np.sqrt(x * x + y * y + shifted**2)
+        w1 = _slope(self.alpha)
+        w2 = (w1 + self.xi) / np.sqrt(2 * w1 * self.xi + self.xi**2 + 1)
+        scale = self.alpha * d2 + (1 - self.alpha) * shifted
+        return _pixels(self, x, y, np.where((z > -w2 * d1) & (d1 > 0), scale, np.nan))
+
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (46) to (51)."""
+        mx, my, r2 = _plane(self, pixels)
+        root = 1 - (2 * self.alpha - 1) * r2
+        mz = (1 - self.alpha**2 * r2) / (self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha)
+        under = mz**2 + (1 - self.xi**2) * r2
+        k = (mz * self.xi + np.sqrt(np.where(under >= 0, under, np.nan))) / (mz**2 + r2)
+        return np.column_stack([k * mx, k * my, k * mz - self.xi])
+
+
+@dataclass(frozen=True, slots=True)
+class ExtendedUnifiedCamera:
+    """Model `eucm` of Khomutenko, Garcia, Martinet 2016: alpha, beta, focal lengths (fu, fv), centre (pu, pv) [px]."""
+
+    alpha: float
+    beta: float
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        _check("eucm", (self.alpha, self.beta), self.focal, self.center, self.size)
+        if not (0 <= self.alpha <= 1 and self.beta > 0):
+            raise CalibError(f"eucm camera: expected alpha of 0 to 1 and beta above 0, found {self.alpha}, {self.beta}")
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them. Eq. (3) to (5)."""
+        x, y, z = np.asarray(points, float).T
+        d = np.sqrt(self.beta * (x * x + y * y) + z * z)
+        scale = self.alpha * d + (1 - self.alpha) * z
+        return _pixels(self, x, y, np.where((z > -_slope(self.alpha) * d) & (d > 0), scale, np.nan))
+
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (12)."""
+        mx, my, r2 = _plane(self, pixels)
+        root = 1 - (2 * self.alpha - 1) * self.beta * r2
+        mz = (1 - self.beta * self.alpha**2 * r2) / (
+            self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha)
+        return np.asarray(np.column_stack([mx, my, mz]) / np.sqrt(r2 + mz**2)[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class EquidistantCamera:
+    """Pinhole with an equidistant lens, `pinhole-equi`, of Kannala and Brandt 2006: k1 to k4, (fu, fv), (pu, pv) [px].
+
+    The distance from the centre grows with the angle t from the axis: t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
+    """
+
+    coefficients: tuple[float, float, float, float]
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        _check("equidistant", self.coefficients, self.focal, self.center, self.size)
+
+    @property
+    def widest_rad(self) -> float:
+        """The angle from the axis up to which the image radius grows."""
+        angles = np.linspace(0, np.pi, ANGLES, endpoint=False)
+        falls = np.flatnonzero(self._slope(angles) <= 0)
+        return float(angles[max(0, falls[0] - 1)]) if falls.size else float(np.pi)
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN beyond widest_rad. Eq. (6)."""
+        x, y, z = np.asarray(points, float).T
+        r = np.hypot(x, y)
+        angle = np.arctan2(r, z)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            scale = np.where(r > 0, self._radius(angle) / r, 1 / z)
+        seen = (angle < self.widest_rad) & ((r > 0) | (z > 0)) & np.isfinite(x + y + z)
+        return _pixels(self, x, y, 1 / np.where(seen, scale, np.nan))
+
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2), by Newton's method; NaN where there is none."""
+        mx, my, r2 = _plane(self, pixels)
+        radius, widest = np.sqrt(r2), self.widest_rad
+        angle = np.minimum(radius, widest)
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):
+                angle = np.clip(angle - (self._radius(angle) - radius) / self._slope(angle), 0, widest)
+            angle = np.where(np.abs(self._radius(angle) - radius) < TOLERANCE_RAD, angle, np.nan)
+            side = np.where(radius > 0, np.sin(angle) / radius, 1.0)
+        return np.column_stack([side * mx, side * my, np.cos(angle)])
+
+    def _radius(self, t: Array) -> Array:
+        k1, k2, k3, k4 = self.coefficients
+        t2 = t * t
+        return np.asarray(t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))))
+
+    def _slope(self, t: Array) -> Array:
+        k1, k2, k3, k4 = self.coefficients
+        t2 = t * t
+        return np.asarray(1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
+
+
+LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
+# Parameters of each model beside the focal lengths and the centre, by the names of their keys in files.
+LENS_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "ds": ("xi", "alpha"), "eucm": ("alpha", "beta"), "equidistant": ("k1", "k2", "k3", "k4")})
+
+
+def lens_camera(model: str, parameters: Sequence[float], focal: tuple[float, float], center: tuple[float, float],
+                size: tuple[int, int]) -> LensCamera:
+    """Return a camera of a model; parameters as LENS_KEYS lists them. Raise CalibError for wrong ones."""
+    if model == "equidistant":
+        k1, k2, k3, k4 = parameters
+        return EquidistantCamera((k1, k2, k3, k4), focal, center, size)
+    first, second = parameters
+    made = DoubleSphereCamera if model == "ds" else ExtendedUnifiedCamera
+    return made(first, second, focal, center, size)
+
+
+def lens_parameters(camera: LensCamera) -> tuple[float, ...]:
+    """Return the parameters in the order of LENS_KEYS."""
+    if isinstance(camera, EquidistantCamera):
+        return camera.coefficients
+    return (camera.xi, camera.alpha) if isinstance(camera, DoubleSphereCamera) else (camera.alpha, camera.beta)
+
+
+def _check(name: str, parameters: tuple[float, ...], focal: tuple[float, float], center: tuple[float, float],
+           size: tuple[int, int]) -> None:
+    """Raise CalibError for parameters that no camera has."""
+    values = (*parameters, *focal, *center)
+    if not np.isfinite(values).all():
+        raise CalibError(f"{name} camera: every parameter must be a finite number, found {values}")
+    if min(focal) <= 0 or min(size) < 1:
+        raise CalibError(f"{name} camera: expected fu and fv above 0 and a size, found focal {focal}, size {size}")
+
+
+def _slope(alpha: float) -> float:
+    """Return the bound of z / distance of visible points, its sign changed."""
+    return alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+
+
+def _pixels(camera: LensCamera, x: Array, y: Array, scale: Array) -> Array:
+    """Return the pixels (N, 2) of (x, y) / scale on the plane."""
+    scale = np.where(scale > 0, scale, np.nan)
+    return np.column_stack([x / scale, y / scale]) * camera.focal + camera.center
+
+
+def _plane(camera: LensCamera, pixels: Array) -> tuple[Array, Array, Array]:
+    """Return mx, my and the square of their radius."""
+    mx, my = ((np.asarray(pixels, float) - camera.center) / camera.focal).T
+    return mx, my, mx * mx + my * my
