@@ -22,6 +22,7 @@ from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
     DIAGNOSTICS_SCHEMA,
+    MAP_POSE_SCHEMA,
     ODOMETRY_SCHEMA,
     POINT_CLOUD_SCHEMA,
     TWIST_SCHEMA,
@@ -30,17 +31,18 @@ from omnid.transport.codec import (
     odometry_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.decode import Cloud, Diagnostics, decode_cloud, decode_diagnostics
+from omnid.transport.decode import Cloud, Diagnostics, MapPose, decode_cloud, decode_diagnostics, decode_map_pose
 
 ODOMETRY: Final = "odom"
 STATUS: Final = "status"
 CLOUD: Final = "cloud"
 DRIVE: Final = "drive"
+MAP_POSE: Final = "map_pose"
 TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
-Content: TypeAlias = OdometryRecord | Diagnostics | Cloud | TwistRecord | RosImage
+Content: TypeAlias = OdometryRecord | MapPose | Diagnostics | Cloud | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[memoryview], Content]
 
 
@@ -122,6 +124,7 @@ def _finite_twist(data: memoryview) -> TwistRecord:
 
 _DECODERS: Final[Mapping[str, tuple[str, Decoder]]] = {
     ODOMETRY: (ODOMETRY_SCHEMA, lambda data: odometry_from_cdr(bytes(data))),
+    MAP_POSE: (MAP_POSE_SCHEMA, lambda data: decode_map_pose(bytes(data))),
     STATUS: (DIAGNOSTICS_SCHEMA, lambda data: decode_diagnostics(bytes(data))),
     CLOUD: (POINT_CLOUD_SCHEMA, lambda data: decode_cloud(bytes(data))),
     DRIVE: (TWIST_SCHEMA, _finite_twist),

@@ -41,6 +41,7 @@ class Plan:
     confidence: NDArray[np.float32]  # (N,)
     height_m: float  # of the rig at the start
     truth: Sequence[Point] = ()  # x, y of the true path
+    in_map: Sequence[Point] = ()  # x, y of the path in the map, where it is another one
     lost: Sequence[Point] = ()  # positions at which the pose was lost
 
 
@@ -62,10 +63,11 @@ def plan_figure(plan: Plan, clock: Clock) -> str:
     """Return the figure."""
     inside = np.abs(plan.points[:, 2] - plan.height_m - sum(Z_M) / 2) <= (Z_M[1] - Z_M[0]) / 2
     points_xy, confidence = plan.points[inside, :2].astype(float), plan.confidence[inside]
-    sheet = _plan_area([*((c.x_m, c.y_m) for c in plan.corners), *plan.truth], points_xy)
+    sheet = _plan_area([*((c.x_m, c.y_m) for c in plan.corners), *plan.truth, *plan.in_map],
+                       points_xy)
     width, height = sheet.size
-    parts = [*_map(sheet, points_xy, confidence), *_frame(sheet), *_truth(sheet, plan.truth),
-             *_path(sheet, plan.corners), *_times(sheet, plan.corners, clock),
+    parts = [*_map(sheet, points_xy, confidence), *_frame(sheet), *_line(sheet, plan.truth, "pt"),
+             *_line(sheet, plan.in_map, "pm"), *_path(sheet, plan.corners), *_times(sheet, plan.corners, clock),
              *(_cross(*sheet.px(*position)) for position in plan.lost), *_ends(sheet, plan.corners)]
     box = f"0 0 {coord(width + _MARGIN[0] + _MARGIN[2])} {coord(height + _MARGIN[1] + _MARGIN[3])}"
     return (f"<figure class='plan'><figcaption><b>Path and map</b> {_keys(plan)}</figcaption><svg viewBox='{box}' "
@@ -79,6 +81,7 @@ def _keys(plan: Plan) -> str:
     known = any(corner.rank >= 0 for corner in plan.corners)
     shown = [key(f"class='p{rank}'", names[rank] if known else "the path") for rank in sorted(ranks)]
     shown += [mark_key(_cross(17, 6), "lost here")] if plan.lost else []
+    shown += [key("class='pm'", "in the map")] if plan.in_map else []
     return "".join([*shown, *([key("class='pt'", "the true path")] if plan.truth else [])])
 
 
@@ -153,10 +156,10 @@ def _ticks(low: float, high: float, step: float) -> list[float]:
     return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _truth(sheet: _PlanArea, truth: Sequence[Point]) -> Iterator[str]:
-    if truth:
-        yield f"<path class='halo' d='{path_d(sheet.px(*at) for at in truth)}'/>"
-        yield polyline([sheet.px(*at) for at in truth], "class='pt'")
+def _line(sheet: _PlanArea, points: Sequence[Point], style: str) -> Iterator[str]:
+    if points:
+        yield f"<path class='halo' d='{path_d(sheet.px(*at) for at in points)}'/>"
+        yield polyline([sheet.px(*at) for at in points], f"class='{style}'")
 
 
 def _path(sheet: _PlanArea, corners: Sequence[Corner]) -> Iterator[str]:
@@ -195,7 +198,8 @@ def _ends(sheet: _PlanArea, corners: Sequence[Corner]) -> Iterator[str]:
     yield text((x1, y1 + below), "end", "text-anchor='middle' class='over'")
 
 
-STYLE: Final = """.p0,.p1,.p2,.pt,.halo{fill:none;stroke-linejoin:round;stroke:#111;stroke-width:2.6}
+STYLE: Final = """.p0,.p1,.p2,.pt,.pm,.halo{fill:none;stroke-linejoin:round;stroke:#111;stroke-width:2.6}
 .p1{stroke-dasharray:9 4}.p2{stroke-dasharray:2.5 3.5}.pt{stroke:#666;stroke-width:1.4;stroke-dasharray:5 3}
+.pm{stroke:#06c;stroke-width:1.8}
 .halo{stroke:#fff;stroke-width:6}text.over{paint-order:stroke;stroke:#fff;stroke-width:3px;stroke-linejoin:round}
 .track{fill:#ececec}"""

@@ -61,7 +61,7 @@ def report_html(path: Path, data: ReportData, true: Trajectory | None = None) ->
     story = ["<h2>Events</h2>", timeline(spans, data.poses.gaps, events, clock),
              *_states_missing(data), *sections.events_table(data.events, clock)]
     measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(data, clock),
-                *sections.uncertainty(data, clock), *health.timing(data, clock),
+                *sections.uncertainty(data, clock), *sections.in_map(data, clock), *health.timing(data, clock),
                 *health.parts(data, clock)]
     rest = [*_images(path, data), *setup.setup(data), *setup.contents(data),
             f"<p><small>Made by omnid {__version__}.</small></p>"]
@@ -119,7 +119,7 @@ def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
     confidence = cloud.confidence if cloud and drawn else np.empty(0, np.float32)
     height_m = float((data.poses.first @ data.T_base_rig)[2, 3])
     return plan.Plan(corners, points[finite], confidence[finite], height_m, comparison.path if comparison else (),
-                     _losses(data, corners))
+                     sections.path_in_map(data), _losses(data, corners))
 
 
 def _losses(data: ReportData, corners: list[Corner]) -> list[tuple[float, float]]:

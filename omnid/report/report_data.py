@@ -19,13 +19,14 @@ from drivers.logs.mcap_info import LogInfo, read_log_info
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
 from omnid.recordings.odometry_topic import choose_odometry_topic
-from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
+from omnid.recordings.recording_reader import CLOUD, DRIVE, MAP_POSE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import Events
+from omnid.report.map_poses import MapPoseHistory
 from omnid.report.poses import PoseHistory
 from omnid.report.status_history import StatusHistory
 from omnid.transport.codec import OdometryRecord, TwistRecord
-from omnid.transport.decode import Cloud, Diagnostics
+from omnid.transport.decode import Cloud, Diagnostics, MapPose
 
 MAX_EARLY: Final = 64  # status messages before the first pose
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
@@ -52,6 +53,7 @@ class ReportData:
     events: Events
     poses: PoseHistory
     statuses: StatusHistory
+    map_poses: MapPoseHistory = field(default_factory=MapPoseHistory)
     drives: dict[str, DriveHistory] = field(default_factory=dict)  # by topic: DRIVE, TWIST_COMMAND
     frames: tuple[str, str] = ("odom", "base_link")  # of the odometry
     cloud: Cloud | None = None  # the newest
@@ -106,10 +108,12 @@ class _Collector:
 
     def collect(self, reader: RecordingReader) -> None:
         """Read all messages."""
-        for message in reader.messages((ODOMETRY, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
+        for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
             match message.content:
                 case OdometryRecord():
                     self._add_pose(message.content, message.log_time_ns)
+                case MapPose():
+                    self._add_map_pose(message.content)
                 case Diagnostics():
                     self._add_diagnostics(message.content)
                 case Cloud():
@@ -130,6 +134,7 @@ class _Collector:
             return
         self._add_pending()
         self._pending = record
+        data.map_poses.add_odometry(record)
 
     def _add_pending(self) -> None:
         """Add the pose that waits, in the state reported by now."""
@@ -142,6 +147,10 @@ class _Collector:
             self._early.append(diagnostics)
         else:
             self._data.statuses.add(diagnostics, self._data.poses.seconds)
+
+    def _add_map_pose(self, pose: MapPose) -> None:
+        if self._offset_ns is not None:
+            self._data.map_poses.add(pose, self._data.poses.seconds(pose.stamp_ns))
 
     def _add_twist(self, name: str, twist: TwistRecord) -> None:
         if self._offset_ns is None:

@@ -17,11 +17,12 @@ from omnid.report.poses import STATES, UNKNOWN
 from omnid.report.report_data import ReportData
 from omnid.report.svg import label
 from omnid.report.truth_comparison import TruthComparison
-from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, Key, time_key
+from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, PLACES, Key, time_key
 
 _LEVELS: Final = ("", "warning", "error")
 _MAX_SOURCES: Final = 20  # of events that were left out
 _MAX_LANDMARK_COUNTS: Final = 12
+_SAME_PATH_M: Final = 0.01  # between two paths that are one in the figure
 
 
 def key_figures(data: ReportData) -> str:
@@ -122,6 +123,33 @@ def uncertainty(data: ReportData, clock: Clock) -> list[str]:
     else:
         missing.append(note(_few_landmarks(tracked, inliers)))
     return ["<h2>Uncertainty</h2>", grid(figures), *missing]
+
+
+def path_in_map(data: ReportData) -> list[tuple[float, float]]:
+    """Return the path in the map; empty where it is that of odometry, to a hundredth of a metre."""
+    history = data.map_poses
+    if max((moved_m for _, moved_m in history.moved_m.points()), default=0.0) < _SAME_PATH_M:
+        return []
+    return [(corner.x_m, corner.y_m) for corner in history.path.corners]
+
+
+def in_map(data: ReportData, clock: Clock) -> list[str]:
+    """Return the section with the map of places: its sizes, and the correction of odometry by it."""
+    history, statuses = data.map_poses, data.statuses
+    if not history.path.corners:
+        return []
+    values = statuses.values(PLACES)
+    rows = [(escape(name.replace("_", " ")), escape(value)) for name, value in values.items()]
+    loops, keyframes = (statuses.series(PLACES, name) for name in ("loops", "keyframes"))
+    figures = [
+        chart("From odometry's position to that in the map", [curve("", history.moved_m)], clock, unit="m", zero=True,
+              note="The correction map -> odom, where the robot is: odom itself does not jump."),
+        chart("From odometry's heading to that in the map", [curve("", history.turned_deg)], clock, unit="deg",
+              zero=True),
+        chart("Standard deviation of the position in the map, all axes", [curve("", history.sigma_m)], clock, unit="m",
+              log=True),
+        chart("Keyframes and loops", [curve("keyframes", keyframes), curve("loops", loops)], clock, zero=True)]
+    return ["<h2>In the map</h2>", *([facts(rows)] if rows else []), grid(figures)]
 
 
 def _few_landmarks(tracked: Downsampled, inliers: Downsampled) -> str:

@@ -323,7 +323,7 @@ def odometry_from_cdr(payload: bytes) -> OdometryRecord:
     twist = message.twist.twist
     return OdometryRecord(
         stamp_ns=_stamp_ns(message.header.stamp),
-        T_odom_base=_transform(message.pose.pose),
+        T_odom_base=rigid_transform(message.pose.pose),
         covariance=message.pose.covariance.reshape(6, 6),
         velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
         velocity_covariance=message.twist.covariance.reshape(6, 6),
@@ -341,9 +341,9 @@ def _xyz(vector: Cartesian) -> tuple[float, float, float]:
     return vector.x, vector.y, vector.z
 
 
-def _transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
+def rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
+    """Return the transform (4, 4) of a pose. Raise OmnidError unless it is finite and rigid."""
     q, position = (*_xyz(pose.orientation), pose.orientation.w), _xyz(pose.position)
     if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
-        raise OmnidError(f"odometry pose {position} {q}: expected finite numbers and a unit quaternion; check the "
-                         "sender")
+        raise OmnidError(f"pose {position} {q}: expected finite numbers and a unit quaternion; check the sender")
     return se3.transform(se3.rotation(q), position)

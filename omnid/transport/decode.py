@@ -25,6 +25,15 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MapPose:
+    """Pose of the robot's base in the map, and its covariance (6, 6) in the map's axes."""
+
+    stamp_ns: int
+    T_map_base: Array  # (4, 4) m
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Pose:
     """Pose and velocity of the robot's base with their covariances."""
 
@@ -165,6 +174,14 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
                          f"expected the fields {', '.join(codec.CLOUD_FIELDS)} in {step} bytes")
     packed = message.data.view("<f4").reshape(-1, len(codec.CLOUD_FIELDS))
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+
+
+def decode_map_pose(payload: bytes, _: bytes = b"") -> MapPose:
+    """Decode a PoseWithCovarianceStamped. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
+    message = codec.message_from_cdr(payload, codec.MAP_POSE_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
+    return MapPose(_stamp_ns(message.header), codec.rigid_transform(message.pose.pose),
+                   message.pose.covariance.reshape(6, 6))
 
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:

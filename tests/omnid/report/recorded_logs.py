@@ -38,6 +38,12 @@ def odom(pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", 
     return at(pose), topic, codec.ODOMETRY_SCHEMA, payload
 
 
+def map_pose(pose: int, T_map_odom: np.ndarray) -> Entry:
+    """A pose in the map."""
+    payload = codec.pose_with_covariance_cdr(at(pose), T_map_odom @ T_odom_base(pose), 1e-4 * np.eye(6))
+    return at(pose), "/omnid/map_pose", codec.MAP_POSE_SCHEMA, payload
+
+
 def status(pose: float, *statuses: DiagnosticStatus) -> Entry:
     """Return a status message at the time of a pose."""
     return at(pose), "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(at(pose), statuses)

@@ -24,12 +24,13 @@ from omnid.report.report_data import ReportData, collect_report_data
 from omnid.report.truth_comparison import compare_with_truth
 from omnid.runs.log_rig import attached_rig
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, SUMMARY, WHEELS, camera_name, stage_name
+from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, camera_name, stage_name
 from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
     cloud,
     drive,
+    map_pose,
     odom,
     run,
     save,
@@ -357,3 +358,24 @@ def test_settings_of_many_dotted_keys_are_not_parsed(tmp_path: Path) -> None:
     settings = ("a." * 20_000 + "a = 1").encode()
     log = save(tmp_path / "run.mcap", run(), {"omnid.toml": settings})
     assert "The attached settings cannot be read." in html_of(log)
+
+
+def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction_over_time(tmp_path: Path) -> None:
+    moved = se3.exp([0.3, 0.4, 0, 0, 0, 0.1])
+    poses = [entry for k in range(60) for entry in (odom(k), map_pose(k, np.eye(4) if k < 30 else moved))]
+    places = status(59, DiagnosticStatus(PLACES, 0, "localized", {"keyframes": "12", "loops": "3"}))
+    data = collect_report_data(save(tmp_path / "a.mcap", [*poses, places]))
+    corrections = data.map_poses.moved_m.points()
+    assert corrections[0][1] == pytest.approx(0, abs=1e-9) and 0.3 < corrections[-1][1] < 0.7
+    assert data.map_poses.turned_deg.points()[-1][1] == pytest.approx(np.degrees(0.1), abs=1e-6)
+    assert data.map_poses.sigma_m.points()[-1][1] == pytest.approx(np.sqrt(3e-4))
+    page = Page(report_html(tmp_path / "a.mcap", data))
+    assert "In the map" in page.text and "in the map" in page.text and "keyframes12" in page.text.replace("\n", "")
+    assert sum(attributes.get("class") == "pm" for _, attributes in page.tags) == 2  # the path and its key
+    plain = report_html(tmp_path / "b.mcap", collect_report_data(save(tmp_path / "b.mcap", run())))
+    assert "In the map" not in plain and "class='pm'" not in plain
+
+
+def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:
+    data = collect_report_data(save(tmp_path / "a.mcap", [odom(0), map_pose(1, np.eye(4)), odom(2)]))
+    assert not data.map_poses.path.corners
