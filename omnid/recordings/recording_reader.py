@@ -31,7 +31,7 @@ from omnid.transport.codec import (
     odometry_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.decode import Cloud, Diagnostics, MapPose, decode_cloud, decode_diagnostics, decode_map_pose
+from omnid.transport.decode import Cloud, Diagnostics, PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose
 
 ODOMETRY: Final = "odom"
 STATUS: Final = "status"
@@ -42,7 +42,7 @@ TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
-Content: TypeAlias = OdometryRecord | MapPose | Diagnostics | Cloud | TwistRecord | RosImage
+Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[memoryview], Content]
 
 

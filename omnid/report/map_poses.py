@@ -13,7 +13,7 @@ from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.report.downsampling import Corner, Downsampled, PathTrace
 from omnid.transport.codec import OdometryRecord
-from omnid.transport.decode import MapPose
+from omnid.transport.decode import PoseInMap
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class MapPoseHistory:
         if len(self._odometry) > _WAITING:
             self._odometry.popitem(last=False)
 
-    def add(self, pose: MapPose, t_s: float) -> None:
+    def add(self, pose: PoseInMap, t_s: float) -> None:
         """Add a pose in the map; one without a pose of odometry of its stamp is left out."""
         T_odom_base = self._odometry.pop(pose.stamp_ns, None)
         position = pose.T_map_base[:3, 3]

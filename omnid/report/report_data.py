@@ -26,7 +26,7 @@ from omnid.report.map_poses import MapPoseHistory
 from omnid.report.poses import PoseHistory
 from omnid.report.status_history import StatusHistory
 from omnid.transport.codec import OdometryRecord, TwistRecord
-from omnid.transport.decode import Cloud, Diagnostics, MapPose
+from omnid.transport.decode import Cloud, Diagnostics, PoseInMap
 
 MAX_EARLY: Final = 64  # status messages before the first pose
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
@@ -112,7 +112,7 @@ class _Collector:
             match message.content:
                 case OdometryRecord():
                     self._add_pose(message.content, message.log_time_ns)
-                case MapPose():
+                case PoseInMap():
                     self._add_map_pose(message.content)
                 case Diagnostics():
                     self._add_diagnostics(message.content)
@@ -148,7 +148,7 @@ class _Collector:
         else:
             self._data.statuses.add(diagnostics, self._data.poses.seconds)
 
-    def _add_map_pose(self, pose: MapPose) -> None:
+    def _add_map_pose(self, pose: PoseInMap) -> None:
         if self._offset_ns is not None:
             self._data.map_poses.add(pose, self._data.poses.seconds(pose.stamp_ns))
 

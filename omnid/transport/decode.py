@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapPose:
+class PoseInMap:
     """Pose of the robot's base in the map, and its covariance (6, 6) in the map's axes."""
 
     stamp_ns: int
@@ -176,11 +176,11 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
-def decode_map_pose(payload: bytes, _: bytes = b"") -> MapPose:
+def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
     message = codec.message_from_cdr(payload, codec.MAP_POSE_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
-    return MapPose(_stamp_ns(message.header), codec.rigid_transform(message.pose.pose),
+    return PoseInMap(_stamp_ns(message.header), codec.rigid_transform(message.pose.pose),
                    message.pose.covariance.reshape(6, 6))
 
 
