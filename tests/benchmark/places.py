@@ -1,9 +1,10 @@
-"""Recognition of places, measured: `python -m tests.benchmark.places laps|queries|kidnapped FOLDER ... [options]`.
+"""Recognition of places, measured: `python -m tests.benchmark.places laps|queries|kidnapped|sessions FOLDER ...`.
 
 laps: errors of odometry and of the pose in the map, and the loops, for folders of `python -m tests.simulation` with a
 closed path (two_laps) or with places that look alike (twin, symmetric, brick_corridor). --wrong-deg rotates the upper
 camera of the rig about a random axis. queries: views of a world, which has changed meanwhile, in the map of a two_laps
-folder. kidnapped: the log of such a folder is cut and goes on elsewhere.
+folder. kidnapped: the log of such a folder is cut and goes on elsewhere. sessions: the log is replayed again and again
+into one map file, with a keyframe every 0.1 m, until the map is full at 1,000 keyframes.
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ from calib import se3
 from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_file import read_rig
+from omnid.cli import main as run_command
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.formats.place_file import read_places
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import evaluate
@@ -48,6 +52,10 @@ AFTER_CUT = 50  # pairs of a log after it was cut
 LAPS_HEAD = ("| log | rig | odometry: ATE, end | live in the map: ATE, end, ratio | at the end: ATE, ratio "
              "| loops (false) | loop after revisit | keyframes | places: processor time |\n"
              "|---|---|---|---|---|---|---|---|---|")
+
+SESSIONS_HEAD = ("| session | keyframes | dropped so far | loops | file | read, processor time "
+                 "| places: processor time | a pair, mean / max | localised | live ATE in the map |\n"
+                 "|---|---|---|---|---|---|---|---|---|---|")
 
 
 def disturbed(rig: Rig, degrees: float, seed: int) -> Rig:
@@ -221,14 +229,41 @@ def kidnapped_row(folder: Path, seed: int) -> str:
             f"{wrong} wrong | {1e3 * steps_m.max():.0f} mm |")
 
 
+def session_rows(folder: Path, count: int) -> Iterator[str]:
+    """Yield a row for each of the sessions that extend one map."""
+    truth, rig = read_tum(folder / "truth.txt"), folder / "rig.toml"
+    denser = ["places.limits.keyframe_m=0.1", "places.limits.keyframe_deg=5"]
+    with TemporaryDirectory() as work:
+        path = Path(work) / "a.omap"
+        built = ["map", "build", str(folder / "log.mcap"), "-o", str(path), "--rig", str(rig), "--quiet"]
+        assert run_command([*built, *(word for setting in denser for word in ("--set", setting))]) == 0
+        for session in range(1, count):
+            started = time.process_time()
+            with timed_places() as spent:
+                result = omnid.replay(folder / "log.mcap", rig, overrides=[*denser, f"places.map={path}"])
+            share = sum(spent) / (time.process_time() - started)
+            began = time.process_time()
+            places, _ = read_places(path)
+            read_s = time.process_time() - began
+            error = evaluate(Trajectory(result.stamps_ns, result.T_map_rig_live), truth)
+            localised = sum(state is MapState.LOCALIZED for state in result.map_states) / len(result.map_states)
+            cells = [str(session + 1), str(len(places)), str(places.dropped), str(places.loops),
+                     f"{path.stat().st_size / 1e6:.1f} MB", f"{read_s:.2f} s", f"{share:.1%}",
+                     f"{1e3 * sum(spent) / len(spent):.1f} / {1e3 * max(spent):.0f} ms", f"{localised:.1%}",
+                     f"{1e3 * error.ate_rmse_m:.1f} mm"]
+            yield f"| {' | '.join(cells)} |"
+
+
 def main() -> None:
     """Print the rows as soon as they are measured."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("laps", "queries", "kidnapped"))
+    parser.add_argument("what", choices=("laps", "queries", "kidnapped", "sessions"))
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="named NAME_sSEED")
     parser.add_argument("--wrong-deg", type=float, nargs="*", default=[0.0, 0.1])
     parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--runs", type=int, default=6, help="sessions")
     args = parser.parse_args()
+    prepare_kernels(lambda _level, _text: None)  # their compilation is no part of the shares
     if args.what == "laps":
         print(LAPS_HEAD)
     if args.what == "kidnapped":
@@ -241,6 +276,10 @@ def main() -> None:
                     print(laps_row(folder, degrees, seed), flush=True)
             case "queries":
                 print(f"{folder.name}: {queries_text(queries(folder, seed, args.count))}", flush=True)
+            case "sessions":
+                print(SESSIONS_HEAD)
+                for row in session_rows(folder, args.runs):
+                    print(row, flush=True)
             case "kidnapped":
                 print(kidnapped_row(folder, seed), flush=True)
 
