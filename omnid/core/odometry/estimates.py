@@ -14,7 +14,7 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-JUMP_M, JUMP_RAD = 0.5, math.radians(30)  # between two poses for one stamp, from which odom would jump
+JUMP_M, JUMP_RAD = 0.5, math.radians(30)  # from a published pose, which odom does not make unannounced
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,34 @@ class OdometryEstimate:
     step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
 
 
+@dataclass(frozen=True, slots=True)
+class GapStep:
+    """Step from the pose that was predicted through a gap, and published, to the one that is then found."""
+
+    xi: Array = field(default_factory=lambda: np.zeros(6))  # [t; r] in the axes of the predicted rectified frame
+
+    @classmethod
+    def between(cls, T_predicted: Array, T_odom_rect: Array) -> GapStep:
+        """Return the step from one pose to the other."""
+        return cls(se3.log(se3.inverse(T_predicted) @ T_odom_rect))
+
+    @property
+    def is_far(self) -> bool:
+        """True if it leads to another place."""
+        return bool(np.linalg.norm(self.xi[:3]) > JUMP_M)
+
+    @property
+    def is_turned(self) -> bool:
+        """True if it leads to another heading."""
+        return bool(np.linalg.norm(self.xi[3:]) > JUMP_RAD)
+
+    @property
+    def covariance(self) -> Array:
+        """The step as a covariance (6, 6) of the predicted pose."""
+        return np.outer(self.xi, self.xi)
+
+
 def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
     """Return the estimate with more inliers, the first one of two equal ones."""
     return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
 
-
-def is_jump(T_predicted: Array, T_odom_rect: Array) -> bool:
-    """True if odom would jump from the predicted pose to this one."""
-    step = se3.log(se3.inverse(T_predicted) @ T_odom_rect)
-    return bool(np.linalg.norm(step[:3]) > JUMP_M or np.linalg.norm(step[3:]) > JUMP_RAD)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import clear_around, corners
-from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate, is_jump, with_more_inliers
+from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
@@ -104,11 +104,12 @@ class VisualOdometry:
         after_break = after_refusal or dt_s > self._limits.max_gap_s
         if searched and after_break and not self._is_plausible(estimate, dt_s):
             estimate = self._relocaliser.locate(frame)
-        # Predicted poses were published: a pose far from them does not close the gap, as odom would jump.
-        jumps = estimate is not None and after_refusal and is_jump(T_predicted, estimate.T_odom_rect)
-        if estimate is None or jumps or not self._is_plausible(estimate, dt_s):
-            elsewhere = estimate is not None and jumps and estimate.inliers >= self._limits.good_inliers
-            return self._refuse(frame, usable, T_predicted, dt_s, elsewhere=elsewhere)
+        # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
+        gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
+        if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
+            known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
+            return self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
+        self._resets += gap.is_turned  # odom has another heading than it was published with
 
         if self._unmoved is not None:
             estimate = self._start_again(frame, usable, estimate, dt_s)
@@ -212,20 +213,22 @@ class VisualOdometry:
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
-    def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: bool
-                ) -> OdometryEstimate:
+    def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *,
+                elsewhere: GapStep | None) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
-        elsewhere: the frame was recognised where the robot cannot have come by the predicted motion.
+        elsewhere: the frame was recognised so far from the predicted pose; None: it was not recognised elsewhere.
         """
-        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not elsewhere
+        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and elsewhere is None
         self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=self._is_textured(frame, usable),
-                                 elsewhere=elsewhere, carried=carried))
+                                 elsewhere=elsewhere is not None, carried=carried))
         if not self._status.restart:
             return self._result(0, 0)
         self._map.clear()
         self._previous = None
         self._relocaliser.clear()
+        if elsewhere is not None:
+            self._covariance = self._covariance + elsewhere.covariance
         if not carried:
             self._motion.reset()
             self._resets += 1
