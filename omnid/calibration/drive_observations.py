@@ -105,7 +105,7 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
         collector = DriveCollector(place)
         newest = np.eye(4)
         choice = KeyframeChoice(_spacing(reader, most))
-        for update, twist in _with_twists(_updates(reader, place, config, log)):
+        for update, twist in _with_twists(tracked_updates(reader, place, config, log)):
             newest = update.T_odom_rig
             if choice.takes(update):
                 collector.add(update, twist)
@@ -197,7 +197,7 @@ def _twist(first: OdometryUpdate, last: OdometryUpdate) -> Array:
     return np.asarray(moved / span_s) if span_s > 0 else np.zeros(6)
 
 
-def _updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> Iterator[OdometryUpdate]:
+def tracked_updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> Iterator[OdometryUpdate]:
     """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
     pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
     gate = RigGate(place.cylinder, "warn")

@@ -102,9 +102,10 @@ class RigCheck:
         self._cylinder = cylinder
         self._found: deque[Matches] = deque(maxlen=min(pairs, MAX_PAIRS))
 
-    def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> None:
-        """Add a pair of panoramas; visible (H, W): where both show the world."""
-        self._found.append(match(lower, upper, visible))
+    def add(self, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure: Exposure | None = None
+            ) -> None:
+        """Add a pair of panoramas; visible (H, W): where both show the world; exposure: the motion during a pair."""
+        self._found.append(match(lower, upper, visible, exposure))
 
     def finding(self) -> RigFinding:
         """Return the result of all pairs collected."""

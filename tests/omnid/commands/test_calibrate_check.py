@@ -47,8 +47,12 @@ def test_motion_between_the_exposures_is_no_drift_to_correct(tmp_path: Path, cap
     run = build("two_walls", 3, 256, 8)
     write_log(tmp_path, run.rig, run.poses, run.scene, readout=Readout(skew_ms=(-20.0, -20.0)), supersample=1)
     words = ["calibrate", "check", str(tmp_path / "log.mcap"), "--rig", str(tmp_path / "rig.toml")]
-    main(words)
-    assert "only for a robot that stands: the upper images are 20.0 ms earlier" in capsys.readouterr().out
+    assert main(words) == 0
+    found = capsys.readouterr().out
+    assert found.startswith("good") and "the upper images are 20.0 ms earlier than the lower ones: the motion" in found
+    write_rig(tmp_path / "turned.toml", with_upper_rotated(read_rig(tmp_path / "rig.toml"), (0.0, 0.5, 0.0)))
+    assert main([*words[:-1], str(tmp_path / "turned.toml")]) == 1
+    assert capsys.readouterr().out.startswith("drifted")
     assert main([*words, "--refine", "-o", str(tmp_path / "new.toml")]) == 2
     assert "calibrate drive" in capsys.readouterr().err and not (tmp_path / "new.toml").exists()
 
