@@ -139,7 +139,7 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.cameras drivers.errors "
         "drivers.frame drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated omnid.config "
         "omnid.controller omnid.core.control omnid.core.navigation omnid.engine omnid.errors omnid.formats "
-        "omnid.messages omnid.runs omnid.simulation.rendering omnid.sinks omnid.stages",
+        "omnid.messages omnid.navigation_state omnid.runs omnid.simulation.rendering omnid.sinks omnid.stages",
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":

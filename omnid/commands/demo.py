@@ -1,4 +1,4 @@
-"""`omnid demo`: replay the sample log in real time with all outputs, and compare with the ground truth."""
+"""`omnid demo`: replay the sample log in real time with all outputs, compared with the truth; or drive a simulation."""
 
 from __future__ import annotations
 
@@ -9,19 +9,27 @@ from pathlib import Path
 from omnid.commands.config import add_settings
 from omnid.commands.replay import replay_and_print
 
+DRIVE_S = 240.0  # of simulated time at most
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `demo` to the command line."""
     parser = subparsers.add_parser("demo", help="replay a sample in real time: files, bus and a simulated motor")
     parser.add_argument("--output", type=Path, default=Path("omnid-demo"), metavar="FOLDER",
                         help="folder of the output files; default %(default)s")
+    parser.add_argument("--drive", action="store_true", help="a simulated robot drives a square, and then along the "
+                        "path that it has driven; takes minutes, and writes drive.png with both true paths")
+    parser.add_argument("--seed", type=int, default=1, help="with --drive: of the world and its noise; default "
+                        "%(default)s")
     parser.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay the sample and print its errors against the truth."""
+    """Replay the sample and print its errors against the truth; or drive."""
+    if args.drive:
+        return _drive(args)
     from omnid.config import load_config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate, format_metrics
@@ -50,3 +58,33 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another folder") from error
+
+
+def _drive(args: argparse.Namespace) -> int:
+    """Drive a simulated robot; print the errors against the truth, and draw both paths."""
+    import cv2
+
+    from omnid.config import load_config
+    from omnid.errors import OmnidError
+    from omnid.simulation.demonstration import SquareTwice, apart_m, both_paths, draw, drift_m
+    from omnid.simulation.lockstep import simulate
+    from omnid.simulation.robot import make_robot
+    from omnid.simulation.world_file import load_world
+
+    if args.seed < 0:
+        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
+    _make_folder(args.output)
+    config, world = load_config(args.config, args.overrides), load_world("room", args.seed)
+    script = SquareTwice(lambda line: None if args.quiet else print(line, flush=True))
+    run = simulate(world, make_robot(), script, seconds=DRIVE_S, seed=args.seed, config=config)
+    first, second = both_paths(run, script.repeated_s)
+    picture = args.output / "drive.png"
+    if not cv2.imwrite(str(picture), draw(world, first, second)):
+        raise OmnidError(f"{picture}: cannot be written; name another folder by --output")
+    end = script.end or f"not reached within {DRIVE_S:g} s"
+    print(f"end: {end}; contacts with obstacles: {len(run.contacts)}; pose {100 * drift_m(run):.1f} cm off at the end")
+    if len(second):
+        most_cm = 100 * apart_m(first, second).max()
+        print(f"the repeated path is at most {most_cm:.1f} cm off the first one, by the truth")
+    print(f"picture of both true paths: {picture}")
+    return 0 if script.end == "reached" else 1

@@ -16,7 +16,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
                "replay drive.mcap --record out.mcap --method paper", "replay drive.mcap --start-s 60 --seconds 20"),
     "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
               "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786"),
-    "demo": ("demo", "demo --output /tmp/demo --quiet"),
+    "demo": ("demo", "demo --drive", "demo --output /tmp/demo --quiet"),
     "eval": ("eval est.txt truth.txt", "eval est.txt truth.txt --align rigid --json"),
     "calibrate board": ("calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
                         "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 "

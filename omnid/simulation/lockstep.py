@@ -63,8 +63,8 @@ class Moment:
     place: PlaceUpdate | None  # the newest
 
 
-# A setpoint of the operator, a request to arm, a stop, or a request to the navigation.
-Request: TypeAlias = Setpoint | Literal["arm", "stop"] | NavigationRequest
+# A setpoint of the operator, a request to arm, a stop, the end of the run, or a request to the navigation.
+Request: TypeAlias = Setpoint | Literal["arm", "stop", "end"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 
@@ -136,6 +136,7 @@ class _Lockstep:
         self._vehicle = Vehicle(world, robot, config, seed)
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
+        self._ends = False
         self._truth: dict[int, Array] = {}
         self._odometry: OdometryUpdate | None = None
         self._poses: list[tuple[int, Array, str]] = []
@@ -173,6 +174,8 @@ class _Lockstep:
             vehicle.motor.cut = self._has("motor cut")
             vehicle.advance(stamp_ns)
             self._send()
+            if self._ends:
+                break
             self._truth[stamp_ns] = vehicle.T_world_base
             yield from vehicle.take_samples()
             yield from self._pair(seq, stamp_ns)
@@ -206,6 +209,8 @@ class _Lockstep:
                 controller.arm(ArmRequest(arrival_ns))
             elif request == "stop":
                 controller.stop(arrival_ns)
+            elif request == "end":
+                self._ends = True
             else:
                 self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns))
 

@@ -1,0 +1,135 @@
+"""Closed-loop drives in lock-step against the truth at the wheels: `python -m tests.benchmark.drive CASE --seeds 1 2`.
+
+Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
+what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
+path to the straight legs, contacts, least clearance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib import se3
+from omnid.core.control.heading_controller import wrap_angle
+from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.navigation_state import NavigationState
+from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
+from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
+
+Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
+
+
+@dataclass
+class Goals:
+    """Arms the robot, and sends each goal when the one before is reached."""
+
+    goals: list[Goal]
+    sent: int = 0
+    sent_s: float = 0.0
+
+    def __call__(self, moment: Moment) -> Iterator[Request]:
+        if moment.odometry is None:
+            return
+        if not moment.controller.armed and moment.time_s < 2.0:
+            yield "arm"
+            return
+        state = None if moment.navigation is None else moment.navigation.state
+        ended = state is not None and state.is_end and moment.time_s > self.sent_s + 1.0
+        if self.sent == len(self.goals) and ended:
+            yield "end"
+        ready = self.sent == 0 or (state is NavigationState.REACHED and ended)
+        if moment.controller.armed and ready and self.sent < len(self.goals):
+            x_m, y_m, heading_deg = self.goals[self.sent]
+            self.sent += 1
+            self.sent_s = moment.time_s
+            yield GoalRequest(NavigationFrame.ODOM, x_m, y_m, math.radians(heading_deg))
+
+
+@dataclass
+class Case:
+    """A drive: world of a seed, script, duration, goals, faults, slips."""
+
+    world: Callable[[int], World]
+    drive: Callable[[], Goals]
+    seconds: float
+    goals: list[Goal] = field(default_factory=list)
+    faults: tuple[Fault, ...] = ()
+    slips: tuple[Slip, ...] = ()
+
+
+STRAIGHT: list[Goal] = [(10.0, 0.0, 0.0)]
+SQUARE: list[Goal] = [(2.5, 0.0, 90.0), (2.5, 2.5, 180.0), (0.0, 2.5, -90.0), (0.0, 0.0, 0.0)]
+ROUND: list[Goal] = [(5.05, 0.0, 90.0), (5.05, 7.1, 180.0), (-5.05, 7.1, -90.0), (-5.05, 0.0, 0.0), (0.0, 0.0, 0.0)]
+
+
+def corridor(seed: int) -> World:
+    """Return the corridor without its person."""
+    world = load_world("corridor", seed)
+    return World(world.name, world.standing, (), world.start)
+
+
+CASES: dict[str, Case] = {
+    "straight": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT),
+    "square": Case(lambda seed: load_world("room", seed), lambda: Goals(SQUARE), 120.0, SQUARE),
+    "building": Case(lambda seed: load_world("building", seed), lambda: Goals(ROUND), 240.0, ROUND),
+    "dark": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (Fault("dark", 10.0, 13.0),)),
+    "slip": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (), (Slip(10.0, 11.0, 0.2),)),
+}
+
+
+def legs_offset_m(truth: np.ndarray, goals: list[Goal]) -> float:
+    """Return the largest distance [m] of true positions (N, 4, 4) from the straight legs between goals."""
+    corners = np.array([(0.0, 0.0), *((x, y) for x, y, _ in goals)])
+    a, along = corners[:-1], np.diff(corners, axis=0)
+    to = truth[:, None, :2, 3] - a
+    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1).max())
+
+
+def row(case: Case, run: SimulatedRun) -> list[str]:
+    """Return the figures of a drive."""
+    x_m, y_m, heading_rad = run.ticks[-1].pose
+    end = se3.inverse(run.T_world_base[0]) @ se3.transform(se3.rotation_exp([0, 0, heading_rad]), [x_m, y_m, 0.0])
+    ends = ["", "", ""]
+    if case.goals:
+        goal = case.goals[-1]
+        error_deg = math.degrees(wrap_angle(float(se3.yaw(end)) - math.radians(goal[2])))
+        ends = [f"{100 * math.dist(end[:2, 3], goal[:2]):.1f}", f"{abs(error_deg):.2f}",
+                f"{100 * legs_offset_m(run.truth_in_odom, case.goals):.1f}"]
+    state = f"{run.navigation[-1].state} {run.navigation[-1].reason}".strip() if case.goals and run.navigation else ""
+    moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)
+    stops = [line for _, line in run.lines if line.startswith("the wheels stop")]
+    return [state, *ends, f"{np.linalg.norm(moved, axis=1).sum():.2f}", str(len(run.contacts)),
+            f"{run.clearance_m:.2f}", "; ".join(dict.fromkeys(stops))[:120]]
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmark.drive")
+    parser.add_argument("cases", nargs="+", choices=[*CASES, "all"], metavar="CASE")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--size", type=int, default=512)
+    arguments = parser.parse_args()
+    heads = ("case", "seed", "end", "end error cm", "deg", "off the legs cm", "way m", "contacts", "clearance m",
+             "stops", "s a pair")
+    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
+    for name in CASES if "all" in arguments.cases else arguments.cases:
+        case = CASES[name]
+        for seed in arguments.seeds:
+            robot = with_slips(make_robot(arguments.size), case.slips)
+            started_s = time.process_time()
+            run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
+            cost_s = (time.process_time() - started_s) / max(1, len(run.stamps_ns))
+            print("|", " | ".join([name, str(seed), *row(case, run), f"{cost_s:.2f}"]), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
