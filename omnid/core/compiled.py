@@ -38,6 +38,11 @@ class Kernel(Generic[P, R]):
         result: R = self._compiled(*args, **kwargs)
         return result
 
+    @property
+    def is_compiled(self) -> bool:
+        """True once the function is compiled."""
+        return self._compiled is not None
+
     def compile(self, *, kept: bool = False) -> None:
         """Compile the function for its signature; kept: read it from numba's folder, or write it there."""
         dispatcher = self._dispatcher()

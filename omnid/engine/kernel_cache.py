@@ -28,7 +28,7 @@ import omnid.core
 from omnid.core.compiled import KERNEL_FILES, Kernel, declared
 from omnid.errors import OmnidError
 
-MAX_FOLDERS: Final = 40  # of other states, and of files that were not compiled now
+MAX_FOLDERS: Final = 100  # of other states, and of files that were not compiled now
 MAX_BYTES: Final = 64 << 20  # of a folder that is read: a larger one is none of ours
 DIGESTS: Final = "digests.json"
 _IMPORTED: Final = re.compile(r"^(?:from|import) (omnid\.core\.\S*_kernels)\b", re.MULTILINE)
@@ -51,26 +51,35 @@ def prepare_kernels(report: Report) -> None:
     except OSError as error:
         raise OmnidError("the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
                          f"the service, or what else denies executable memory ({error})") from error
-    files = _kernel_files()
-    folders = {name: _folder_of_state(path) for name, path in files.items()}
-    reason = _why_unusable(cache_folder())
-    missing = []
-    for name, folder in folders.items():
-        importlib.import_module(name)
-        if not reason and _is_intact(folder):
-            _compile_into(name, folder)
-        else:
-            missing.append(name)
+    read_kept_kernels()
+    missing = {name: _folder_of_state(path) for name, path in _kernel_files().items() if not _is_ready(name)}
     if missing:
-        _compile_first({name: folders[name] for name in missing}, reason, report)
+        _compile_first(missing, _why_unusable(cache_folder()), report)
     _state["ready"] = True
+
+
+def read_kept_kernels() -> None:
+    """Read the functions that are on the disk: also in a thread of its own, before `prepare_kernels` does the rest."""
+    reason = _why_unusable(cache_folder())
+    for name, path in _kernel_files().items():
+        importlib.import_module(name)
+        folder = _folder_of_state(path)
+        if not reason and not _is_ready(name) and _is_intact(folder):
+            _compile_into(name, folder)
+            with suppress(OSError):
+                os.utime(folder)  # used: not the next to be removed
+
+
+def _is_ready(name: str) -> bool:
+    """True if the functions of a file (name of its module) are compiled."""
+    return all(kernel.is_compiled for kernel in _functions_of(name))
 
 
 def _compile_first(folders: Mapping[str, Path], reason: str, report: Report) -> None:
     """Compile what is not on the disk; reason: why it cannot be kept there, empty where it can."""
     started_s = time.monotonic()
     count = sum(1 for name in folders for _ in _functions_of(name))
-    report(logging.INFO, f"compiling {count} functions for this processor, once; takes up to a minute")
+    report(logging.INFO, f"compiling {count} functions for this processor, once; takes half a minute to two")
     for name, folder in folders.items():
         if not reason:
             try:

@@ -32,7 +32,7 @@ from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.bounded_call import started
 from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink
-from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
@@ -286,10 +286,10 @@ class LiveRun:
 
 
 def _import_slow_modules() -> None:
-    """Import what takes half a second, while images are awaited; where it cannot be imported, its users raise."""
+    """Import what takes a second, while images are awaited; where that fails, the users of it raise."""
     with suppress(Exception):
-        for module in ("numba", "filterpy.kalman"):
-            import_module(module)
+        read_kept_kernels()
+        import_module("filterpy.kalman")
 
 
 def _ready(config: Config) -> str:

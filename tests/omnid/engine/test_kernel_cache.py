@@ -47,7 +47,7 @@ def test_functions_are_compiled_once_and_damaged_files_are_never_read(tmp_path: 
     assert lines[2:] == ["[1.5, 2.5] 0"]
     assert second.stdout.splitlines() == ["[1.5, 2.5] 1"], second.stderr
     kept = {path.name for path in tmp_path.iterdir()}
-    assert len(kept) == kernel_cache.MAX_FOLDERS + 1 and "kernels-40" in kept and "kernels-0" not in kept
+    assert len(kept) == kernel_cache.MAX_FOLDERS + 1 and "kernels-100" in kept and "kernels-0" not in kept
 
     (folder,) = tmp_path.glob("kernels-sample-*")
     code = next(folder.rglob("*.nbc"))
