@@ -24,8 +24,8 @@ SHOW_PERIOD_S: Final = 1.0
 _NAME_COLUMNS: Final = 20
 _RETRY_S: Final = 0.5
 FLEET_TOPICS: Final = ("odom", "status")
-_HEAD: Final = (f"{'robot':{_NAME_COLUMNS}} {'state':10} {'Hz':>5} {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
-               "  worst")
+_POSE_HEAD: Final = f" {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
+NARROW_COLUMNS: Final = 110  # a terminal with fewer shows no positions: what is wrong must be seen
 
 
 class FleetState:
@@ -100,24 +100,29 @@ def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float)
 
 def show(fleet: FleetState, stream: IO[str], dropped: int = 0) -> None:
     """Write the table, in place on a terminal; dropped: messages that the inbox could not hold."""
-    lines = list(fleet_table(fleet.robots, len(fleet.refused), dropped))
+    size = shutil.get_terminal_size()
+    narrow = stream.isatty() and size.columns < NARROW_COLUMNS
+    lines = list(fleet_table(fleet.robots, len(fleet.refused), dropped, narrow=narrow))
     if stream.isatty():
-        size = shutil.get_terminal_size()
         stream.write(CLEAR + "\n".join(fitted(lines, size.columns, size.lines)) + "\n")
     else:
         stream.write("\n".join(lines) + "\n")
     stream.flush()
 
 
-def fleet_table(robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0) -> Iterator[str]:
-    """Yield a head and a line for each robot: those that are gone or have the worst state first."""
+def fleet_table(robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0, *,
+                narrow: bool = False) -> Iterator[str]:
+    """Yield a head and a line for each robot: those that are gone or have the worst state first.
+
+    narrow: without positions and ages.
+    """
     counts = [sum(1 for state in robots.values() if severity(state) >= level) for level in (0, 1, 2)]
     more = f"; {refused} more than {MAX_ROBOTS} are left out" if refused else ""
     lost = f"; {dropped} messages dropped" if dropped else ""
     yield f"{counts[0]} robots, {counts[1] - counts[2]} with warnings, {counts[2]} with errors or gone{more}{lost}"
-    yield _HEAD
+    yield f"{'robot':{_NAME_COLUMNS}} {'state':10} {'Hz':>5}{'' if narrow else _POSE_HEAD}  worst"
     for name, state in sorted(robots.items(), key=lambda entry: (-severity(entry[1]), entry[0])):
-        yield _line(name, state)
+        yield _line(name, state, narrow)
 
 
 def severity(state: RobotState) -> int:
@@ -141,7 +146,7 @@ def worst_part(state: RobotState) -> DiagnosticStatus | None:
     return None if worst is None or worst.level % 4 == OK else worst
 
 
-def _line(name: str, state: RobotState) -> str:
+def _line(name: str, state: RobotState, narrow: bool) -> str:
     shown = plain(name)
     shown = shown if len(shown) <= _NAME_COLUMNS else f"{shown[: _NAME_COLUMNS - 1]}\N{HORIZONTAL ELLIPSIS}"
     word = word_of(state)
@@ -150,7 +155,8 @@ def _line(name: str, state: RobotState) -> str:
         f"{pose.x_m:+9.2f} {pose.y_m:+9.2f} {math.degrees(pose.yaw_rad):+8.1f}"
     worst = worst_part(state)
     problem = "" if worst is None else f"{short_name(worst.name)}: {worst.message}"
-    return plain(f"{shown:{_NAME_COLUMNS}} {word:10.10} {state.rate_hz:5.1f} {where} {age}  {problem}")
+    details = "" if narrow else f" {where} {age}"
+    return plain(f"{shown:{_NAME_COLUMNS}} {word:10.10} {state.rate_hz:5.1f}{details}  {problem}")
 
 
 def check_all(robot: str | None, files: Mapping[str, object]) -> None:

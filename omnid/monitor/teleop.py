@@ -159,4 +159,4 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
 def _status_line(report: Diagnostics) -> str:
     """Return whether the robot is armed, or why it stops."""
     disarmed = report.value(WHEELS, Key.DISARMED_BY)
-    return f"not armed: {disarmed} (press a)" if disarmed else "armed"
+    return f"press a: not armed, {disarmed}" if disarmed else "armed"

@@ -79,3 +79,12 @@ def test_options_of_one_robot_are_refused() -> None:
     done = subprocess.run([sys.executable, "-m", "omnid", "listen", "--all", "--robot", "one"], capture_output=True,
                           text=True)
     assert done.returncode == 2 and "--robot does not go with it" in done.stderr
+
+
+def test_a_narrow_terminal_shows_what_is_wrong() -> None:
+    fleet = FleetState()
+    status = codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 2, "the motor does not answer", {})])
+    fleet.process(ReceivedMessage(time.time_ns(), "rover/status", status, b""))
+    wide, narrow = (list(fleet_table(fleet.robots, narrow=narrow)) for narrow in (False, True))
+    assert "x m" in wide[1] and "x m" not in narrow[1]
+    assert narrow[2][:80].endswith("wheels: the motor does not answer")
