@@ -1,0 +1,227 @@
+"""Navigation stage: requests are answered, frames are those of the base, routes are taught and repeated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationCommand,
+    NavigationFrame,
+    NavigationVerb,
+    PathRequest,
+    RouteAction,
+    RouteRequest,
+)
+from omnid.core.navigation.requests import Request as NavigationRequest
+from omnid.core.navigation.route import KeyframePose
+from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.situation import WheelState
+from omnid.core.places.planar import planar, transform
+from omnid.formats.route_file import RouteFolder
+from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.navigation_state import NavigationState
+from omnid.stages.navigation import NavigationStage
+from omnid.stages.routes import Routes
+from omnid.tracking_state import MapState, TrackingState
+
+Array = NDArray[np.float64]
+T_BASE_RIG = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, -0.2, 0.9])
+T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
+PERIOD_NS = 100_000_000
+ODOM, MAP = NavigationFrame.ODOM, NavigationFrame.MAP
+DEPTH: Any = None  # the stage reads none
+UNIT = np.eye(6) * 1e-6
+
+
+class FixedMap:
+    """A map of keyframes that stand still."""
+
+    name = "site.omap"
+    saves = 0
+
+    def __init__(self, stamp_ns: int = 5) -> None:
+        self._stamp_ns = stamp_ns
+
+    def keyframe(self, id: int) -> KeyframePose | None:
+        return KeyframePose(self._stamp_ns, np.zeros(3)) if id == 3 else None
+
+    def noted(self) -> Mapping[int, int]:
+        return {3: self._stamp_ns}
+
+    def save(self) -> None:
+        self.saves += 1
+
+
+class Robot:
+    """A base that follows setpoints exactly, seen through the stage's messages."""
+
+    def __init__(self, folder: Path, places: FixedMap | None = None) -> None:
+        self.wheels = WheelState(True, False)
+        self.places = FixedMap() if places is None else places
+        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, lambda: self.wheels,
+                                     Routes(RouteFolder(folder), self.places))
+        self.pose, self.velocity = np.zeros(3), np.zeros(2)
+        self.seq = 0
+        self.updates: list[NavigationUpdate] = []
+        self.map_state = MapState.LOCALIZED
+        self.in_map = True
+
+    def send(self, request: NavigationRequest, stamp_ns: int = 0) -> NavigationUpdate:
+        """Return the answer to a request."""
+        update = self.stage.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns))
+        assert update is not None
+        self.updates.append(update)
+        return update
+
+    def pass_on(self) -> NavigationUpdate | None:
+        """Advance by a period."""
+        self.seq += 1
+        T_odom_base = transform(self.pose)
+        T_odom_rig = se3.inverse(T_BASE_RIG) @ T_odom_base @ T_BASE_RIG
+        to_rig = se3.adjoint(se3.inverse(T_BASE_RIG))
+        velocity = to_rig @ np.array([self.velocity[0], 0, 0, 0, 0, self.velocity[1]])
+        stamp_ns = self.seq * PERIOD_NS
+        if self.in_map:
+            T_map_odom = se3.inverse(T_BASE_RIG) @ T_MAP_ODOM @ T_BASE_RIG
+            T_map_rig = T_map_odom @ T_odom_rig
+            T_keyframe_rig = T_map_rig  # keyframe 3 stands where the map begins
+            self.stage.process(PlaceUpdate(self.seq, stamp_ns, T_map_odom, T_map_rig, UNIT, self.map_state, 3,
+                                           T_keyframe_rig))
+        update = self.stage.process(OdometryUpdate(
+            self.seq, stamp_ns, T_odom_rig, UNIT, velocity, UNIT, TrackingState.TRACKING, 0, 100, 100, DEPTH))
+        if update is not None:
+            self.updates.append(update)
+        if update is not None and update.setpoint is not None:
+            wanted = update.setpoint
+            rate = wanted.yaw_rate_radps if wanted.heading_rad is None else np.clip(
+                3 * math.remainder(wanted.heading_rad - self.pose[2], math.tau), -1, 1)
+            self.velocity = np.array([wanted.velocity_mps, rate])
+        heading = self.pose[2] + 0.05 * self.velocity[1]
+        self.pose = self.pose + 0.1 * np.array([self.velocity[0] * math.cos(heading),
+                                                self.velocity[0] * math.sin(heading), self.velocity[1]])
+        return update
+
+    def run(self, periods: int = 600) -> NavigationUpdate:
+        """Advance until the drive has ended."""
+        for _ in range(periods):
+            update = self.pass_on()
+            if update is not None and update.state.is_end:
+                return update
+        raise AssertionError(self.updates[-1])
+
+
+def test_drives_to_a_goal_of_the_base_in_odom_and_in_the_map(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    update = robot.send(GoalRequest(ODOM, 1.5, 0.5, 1.0), 77)
+    assert update.answer is not None and not update.answer.refusal and update.answer.stamp_ns == 77
+    assert update.state is NavigationState.DRIVING and update.plan is not None and update.plan.frame == "odom"
+    assert robot.run().state is NavigationState.REACHED
+    np.testing.assert_allclose(robot.pose, [1.5, 0.5, 1.0], atol=0.03)
+    goal = planar(T_MAP_ODOM @ transform(np.array([0.2, 1.5, -0.4])))
+    robot.send(GoalRequest(MAP, *map(float, goal)))
+    assert robot.run().state is NavigationState.REACHED
+    np.testing.assert_allclose(robot.pose, [0.2, 1.5, -0.4], atol=0.03)
+
+
+def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+
+    def refusal(request: NavigationRequest) -> str:
+        update = robot.send(request)
+        assert update.setpoint is None and update.answer is not None and update.state is NavigationState.IDLE
+        return update.answer.refusal
+
+    assert "no pose yet" in refusal(GoalRequest(ODOM, 1.0, 0.0))
+    robot.in_map = False
+    robot.pass_on()
+    assert "not localised" in refusal(GoalRequest(MAP, 1.0, 0.0))
+    assert "not localised" in refusal(RouteRequest(RouteAction.TEACH, "a"))
+    assert "navigation.reach_m" in refusal(GoalRequest(ODOM, 500.0, 0.0))
+    assert "begins 5.0 m away" in refusal(PathRequest(ODOM, np.array([[5.0, 0.0], [6.0, 0.0]])))
+    assert "nothing is under way" in refusal(NavigationVerb.RESUME)
+    assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
+    robot.wheels = WheelState(False, True, "a stop was asked for")
+    assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
+    assert [u.answer.number for u in robot.updates if u.answer is not None][-1] == 8
+
+
+def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(GoalRequest(ODOM, 3.0, 0.0))
+    for _ in range(15):
+        robot.pass_on()
+    update = robot.send(NavigationVerb.CANCEL)
+    assert update.state is NavigationState.CANCELLED
+    assert update.setpoint is not None and update.setpoint.velocity_mps == 0.0
+
+
+def test_several_requests_at_once_are_done_in_their_order(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    requests = [GoalRequest(ODOM, 3.0, 0.0), NavigationVerb.CANCEL]
+    update = robot.stage.process([NavigationCommand(request, 0) for request in requests])
+    assert update is not None and update.state is NavigationState.CANCELLED
+    assert robot.stage.process([]) is None
+
+
+def test_a_ring_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
+    for age_ns, expected in ((0, NavigationState.BLOCKED), (3_000_000_000, NavigationState.DRIVING)):
+        robot = Robot(tmp_path)
+        robot.seq = 40
+        robot.pass_on()
+        robot.send(GoalRequest(ODOM, 3.0, 0.0))
+        ranges = np.full(360, 0.5, np.float32)
+        robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS - age_ns, ranges, ranges, ranges, np.eye(4)))
+        for _ in range(8):
+            robot.pass_on()
+        assert robot.updates[-1].state is expected
+
+
+def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(RouteRequest(RouteAction.TEACH, "hall"))
+    assert "is being taught" in (robot.send(RouteRequest(RouteAction.REPEAT, "hall")).answer or ("",) * 4)[3]
+    for k in range(150):
+        robot.velocity = np.array([0.3, 0.4 * math.sin(k / 20)])
+        robot.pass_on()
+    robot.velocity = np.zeros(2)
+    update = robot.pass_on()
+    assert robot.updates[-1].teaching == "hall" and robot.updates[-1].taught_m == pytest.approx(4.5, abs=0.2)
+    update = robot.send(RouteRequest(RouteAction.FINISH))
+    assert update.answer is not None and not update.answer.refusal and not update.teaching
+    assert robot.places.saves == 1, "the map is saved with it"
+    end = robot.pose.copy()
+    robot.send(RouteRequest(RouteAction.REPEAT, "hall", reverse=True))
+    assert robot.updates[-1].task == "route hall"
+    assert robot.run(1200).state is NavigationState.REACHED
+    assert math.hypot(*robot.pose[:2]) < 0.1
+    robot.send(RouteRequest(RouteAction.REPEAT, "hall"))
+    assert robot.run(1200).state is NavigationState.REACHED
+    np.testing.assert_allclose(robot.pose[:2], end[:2], atol=0.1)
+    other = Robot(tmp_path, FixedMap(stamp_ns=6))
+    other.pass_on()
+    update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
+    assert update.answer is not None and "taught in another map (site.omap)" in update.answer.refusal
+    other.places.name = ""
+    update = other.send(RouteRequest(RouteAction.TEACH, "x"))
+    assert update.answer is not None and "omnid run --map" in update.answer.refusal
+
+
+def test_the_state_is_given_each_second_while_nothing_happens(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    given = [robot.pass_on() for _ in range(30)]
+    assert [k for k, update in enumerate(given) if update is not None] == [0, 10, 20]
+    assert all(update.setpoint is None for update in given if update is not None)
