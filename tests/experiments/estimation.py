@@ -13,6 +13,7 @@ from calib.models.camera import Array
 from omnid.config import Config, OdometryConfig
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.motion_model import MotionModel
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -64,7 +65,7 @@ class UnfilteredOdometry(VisualOdometry):
     def __init__(self, geometry: Geometry, config: OdometryConfig) -> None:
         model = geometry.model(config.noise_px)
         super().__init__(model, config.klt, config.limits, Relocaliser(model))
-        self._filter = PassThroughFilter()
+        self._motion = MotionModel(config.limits, PassThroughFilter())
 
 
 class UnfilteredPaperOdometry(PaperOdometry):

@@ -24,9 +24,10 @@ SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 deg
 class MotionModel:
     """The velocity of the rectified frame, and its next step. Steps are T_prev_curr (4, 4)."""
 
-    def __init__(self, limits: OdometryLimits) -> None:
+    def __init__(self, limits: OdometryLimits, motion_filter: MotionFilter | None = None) -> None:
+        """motion_filter: None for a new one."""
         self._longest_s = limits.max_gap_s
-        self._filter = MotionFilter()
+        self._filter = motion_filter or MotionFilter()
         self._exposures = ExposureVelocity(self._filter)
         self._bridge = Bridge(limits)
 
