@@ -18,6 +18,7 @@ from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light
+from omnid.engine.one_at_a_time import OneAtATime
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -65,14 +66,14 @@ class StereoDepth:
     """Panoramas of a pair, and their dense depth, which is computed when it is first read.
 
     Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map.
-    Any thread may read. Two threads that read at the same time may both compute it, with the same result.
+    Any thread may read; while one computes it, others that read it wait for the result.
     rig_fits is False if the images contradict the rig, so that no result of them is better than degraded.
 
     Where the images were exposed at several times, the depth depends on the motion in between, which the odometry
     finds: it settles the depth before it passes it on.
     """
 
-    __slots__ = ("_compute", "_dense", "_exposure", "_settled", "panoramas", "rig_fits", "seq", "stamp_ns")
+    __slots__ = ("_compute", "_dense", "_exposure", "_one", "_settled", "panoramas", "rig_fits", "seq", "stamp_ns")
 
     def __init__(self, panoramas: Panoramas, compute: Callable[[Panoramas, Exposure | None], DensePoints], *,
                  rig_fits: bool = True) -> None:
@@ -82,12 +83,14 @@ class StereoDepth:
         self._dense: DensePoints | None = None
         self._exposure: Exposure | None = None
         self._settled = False
+        self._one = OneAtATime()
 
     def dense(self) -> DensePoints:
         """Return the dense depth; compute it the first time."""
-        if self._dense is None:
-            self._dense = self._compute(self.panoramas, self._exposure)
-        return self._dense
+        with self._one:
+            if self._dense is None:
+                self._dense = self._compute(self.panoramas, self._exposure)
+            return self._dense
 
     @property
     def exposure(self) -> Exposure | None:

@@ -109,7 +109,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.navigation omnid.core.places omnid.errors",
     "omnid.messages":
         "drivers.motion omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "
-        "omnid.core.stereo omnid.navigation_state omnid.tracking_state",
+        "omnid.core.stereo omnid.engine omnid.navigation_state omnid.tracking_state",
     "omnid.monitor":
         "calib.bounded_toml drivers.logs omnid.client omnid.core.control omnid.engine omnid.errors omnid.formats "
         "omnid.navigation_state omnid.sinks omnid.transport",
@@ -155,12 +155,12 @@ ARROWS: Mapping[str, str] = {
     "omnid.tracking_state": "",
     "omnid.transport":
         "calib.se3 drivers.errors drivers.frame drivers.logs drivers.motion omnid.core.control "
-        "omnid.core.navigation omnid.errors omnid.settings omnid.tracking_state",
+        "omnid.core.navigation omnid.core.obstacles omnid.errors omnid.settings omnid.tracking_state",
     "omnid.version": "",
     "omnid.viewer":
-        "calib.se3 drivers.errors drivers.frame drivers.logs omnid.client omnid.config omnid.core.odometry "
-        "omnid.engine omnid.errors omnid.messages omnid.monitor omnid.recordings omnid.runs omnid.sinks "
-        "omnid.stages omnid.tracking_state omnid.transport",
+        "calib.se3 drivers.errors drivers.frame drivers.logs omnid.client omnid.config omnid.core.mapping "
+        "omnid.core.odometry omnid.engine omnid.errors omnid.messages omnid.monitor omnid.recordings omnid.runs "
+        "omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.web":
         "drivers.errors drivers.logs omnid.client omnid.core.navigation omnid.engine omnid.errors omnid.monitor "
         "omnid.tracking_state omnid.transport",
@@ -180,7 +180,8 @@ RULES = (
     Rule("calib", ("threading", "_thread", "time", "socket", "logging")),
     Rule("drivers.motors", ("numpy", "cv2")),
     Rule("omnid", ("threading", "_thread"),
-         excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py", "omnid/engine/bounded_call.py")),
+         excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py", "omnid/engine/bounded_call.py",
+                   "omnid/engine/one_at_a_time.py")),
     Rule("omnid", ("zenoh",), excepted=("omnid/transport/bus.py", "omnid/transport/session.py",
                                        "omnid/transport/client_session.py", "omnid/client.py")),
     Rule("omnid.core", ("threading", "time", "logging", "socket", "subprocess")),

@@ -32,17 +32,19 @@ from omnid.transport.codec import (
     twist_from_cdr,
 )
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose
+from omnid.transport.scan_codec import SCAN_SCHEMA, Scan, decode_scan
 
 ODOMETRY: Final = "odom"
 STATUS: Final = "status"
 CLOUD: Final = "cloud"
+SCAN: Final = "scan"
 DRIVE: Final = "drive"
 MAP_POSE: Final = "map_pose"
 TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
-Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | TwistRecord | RosImage
+Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[memoryview], Content]
 
 
@@ -127,6 +129,7 @@ _DECODERS: Final[Mapping[str, tuple[str, Decoder]]] = {
     MAP_POSE: (MAP_POSE_SCHEMA, lambda data: decode_map_pose(bytes(data))),
     STATUS: (DIAGNOSTICS_SCHEMA, lambda data: decode_diagnostics(bytes(data))),
     CLOUD: (POINT_CLOUD_SCHEMA, lambda data: decode_cloud(bytes(data))),
+    SCAN: (SCAN_SCHEMA, lambda data: decode_scan(bytes(data))),
     DRIVE: (TWIST_SCHEMA, _finite_twist),
     TWIST_COMMAND: (TWIST_SCHEMA, _finite_twist),
 }

@@ -19,6 +19,7 @@ from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, navigation_codec
 from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
@@ -68,6 +69,8 @@ class Encoder:
                 payload = scan_cdr(message.stamp_ns + self.offset_ns, "base_link", message.ranges_m, message.sigma_m,
                                    (0.0, self._map_encoding.max_range_m))
                 yield OutgoingMessage("scan", SCAN_SCHEMA, payload)
+                payload = moving_cdr(message.stamp_ns + self.offset_ns, "odom", message.moving)
+                yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
             case NavigationUpdate():

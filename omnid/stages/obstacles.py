@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.observation import observe
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
@@ -56,7 +57,7 @@ class Obstacles:
         self._min_period_s = min_period_s
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
         self._settings = ring_settings(geometry, config)
-        self._filter = RingFilter(self._settings)
+        self._filter, self._tracker = RingFilter(self._settings), MovingTracker()
         self._view = viewpoint(geometry)
         self._last_ns: int | None = None
         self._resets = 0
@@ -67,14 +68,19 @@ class Obstacles:
             return None
         self._last_ns = odometry.stamp_ns
         if odometry.state is TrackingState.LOST or odometry.reset_counter != self._resets:
-            self._filter.clear()  # its memory is in odom, which has lost its relation to the robot
+            # Their memory is in odom, which has lost its relation to the robot.
+            self._filter.clear()
+            self._tracker.clear()
             self._resets = odometry.reset_counter
         depth = odometry.depth
         points = se3.apply(self._T_base_rig, depth.points)
         seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
-        ring = self._filter.update(odometry.stamp_ns, planar(T_odom_base), seen)
-        return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base)
+        pose = planar(T_odom_base)
+        ring = self._filter.update(odometry.stamp_ns, pose, seen)
+        moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
+        return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
+                            moving)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""

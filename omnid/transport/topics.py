@@ -29,6 +29,7 @@ PUBLISHED: Final = {
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
     "map": Topic(codec.GRID_SCHEMA, latched=True),
     "scan": Topic(SCAN_SCHEMA),
+    "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
     "panorama": Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import RosImage
-from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
+from omnid.recordings.recording_reader import CLOUD, ODOMETRY, SCAN, STATUS, RecordingReader
 from omnid.transport.codec import OdometryRecord
 from omnid.transport.decode import Cloud, Diagnostics, Pose
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.scan_codec import Scan
 from omnid.viewer import status_plots
 from omnid.viewer.image_encoding import compressed
 from omnid.viewer.rerun_scene import RerunScene
@@ -23,7 +24,7 @@ class RecordingView:
 
     def show(self) -> None:
         """Draw all messages."""
-        for message in self._reader.messages((ODOMETRY, STATUS, CLOUD, self._reader.image_name())):
+        for message in self._reader.messages((ODOMETRY, STATUS, CLOUD, SCAN, self._reader.image_name())):
             match message.content:
                 case OdometryRecord():
                     self._draw_pending()
@@ -32,6 +33,8 @@ class RecordingView:
                     self._diagnostics(message.content)
                 case Cloud():
                     self._scene.cloud(message.content)
+                case Scan():
+                    self._scene.scan(message.content)
                 case RosImage() if self._scene.wants("image"):
                     self._image(message.content)
         self._draw_pending()

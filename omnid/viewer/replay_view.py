@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
 from calib import se3
+from omnid.core.mapping.range_scan import azimuths
 from omnid.engine.telemetry import Telemetry
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import of_base
 from omnid.transport.decode import Cloud, Pose
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.scan_codec import Scan
 from omnid.viewer.image_encoding import jpeg
 from omnid.viewer.rerun_scene import RerunScene
 from omnid.viewer.status_plots import STAGES
@@ -36,6 +39,9 @@ class ReplayView:
             self._odometry(message)
         elif isinstance(message, MapUpdate):
             self._map(message)
+        elif isinstance(message, ObstacleRing):
+            self._scene.scan(Scan(message.stamp_ns, "base_link", azimuths(), message.ranges_m, message.sigma_m,
+                                  math.inf))
 
     def _odometry(self, odometry: OdometryUpdate) -> None:
         scene = self._scene

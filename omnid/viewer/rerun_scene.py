@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.stereo_frame import Features
 from omnid.transport.decode import Cloud, Pose
+from omnid.transport.scan_codec import Scan
 from omnid.viewer import style
 from omnid.viewer.layout import TIMELINE
 from omnid.viewer.style import Style
@@ -33,6 +34,7 @@ MAX_LOG_LINES: Final = 1_000
 MAX_LATENCIES: Final = 64  # curves
 FLUSH_EVERY: Final = 20  # poses
 AXIS_M: Final = 0.3
+UNKNOWN_AT_M: Final = 0.4  # distance at which unknown directions are marked
 PNG_FAST: Final = (cv2.IMWRITE_PNG_COMPRESSION, 3)
 
 LEGEND: Final = f"""
@@ -41,6 +43,8 @@ LEGEND: Final = f"""
 **Panorama**: dots are inliers, crosses are features that do not agree with the pose, squares are new.
 
 **Ellipsoid**: {style.SIGMAS:g} sigma of the position; its label tells by how many times it is magnified.
+
+**Obstacles**: red dots around the base; grey ones mark directions that are unknown.
 
 **Map and points**: dark below, light above. **Depth**: m from the rig's axis.
 """
@@ -56,7 +60,8 @@ class RerunScene:
         self._target, self._layout = target, layout
         self._stream: rr.RecordingStream | None = None
         self._thinning = {"pose": Thinning(MAX_POSES, expected), "frame": Thinning(MAX_FRAMES, expected),
-                          "image": Thinning(MAX_FRAMES, expected), "cloud": Thinning(MAX_CLOUDS)}
+                          "image": Thinning(MAX_FRAMES, expected), "cloud": Thinning(MAX_CLOUDS),
+                          "scan": Thinning(MAX_POSES)}
         self._last_position: Array | None = None  # (3,) m, end of the path
         self._state = ""
         self._lines = 0
@@ -137,6 +142,19 @@ class RerunScene:
         if self.wants("cloud"):
             (points,) = style.evenly(MAX_CLOUD_POINTS, cloud.points[np.isfinite(cloud.points).all(axis=1)])
             self._at(cloud.stamp_ns).log("odom/map", _points_3d(points, 1.5))
+
+    def scan(self, scan: Scan) -> None:
+        """Draw the obstacles around the base, and where their directions are unknown."""
+        if not self.wants("scan"):
+            return
+        stream, known = self._at(scan.stamp_ns), np.isfinite(scan.ranges_m)
+        unknown = np.isnan(scan.ranges_m)
+        ranges = np.where(known, scan.ranges_m, UNKNOWN_AT_M)
+        points = np.column_stack([ranges * np.cos(scan.azimuths_rad), ranges * np.sin(scan.azimuths_rad),
+                                  np.zeros(len(ranges))])
+        for name, chosen, one in (("obstacles", known, style.OBSTACLE), ("unknown", unknown, style.UNKNOWN)):
+            dots = rr.Points3D(points[chosen], colors=one.colour, radii=_px(one.size_px))
+            stream.log(f"odom/base_link/{name}", dots)
 
     def line(self, stamp_ns: int, text: str, level: str = "INFO") -> None:
         """Add a line to the log, up to MAX_LOG_LINES."""

@@ -16,6 +16,7 @@ from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_pose
 from omnid.transport.features_attachment import features_from_bytes
+from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.viewer import status_plots
 from omnid.viewer.rerun_scene import RerunScene
 from omnid.viewer.targets import ViewerTarget
@@ -72,6 +73,8 @@ class RobotView:
                 self._diagnostics(content)
             case Cloud():
                 self._scene.cloud(content)
+            case Scan():
+                self._scene.scan(content)
             case RosImage() if self._scene.wants("image"):
                 self._scene.panorama(content.stamp_ns, bytes(content.data), content.encoding)
                 self._features(content.stamp_ns, message.attachment)
@@ -87,7 +90,7 @@ class RobotView:
         status_plots.draw(diagnostics, self._changes, self._scene)
 
 
-def _decoded(message: ReceivedMessage) -> Pose | Diagnostics | Cloud | RosImage | None:
+def _decoded(message: ReceivedMessage) -> Pose | Diagnostics | Cloud | Scan | RosImage | None:
     """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
     match message.topic:
         case "odom":
@@ -96,6 +99,8 @@ def _decoded(message: ReceivedMessage) -> Pose | Diagnostics | Cloud | RosImage 
             return decode_diagnostics(message.payload)
         case "cloud":
             return decode_cloud(message.payload)
+        case "scan":
+            return decode_scan(message.payload)
         case "panorama":
             return parse_image(COMPRESSED_IMAGE, memoryview(message.payload))
     return None

@@ -35,6 +35,7 @@ STATES: Final = {  # the worse, the thicker
     "degraded": Style((230, 159, 0), 3.0),
     "lost": Style((213, 94, 0), 5.0),
 }
+OBSTACLE: Final = Style((213, 40, 40), 3.0)  # dots around the base
 INLIER: Final = Style((86, 180, 233), 2.5)  # dots
 REJECTED: Final = Style((213, 94, 0), 5.0)  # crosses
 NEW: Final = Style((240, 228, 66), 4.0)  # squares

@@ -79,7 +79,7 @@ class CollisionMonitor:
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
         self._stamp_ns: int | None = None
         self._points: list[tuple[float, float]] = []  # obstacles in the frame of the ring
-        self._frontier: list[tuple[float, float]] = []  # where the unknown begins
+        self._unknown: list[tuple[float, float]] = []  # where the way that was seen to be free ends, nothing is known
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
         self.reason = ""  # of the last step: why the motion was changed
@@ -95,11 +95,11 @@ class CollisionMonitor:
         self._points = [(r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
                         for k, r in enumerate(ring.ranges_m) if math.isfinite(r)]
         free = ring.free_m if len(ring.free_m) == count else (0.0,) * count
-        self._frontier = []
+        self._unknown = []
         for k in _unknown_sectors(ring.ranges_m):
             azimuth = (k + 0.5) * step - math.pi
             begins_m = max(free[k], self._outline.edge_m(azimuth))
-            self._frontier.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
+            self._unknown.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
 
     def step(self, now_ns: int, motion: Twist) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
@@ -130,7 +130,7 @@ class CollisionMonitor:
         points = _seen_from(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
-            allowances.append(self._into_unknown(_seen_from(self._frontier, moved, reach_m), motion))
+            allowances.append(self._into_unknown(_seen_from(self._unknown, moved, reach_m), motion))
         if self._moving:
             allowances.append(self._before_moving(moved, age_s, motion))
         return min(allowances)
@@ -178,15 +178,14 @@ class CollisionMonitor:
         is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
 
-    def _into_unknown(self, frontier: list[tuple[float, float]], motion: Twist) -> Allowance:
-        """Approach what was never seen slowly, or not at all."""
+    def _into_unknown(self, unknown: list[tuple[float, float]], motion: Twist) -> Allowance:
+        """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all."""
         if abs(motion.velocity_mps) <= TURN_MPS:
             return FREE
-        share = self._share_before(frontier, motion)
         least = 0.0
         if self._settings.unknown != STOP:
             least = min(1.0, self._settings.slow_mps / abs(motion.velocity_mps))
-        share = max(share, least)
+        share = max(self._share_before(unknown, motion), least)
         return FREE if share >= 1.0 else Allowance(share, UNKNOWN)
 
     def _before_moving(self, moved: tuple[float, float, float], age_s: float, motion: Twist) -> Allowance:

@@ -22,9 +22,9 @@ Counts = NDArray[np.intp]
 HEIGHT_SIGMAS: Final = 2.0  # of the height, between the floor and an obstacle
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four sigma of a usual rig
 NEAREST_M: Final = 0.2  # of the bins
-FLOOR_STEP_M: Final = 0.25  # of the bins of the floor's range
+FLOOR_STEP_M: Final = 0.1  # of the bins of the floor's range
 FLOOR_POINTS: Final = 3  # of such a bin, within three sectors, that show the floor
-FLOOR_GAP: Final = 1  # bins without floor that are passed over, as a floor without edges gives no points
+FLOOR_GAP: Final = 4  # bins without floor that are passed over, as a floor without edges gives no points
 
 
 class Observation(NamedTuple):
@@ -122,8 +122,9 @@ def _floor_reach(sector: Counts, ranges: Array, max_range_m: float) -> Array:
     position = np.arange(bins)
     last = np.maximum.accumulate(np.where(seen, position, -1), axis=1)
     gap = (position - last > FLOOR_GAP) & (position >= first[:, None])
-    end = np.where(gap.any(axis=1), np.argmax(gap, axis=1) - FLOOR_GAP, bins)
-    return np.where(seen.any(axis=1), end * FLOOR_STEP_M, 0.0)
+    # The first bin of the gap that is too long is FLOOR_GAP + 1 bins behind the last one that shows the floor.
+    end = np.where(gap.any(axis=1), last[np.arange(SECTORS), np.argmax(gap, axis=1)], last[:, -1])
+    return np.where(seen.any(axis=1), (end + 0.5) * FLOOR_STEP_M, 0.0)
 
 
 def _carried(sigma: RangeScan) -> RangeScan:

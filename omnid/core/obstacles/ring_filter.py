@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths, fill_gaps
+from omnid.core.obstacles.free_space import FreeSpace
 from omnid.core.obstacles.observation import Observation
 from omnid.core.obstacles.settings import RingSettings
 
@@ -43,11 +44,13 @@ class RingFilter:
         self._settings = settings
         self._history: deque[tuple[int, RingPoints]] = deque(maxlen=PAIRS - 1)
         self._memory: RingPoints | None = None
+        self._free = FreeSpace(settings.max_range_m, settings.free_s)
         self._directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths())])
 
     def clear(self) -> None:
         """Forget everything: the pose has lost its relation to the past."""
         self._history.clear()
+        self._free.clear()
         self._memory = None
 
     def update(self, stamp_ns: int, T_odom_base: Array, seen: Observation) -> Observation:
@@ -67,8 +70,9 @@ class RingFilter:
         accepted, sigma, age_stamps = self._remembered(stamp_ns, T_odom_base, accepted, sigma, age_stamps, unknown)
         known = np.isfinite(accepted)
         result = np.where(known, accepted, np.where(np.isposinf(seen.ranges_m), np.inf, np.nan)).astype(np.float32)
-        free = np.where(known, np.minimum(seen.free_m, accepted), seen.free_m)
-        # An obstacle that is not confirmed ends what is known to be free: free_m of the observation ends there.
+        # An obstacle ends what is known to be free, one that is not confirmed as well.
+        free = self._free.update(stamp_ns, T_odom_base, np.minimum(seen.free_m, np.where(known, accepted, np.inf)))
+        free = np.where(known, np.minimum(free, accepted), free)
         is_seen = np.isfinite(seen.ranges_m)
         self._history.append((stamp_ns, self._points(T_odom_base, np.where(is_seen, seen.ranges_m, np.nan),
                                                      sigmas[0], np.full(SECTORS, stamp_ns))))

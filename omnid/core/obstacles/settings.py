@@ -26,6 +26,9 @@ class RingSettings:
     memory_s: float = knob(2.0, "an obstacle beyond blind_m is kept for so long while its direction is unknown, s",
                            low=0, high=60)
 
+    free_s: float = knob(60.0, "floor that was seen to be free counts as free for so long where none is seen now, s",
+                         low=0, high=3600)
+
     def __post_init__(self) -> None:
         """Raise OmnidError unless the heights are in order."""
         if self.heights_m[0] >= self.heights_m[1]:

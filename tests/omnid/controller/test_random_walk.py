@@ -18,6 +18,8 @@ from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
+from omnid.core.control.collision_monitor import BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN, ControllerRing, MovingPoint
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Setpoint, Twist, wrap_angle
@@ -33,6 +35,8 @@ LEAD_RAD = longest_lead_rad(SETTINGS.heading, LIMITS)
 SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))
 TINY = 1e-9
 FAULTS = frozenset(rule.reason for rule in safety_rules.FAULTS)
+COLLISION = CollisionSettings()
+RINGS = ("free", "free", "free", "ahead", "behind", "unknown", "random", "person", "none")
 SLOW_SHARE = SETTINGS.trust.degraded_speed
 # Of some phases, what the motor controller reports and the poses show: its fault, volts, the speed of the wheels (None:
 # as commanded), the speed that is seen (NaN: unknown) and its standard deviation.
@@ -79,6 +83,7 @@ class Oracle:
     failed: bool = False  # the motor controller, at the last tick
     stopped: bool = False
     pose: ControllerPose | None = None
+    ring: ControllerRing | None = None
     requests: list[ArmRequest] = field(default_factory=list)  # since the last tick
     current: TimedSetpoint | None = None  # of the source and the sender that own the wheels
 
@@ -87,6 +92,16 @@ class Oracle:
         if asked_ns > self.stop_ns:
             self.stop_ns = asked_ns
             self.stop_latched = self.stop_latched or asked_ns > self.armed_ns
+
+    def blocked(self, now_ns: int, ahead: bool) -> bool:
+        """True if the newest ring is too old, or was taken just now and has an obstacle at the base on that side."""
+        age_s = math.inf if self.ring is None else abs(now_ns - self.ring.stamp_ns) * 1e-9
+        if self.ring is None or age_s > COLLISION.stale_s:
+            return True
+        edge_m = COLLISION.front_m if ahead else COLLISION.rear_m
+        middle = self.ring.ranges_m[180 if ahead else 0]  # within half a degree of the axis
+        # While the ring came the base can have moved by 0.4 m/s.
+        return edge_m < middle < edge_m + COLLISION.stop_m - 0.4 * age_s
 
     def take_command(self, command: TimedSetpoint) -> None:
         """Take a command if its sender may drive: the first on its source, and none of higher priority before it."""
@@ -133,7 +148,8 @@ class Walk:
     def __init__(self, seed: int, mode: str) -> None:
         self.rng, self.now_ns = random.Random(seed), 10**12
         self.motor, self.oracle = RandomMotor(), Oracle(mode == AUTOMATIC)
-        settings = replace(SETTINGS, arming=mode)
+        settings = replace(SETTINGS, arming=mode, collision=COLLISION)
+        self.rings = "free"  # kind of the rings of a phase
         self.controller = Controller(self.motor, settings, PERIOD_S, clock_ns=lambda: self.now_ns)
         self.motion, self.last_ns = STOP, self.now_ns  # that the base follows, and since when
         self.calm, self.quiet = True, False  # phases with few faults and with many, without commands
@@ -151,6 +167,7 @@ class Walk:
                 oddity = USUAL if usual else self.rng.choice(ODDITIES)
                 self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
+                self.rings = self.rng.choice(RINGS)
                 self.quiet, self.main = self.rng.random() < 0.1, self.rng.choice(SENDERS)
             self.events()
             self.tick()
@@ -166,6 +183,8 @@ class Walk:
         self.now_ns += rng.randrange(1, 1000)
         if self.chance(0.95, 0.7):
             self.send_pose()
+        if self.rings != "none" and self.chance(0.95, 0.7):
+            self.send_ring()
         for _ in range(0 if self.quiet else rng.choice((0, 1, 1, 1, 2, 3))):
             self.send_command()
         if self.chance(0.01, 0.03):
@@ -197,6 +216,26 @@ class Walk:
         self.oracle.pose = pose
         self.controller.set_pose(pose)
 
+    def send_ring(self) -> None:
+        """Send an obstacle ring of the phase, some of them late."""
+        rng, kind = self.rng, self.rings
+        ranges = [math.inf] * 360
+        if kind in ("ahead", "behind"):
+            middle = 180 if kind == "ahead" else 0
+            for k in range(middle - 5, middle + 6):
+                ranges[k] = rng.uniform(0.27, 0.6)
+        if kind == "unknown":
+            ranges[rng.randrange(200) : 300] = [math.nan] * 100
+        if kind == "random":
+            ranges = [rng.choice((math.inf, math.nan, rng.uniform(0.1, 3.0))) for _ in range(360)]
+        moving = (MovingPoint(rng.uniform(0.4, 2), rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-1, 1), 0.2),)
+        age_s = rng.uniform(0.0, 0.15) if self.chance(0.99, 0.9) else rng.uniform(-1, 2)
+        ring = ControllerRing(self.now_ns - round(age_s * 1e9), tuple(ranges[:360]),
+                              (rng.uniform(0, 2),) * 360, moving if kind == "person" else ())
+        if self.oracle.ring is None or ring.stamp_ns >= self.oracle.ring.stamp_ns:
+            self.oracle.ring = ring
+        self.controller.set_ring(ring)
+
     def send_command(self) -> None:
         rng = self.rng
         velocity_mps = rng.uniform(-3, 3) if self.chance(1.0, 0.95) else rng.choice((math.nan, math.inf))
@@ -226,7 +265,12 @@ class Walk:
             assert nearer(self.motion.velocity_mps, now.velocity_mps), (self.motion, now, state)
             assert nearer(self.motion.yaw_rate_radps, now.yaw_rate_radps), (self.motion, now, state)
         else:
-            self.expect_obeys(permitted.setpoint, now, state.reason, SLOW_SHARE if state.slowed_by else 1.0)
+            self.expect_obeys(permitted.setpoint, now, state.reason, SLOW_SHARE if state.slowed_by else 1.0,
+                              limited=bool(state.obstacle))
+        self.seen[state.obstacle] += bool(state.obstacle)
+        if abs(now.yaw_rate_radps) < TINY and abs(self.motion.yaw_rate_radps) < TINY and now != STOP:
+            assert not self.oracle.blocked(self.now_ns, now.velocity_mps > 0) or nearer(
+                self.motion.velocity_mps, now.velocity_mps), (self.motion, now, state, self.oracle.ring)
         if now != STOP and permitted:
             self.seen["driven"] += 1
             self.seen[f"driven by {permitted.source}"] += 1
@@ -255,21 +299,22 @@ class Walk:
         assert gained_mps <= LIMITS.acceleration_mps2 * dt_s + TINY
         assert abs(wrap_angle(goal_rad - self.reported_rad)) <= LEAD_RAD + TINY
 
-    def expect_obeys(self, setpoint: Setpoint, now: Twist, reason: str, share: float) -> None:
+    def expect_obeys(self, setpoint: Setpoint, now: Twist, reason: str, share: float, *, limited: bool) -> None:
         """Expect a motion on the way to the owner's setpoint, or to a stop where the controller is stricter.
 
-        share: of the limits, while it drives slowly.
+        share: of the limits, while it drives slowly. limited: by obstacles, at any speed down to a stop.
         """
         top_mps, top_radps = share * LIMITS.velocity_mps, share * LIMITS.yaw_rate_radps
         heading_rad = setpoint.heading_rad
         valid = math.isfinite(setpoint.velocity_mps) and (heading_rad is None or math.isfinite(heading_rad))
         wanted_mps = max(-top_mps, min(top_mps, setpoint.velocity_mps)) if valid else 0.0
         wanted_mps = 0.0 if reason else wanted_mps
-        low_mps, high_mps = sorted((self.motion.velocity_mps, wanted_mps))
+        stop = (0.0,) if limited else ()
+        low_mps, *_, high_mps = sorted((self.motion.velocity_mps, wanted_mps, *stop))
         assert low_mps - TINY <= now.velocity_mps <= high_mps + TINY, (self.motion, setpoint, now, reason)
         if heading_rad is None and valid and not reason:
             wanted_radps = max(-top_radps, min(top_radps, setpoint.yaw_rate_radps))
-            low_radps, high_radps = sorted((self.motion.yaw_rate_radps, wanted_radps))
+            low_radps, *_, high_radps = sorted((self.motion.yaw_rate_radps, wanted_radps, *stop))
             assert low_radps - TINY <= now.yaw_rate_radps <= high_radps + TINY, (self.motion, setpoint, now)
 
 
@@ -283,6 +328,7 @@ def walk(seed: int, mode: str, ticks: int) -> None:
     reasons = {rule.reason for rule in safety_rules.RULES} - {safety_rules.ENDS}
     if mode == AUTOMATIC:
         reasons -= {safety_rules.NOT_ARMED}
+    reasons |= {BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN}
     assert reasons <= set(seen), f"not met: {reasons - set(seen)}"
     assert seen["driven"] > 0.1 * ticks and seen["driven by planner"] > 0, seen
 

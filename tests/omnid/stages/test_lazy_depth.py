@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import numpy as np
 import pytest
 
@@ -45,6 +48,29 @@ def test_depth_is_computed_once_and_only_where_it_is_read() -> None:
     assert (depth.seq, depth.stamp_ns, depth.panoramas.seq) == (3, 5 * MS, 3) and counted.computed == []
     assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2) == 1 and depth.disparity.shape == (4, 100)
     assert counted.computed == [3]
+
+
+def test_two_threads_that_read_at_the_same_time_compute_the_depth_once() -> None:
+    counted, begun = Counted(), threading.Barrier(2, timeout=20)
+
+    def slow(panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
+        time.sleep(0.1)
+        return counted(panoramas, exposure)
+
+    panorama = wrapped(IMAGE)
+    depth = StereoDepth(Panoramas(3, 0, panorama, panorama, IMAGE > 0), slow)
+    found: list[DensePoints] = []
+
+    def read() -> None:
+        begun.wait()
+        found.append(depth.dense())
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for reader in readers:
+        reader.join(20)
+    assert counted.computed == [3] and found[0] is found[1]
 
 
 @pytest.mark.parametrize(("rate_hz", "speed_mps", "expected"), [

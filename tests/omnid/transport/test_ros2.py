@@ -35,6 +35,7 @@ HASHES = {  # as published by ROS 2's own type description service, first digits
 TOPICS = {
     "/omnid/cloud": "sensor_msgs/msg/PointCloud2", "/omnid/drive": "geometry_msgs/msg/TwistStamped",
     "/omnid/map": "nav_msgs/msg/OccupancyGrid",
+    "/omnid/moving": "sensor_msgs/msg/PointCloud2",
     "/omnid/scan": "sensor_msgs/msg/LaserScan",
     "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
     "/omnid/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",

@@ -113,9 +113,12 @@ def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
 def test_an_unknown_way_that_was_seen_to_be_free_is_driven_up_to_there() -> None:
     wall = with_unknown(-20, 20)
     assert after(wall, free=(2.0,) * 360) == (AHEAD, "")
-    settings = replace(SETTINGS, unknown="stop")
-    allowed, _ = after(wall, free=(1.0,) * 360, settings=settings)
-    assert allowed.velocity_mps == pytest.approx(0.6 / settings.time_s, rel=0.1)
+    for unknown in ("stop", "slow"):
+        settings = replace(SETTINGS, unknown=unknown)
+        allowed, _ = after(wall, free=(0.8,) * 360, settings=settings)
+        assert allowed.velocity_mps == pytest.approx(0.37 / settings.time_s, rel=0.1)
+        slowest = Twist() if unknown == "stop" else Twist(settings.slow_mps, 0.0)
+        assert after(wall, free=(0.4,) * 360, settings=settings) == (slowest, monitor_module.UNKNOWN)
 
 
 def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:

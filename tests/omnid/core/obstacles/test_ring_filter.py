@@ -103,3 +103,43 @@ def test_clear_forgets() -> None:
 def test_without_votes_the_first_pair_counts() -> None:
     ring = RingFilter(replace(SETTINGS, min_votes=1))
     np.testing.assert_allclose(ring.update(0, pose(), ring_of(2.0)).ranges_m[AHEAD], 2.0, atol=1e-5)
+
+
+def test_the_floor_that_was_seen_to_be_free_is_remembered_where_none_is_seen() -> None:
+    ring = RingFilter(SETTINGS)
+    floor = Observation(np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.nan, np.float32),
+                        np.full(SECTORS, 2.0, np.float32))
+    nothing = ring_of(np.nan)
+    ring.update(0, pose(), floor)
+    near = ring.update(S, pose(1.5), nothing)
+    np.testing.assert_allclose(near.free_m[AHEAD], 0.5, atol=0.1)
+    np.testing.assert_allclose(near.free_m[BEHIND][[0, -1]], 3.5, atol=0.1)
+    late = ring.update(S + round((SETTINGS.free_s + 1) * S), pose(1.5), nothing)
+    assert (late.free_m == 0).all()
+
+
+def test_a_floor_that_is_seen_now_says_more_than_the_memory() -> None:
+    ring = RingFilter(SETTINGS)
+    unknown = np.full(SECTORS, np.nan, np.float32)
+    ring.update(0, pose(), Observation(unknown, unknown, np.full(SECTORS, 3.0, np.float32)))
+    shorter = ring.update(S, pose(), Observation(unknown, unknown, np.full(SECTORS, 1.5, np.float32)))
+    np.testing.assert_allclose(shorter.free_m, 1.5)
+
+
+def test_a_long_drive_keeps_its_memory_of_the_free_floor_bounded_and_right() -> None:
+    ring = RingFilter(SETTINGS)
+    unknown = np.full(SECTORS, np.nan, np.float32)
+    floor, nothing = np.full(SECTORS, 2.0, np.float32), np.zeros(SECTORS, np.float32)
+    for i in range(200):  # 30 m, far beyond the square that is remembered
+        ring.update(i * S // 5, pose(0.15 * i, 3 * i), Observation(unknown, unknown, floor))
+    result = ring.update(40 * S, pose(0.15 * 199, 3 * 199), Observation(unknown, unknown, nothing))
+    assert (result.free_m > 1.8).all() and (result.free_m < 5).all()
+
+
+def test_a_direction_in_which_no_floor_was_ever_seen_is_not_free_by_its_neighbours() -> None:
+    ring = RingFilter(SETTINGS)
+    unknown = np.full(SECTORS, np.nan, np.float32)
+    floor = np.where(AHEAD, 0.0, 2.0).astype(np.float32)
+    for i in range(4):
+        result = ring.update(i * S // 5, pose(), Observation(unknown, unknown, floor))
+    assert result.free_m[175:185].max() <= 0.15
