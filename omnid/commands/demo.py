@@ -78,13 +78,13 @@ def _drive(args: argparse.Namespace) -> int:
     script = SquareTwice(lambda line: None if args.quiet else print(line, flush=True))
     run = simulate(world, make_robot(), script, seconds=DRIVE_S, seed=args.seed, config=config)
     first, second = both_paths(run, script.repeated_s)
-    picture = args.output / "drive.png"
-    if not cv2.imwrite(str(picture), draw(world, first, second)):
-        raise OmnidError(f"{picture}: cannot be written; name another folder by --output")
+    image = args.output / "drive.png"
+    if not cv2.imwrite(str(image), draw(world, first, second)):
+        raise OmnidError(f"{image}: cannot be written; name another folder by --output")
     end = script.end or f"not reached within {DRIVE_S:g} s"
     print(f"end: {end}; contacts with obstacles: {len(run.contacts)}; pose {100 * drift_m(run):.1f} cm off at the end")
     if len(second):
         most_cm = 100 * apart_m(first, second).max()
         print(f"the repeated path is at most {most_cm:.1f} cm off the first one, by the truth")
-    print(f"picture of both true paths: {picture}")
+    print(f"picture of both true paths: {image}")
     return 0 if script.end == "reached" else 1

@@ -85,11 +85,11 @@ def apart_m(first: Array, second: Array) -> Array:
 
 
 def draw(world: World, first: Array, second: Array) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3): what stands in the world, the first path in black and the second one in red."""
+    """Return a image (H, W, 3): what stands in the world, the first path in black and the second one in red."""
     segments = footprints(world.standing, 1.2)
     low, high = segments.reshape(-1, 2).min(axis=0), segments.reshape(-1, 2).max(axis=0)
     width, height = (int(side) for side in np.ceil((high - low) * PX_PER_M) + 2 * MARGIN_PX)
-    picture = np.full((height, width, 3), _WHITE, np.uint8)
+    image = np.full((height, width, 3), _WHITE, np.uint8)
 
     def pixels(points: Array) -> NDArray[np.int32]:
         across = (points[:, 0] - low[0]) * PX_PER_M + MARGIN_PX
@@ -97,11 +97,11 @@ def draw(world: World, first: Array, second: Array) -> NDArray[np.uint8]:
         return np.asarray(np.rint(np.column_stack([across, down])), np.int32)
 
     for segment in segments:
-        cv2.polylines(picture, [pixels(segment)], False, _GREY, 3, cv2.LINE_AA)
+        cv2.polylines(image, [pixels(segment)], False, _GREY, 3, cv2.LINE_AA)
     for path, color, thickness in ((first, _BLACK, 4), (second, _RED, 2)):
         if len(path):
-            cv2.polylines(picture, [pixels(path)], False, color, thickness, cv2.LINE_AA)
-    return picture
+            cv2.polylines(image, [pixels(path)], False, color, thickness, cv2.LINE_AA)
+    return image
 
 
 def drift_m(run: SimulatedRun) -> float:

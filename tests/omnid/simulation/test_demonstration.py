@@ -1,4 +1,4 @@
-"""`omnid demo --drive`: the requests of its script, and its picture."""
+"""`omnid demo --drive`: the requests of its script, and its image."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_the_square_is_driven_by_goals_and_again_along_its_path() -> None:
     assert end == "end" and script.end == "reached" and script.repeated_s == 41.0 and len(lines) == 5
 
 
-def test_a_drive_that_fails_is_told() -> None:
+def test_a_drive_that_fails_is_reported() -> None:
     script = SquareTwice(lambda line: None)
     list(script(moment(1.0, (0.0, 0.0), NavigationState.REACHED)))
     assert list(script(moment(9.0, (0.5, 0.0), NavigationState.FAILED))) == ["end"]
@@ -54,8 +54,8 @@ def test_a_drive_that_fails_is_told() -> None:
 def test_both_paths_are_drawn() -> None:
     first = np.array([[-1.0, -1.0], [0.0, -1.0], [0.0, 0.0]])
     aside = np.array([0.0, 0.5])
-    picture = draw(load_world("room", 1), first, first + aside)
-    assert picture.shape[0] < picture.shape[1] and picture.dtype == np.uint8
-    red = (picture[..., 2].astype(int) - picture[..., 0] > 100).sum()
-    assert red > 200 and (picture.max(axis=2) < 40).sum() > 300
+    image = draw(load_world("room", 1), first, first + aside)
+    assert image.shape[0] < image.shape[1] and image.dtype == np.uint8
+    red = (image[..., 2].astype(int) - image[..., 0] > 100).sum()
+    assert red > 200 and (image.max(axis=2) < 40).sum() > 300
     assert apart_m(first, first + aside).max() == pytest.approx(0.5)
