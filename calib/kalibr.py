@@ -175,7 +175,7 @@ def _camera_text(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     if not isinstance(camera, UnifiedCamera):
         raise CalibError("export: Kalibr's camchain.yaml holds omni cameras, "
-                         f"found one of the model {model_name(camera)}; an ocam camera: --format ocam")
+                         f"found one of the model {model_name(camera)}; use --format ocam for an ocam camera")
     has_distortion = any(camera.distortion)
     return (f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
             f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"

@@ -170,7 +170,8 @@ class LiveRun:
                               has_delay=config.camera.upper_delay_ms == 0)))
         if refinement is not None:
             poses["refine"] = refinement
-        if controller and config.obstacles.enabled and floor_is_assumed(geometry, config.obstacles):
+        looks_ahead = config.obstacles.enabled and config.controller.collision.check
+        if controller and looks_ahead and floor_is_assumed(geometry, config.obstacles):
             session.warn(f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
                          f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
         requests = RequestQueue()

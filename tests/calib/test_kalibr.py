@@ -61,7 +61,7 @@ def test_rig_round_trip_is_exact(omni_rig: Rig) -> None:
 
 
 def test_refuses_to_export_an_ocam_rig(ocam_rig: Rig) -> None:
-    with pytest.raises(CalibError, match="model ocam; an ocam camera: --format ocam"):
+    with pytest.raises(CalibError, match="model ocam; use --format ocam for an ocam camera"):
         export_kalibr(ocam_rig)
 
 
