@@ -37,6 +37,9 @@ CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # of the cameras' motion in a step, beside th
 STILL_M, STILL_RAD = 1e-4, 5e-5  # of a base that stands
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03  # m/s and rad/s below which they read nothing, beside a bias
 STILL_BEFORE_S = 0.2  # for which they must have stood before the step, so that none swings on
+# The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
+# mean of the squared differences by their expected values. Ratios beyond the limit do not count: slip is no noise.
+NOISE_GAIN, RATIO_LIMIT = 0.02, 16.0
 OUTLIER_SIGMA = 5.0  # by which a step of a sensor differs from the cameras' when it slips or is wrong
 MOST_OUTLIERS = 40  # consecutive ones, after which the sensor counts as not calibrated
 SANE_SCALE = (0.5, 2.0)  # of wheels: beyond it their settings are wrong
@@ -61,6 +64,7 @@ class MotionSensors:
         self._outliers = {WheelSample: 0, GyroSample: 0}
         self.slips = self.refused = self.steps = 0
         self.is_slipping = False
+        self._noise_factors = {DISTANCE: 1.0, TURN: 1.0}
 
     @property
     def values(self) -> Array:
@@ -112,11 +116,12 @@ class MotionSensors:
         if wheels is not None:
             distance, turn = wheels[0]
             twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
-            sigma[:5] = (math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
+            rough = math.sqrt(self._noise_factors[DISTANCE])
+            sigma[:5] = (rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
                          math.hypot(SIDE_SHARE * distance, SIDE_M), HEIGHT_M, TILT_RAD, TILT_RAD)
             if math.isfinite(turn):
                 twist[5], slopes[5, TURN] = self.values[TURN] * turn, turn
-                sigma[5] = math.hypot(TURN_SHARE * turn, WHEEL_RAD)
+                sigma[5] = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
         if gyro is not None:
             twist[3:] = gyro[0] - self.values[BIAS] * dt_s
             sigma[3:] = GYRO_RADPS_SQRT_S * math.sqrt(dt_s)
@@ -131,7 +136,8 @@ class MotionSensors:
         H = np.zeros(len(START))
         H[TURN], H[BIAS.stop - 1] = turn, dt_s
         difference = self.values[TURN] * turn - (gyro[2] - self.values[BIAS][2] * dt_s)
-        variance = (TURN_SHARE * turn) ** 2 + WHEEL_RAD**2 + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
+        of_wheels = self._noise_factors[TURN] * ((TURN_SHARE * turn) ** 2 + WHEEL_RAD**2)
+        variance = of_wheels + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
         # The offsets of both clocks are not known exactly either: a turn begins in one before it does in the other.
         variance += (self.sigmas[WHEEL_OFFSET] ** 2 + self.sigmas[GYRO_OFFSET] ** 2) * (gyro[2] / dt_s) ** 2
         return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
@@ -168,11 +174,18 @@ class MotionSensors:
                 continue
             H = np.zeros(len(START))
             H[state], H[WHEEL_OFFSET] = amount, -self.values[state] * change
-            noise = noise + (share * amount) ** 2 + least**2
-            agree &= self._update(truth - self.values[state] * amount, H, noise)
+            error = truth - self.values[state] * amount
+            of_wheels = self._noise_factors[state] * ((share * amount) ** 2 + least**2)
+            self._follow_noise(state, error**2 / (float(H @ self._filter.P @ H) + noise + of_wheels))
+            agree &= self._update(error, H, noise + of_wheels)
         self.is_slipping = not agree
         self.slips += not agree
         self._count(WheelSample, agree, np.array([DISTANCE, TURN, WHEEL_OFFSET]))
+
+    def _follow_noise(self, state: int, ratio: float) -> None:
+        """Follow the noise of distance or turn by the square of a difference, divided by its expected value."""
+        if ratio < RATIO_LIMIT:
+            self._noise_factors[state] = max(1.0, self._noise_factors[state] * (1.0 + NOISE_GAIN * (ratio - 1.0)))
 
     def _learn_gyro(self, gyro: tuple[Array, Array], seen: Array, variance: Array, dt_s: float) -> None:
         """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,)."""

@@ -203,3 +203,20 @@ def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
         sensed = sensors.between(*stamps(1.5))
         assert sensed is not None and np.isfinite(sensed.twist).all() and np.isfinite(sensed.covariance).all()
         assert sensed.is_complete == gyro
+
+
+def test_rough_wheels_do_not_count_as_slipping() -> None:
+    """Ten times the noise of the other tests: after some seconds it is known, and the covariance says so."""
+    calm, _ = driven(SensorErrors(), 20)
+    rough, end_s = driven(SensorErrors(noise=10.0), 20, wheels=True)
+    before = rough.slips
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        end_s += PAIR_S
+        rough.add(samples(SensorErrors(noise=10.0), end_s - PAIR_S, end_s, rng))
+        T = T_RECT_BASE @ step(end_s - PAIR_S, end_s) @ se3.inverse(T_RECT_BASE)
+        rough.observe(T, CAMERA_COVARIANCE, *stamps(end_s))
+    assert rough.slips - before <= 2
+    sensed, quiet = rough.between(*stamps(end_s)), calm.between(*stamps(19.9))
+    assert sensed is not None and quiet is not None
+    assert np.trace(sensed.noise[:3, :3]) > 2.5 * np.trace(quiet.noise[:3, :3])
