@@ -41,6 +41,7 @@ STILL_BEFORE_S = 0.2  # for which they must have stood before the step, so that 
 # mean of the squared differences by their expected values. Ratios beyond the limit do not count: slip is no noise.
 NOISE_GAIN, RATIO_LIMIT = 0.02, 16.0
 OUTLIER_SIGMA = 5.0  # by which a step of a sensor differs from the cameras' when it slips or is wrong
+SLIPPING = 2  # consecutive ones of wheels: a single one may be a bump
 MOST_OUTLIERS = 40  # consecutive ones, after which the sensor counts as not calibrated
 SANE_SCALE = (0.5, 2.0)  # of wheels: beyond it their settings are wrong
 UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2  # sigma of what no sensor measures in a step
@@ -64,6 +65,7 @@ class MotionSensors:
         self._outliers = {WheelSample: 0, GyroSample: 0}
         self.slips = self.refused = self.steps = 0
         self.is_slipping = False
+        self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
         self._noise_factors = {DISTANCE: 1.0, TURN: 1.0}
 
     @property
@@ -109,7 +111,9 @@ class MotionSensors:
             return None
         if wheels is not None and self._stands(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
-        if wheels is not None and gyro is not None and self._disagree(wheels[0], gyro[0], dt_s):
+        disagree = wheels is not None and gyro is not None and self._disagree(wheels[0], gyro[0], dt_s)
+        self._disagreements = self._disagreements + 1 if disagree else 0
+        if self._disagreements >= SLIPPING:
             wheels = None
             self.slips += 1
         twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
@@ -178,9 +182,9 @@ class MotionSensors:
             of_wheels = self._noise_factors[state] * ((share * amount) ** 2 + least**2)
             self._follow_noise(state, error**2 / (float(H @ self._filter.P @ H) + noise + of_wheels))
             agree &= self._update(error, H, noise + of_wheels)
-        self.is_slipping = not agree
         self.slips += not agree
         self._count(WheelSample, agree, np.array([DISTANCE, TURN, WHEEL_OFFSET]))
+        self.is_slipping = self._outliers[WheelSample] >= SLIPPING
 
     def _follow_noise(self, state: int, ratio: float) -> None:
         """Follow the noise of distance or turn by the square of a difference, divided by its expected value."""
