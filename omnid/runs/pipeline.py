@@ -72,7 +72,7 @@ class RequestSource(Protocol):
 class NavigationParts(NamedTuple):
     """The surroundings of the navigation of a run with wheels."""
 
-    requests: RequestSource | None  # None: its caller gives requests to the stage
+    requests: RequestSource
     wheels: Callable[[], WheelState]
     drive: Sink[NavigationUpdate]
     routes: RouteStore
@@ -92,7 +92,6 @@ class WiredStages(NamedTuple):
     odometry: OdometryStage
     mapping: Mapping | None
     places: Places | None
-    navigation: NavigationStage | None  # that of a run in lock-step is given its requests directly
 
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
@@ -131,14 +130,12 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         outgoing["bus-scan"] = rings
         for name, ring_sink in sinks.rings.items():
             graph.sink(name, ring_sink, rings)
-    navigation: NavigationStage | None = None
     if sinks.navigation:
         others = [outgoing[name] for name in ("bus-places", "bus-scan") if name in outgoing]
-        inputs: tuple[Stream[Any], ...] = (odometry, *others)
+        requests = sinks.navigation.requests
+        inputs: tuple[Stream[Any], ...] = (
+            odometry, *others, graph.source("requests", requests.batches, wake=requests.end))
         navigation = _navigation(geometry, config, sinks.navigation, places)
-        if sinks.navigation.requests is not None:
-            requests = sinks.navigation.requests
-            inputs = (*inputs, graph.source("requests", requests.batches, wake=requests.end))
         updates: Stream[NavigationUpdate] = graph.stage("navigation", navigation, *inputs)
         graph.sink("planner", sinks.navigation.drive, updates, policy=NEWEST, depth=1)
         outgoing["bus-navigation"] = updates
@@ -149,7 +146,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(rig_gate, odometry_stage, mapping, places, navigation)
+    return WiredStages(rig_gate, odometry_stage, mapping, places)
 
 
 def _navigation(geometry: Geometry, config: Config, parts: NavigationParts, places: Places | None) -> NavigationStage:

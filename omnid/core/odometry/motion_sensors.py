@@ -100,7 +100,8 @@ class MotionSensors:
     def between(self, start_ns: int, end_ns: int) -> SensedMotion | None:
         """Return the motion between two stamps, None where the sensors do not cover it.
 
-        Wheels that slipped in the last step that the cameras saw are left out.
+        Wheels that slipped in the last two steps that the cameras saw are left out, and so are those whose turn differs
+        from that of the gyro twice in a row.
         """
         start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
         dt_s = end_s - start_s
