@@ -86,7 +86,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.control": "omnid.errors omnid.settings omnid.tracking_state",
     "omnid.core.mapping": "omnid.errors",
     "omnid.core.navigation":
-        "omnid.core.control omnid.core.places omnid.errors omnid.navigation_state omnid.settings omnid.tracking_state",
+        "omnid.core.control omnid.core.obstacles omnid.core.places omnid.errors omnid.navigation_state "
+        "omnid.settings omnid.tracking_state",
     "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
     "omnid.core.odometry":
         "calib.panorama calib.se3 drivers.motion omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",

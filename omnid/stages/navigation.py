@@ -13,6 +13,7 @@ from calib import se3
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
+from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.local_planner import room_ahead
 from omnid.core.navigation.navigator import Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
@@ -92,7 +93,7 @@ class NavigationStage:
         nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._half_width_m
         self._now = now = Situation(
             odometry.stamp_ns, pose, speed_mps, float(velocity[5]), odometry.state, odometry.reset_counter,
-            self._wheels(), self._in_map, obstacles, nearest_m)
+            self._wheels(), self._in_map, obstacles, self._moving(odometry.stamp_ns), nearest_m)
         ended = self._routes.record(now, self._tie)
         if ended:
             self._refuse(ended)
@@ -108,6 +109,12 @@ class NavigationStage:
         points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions),
                                   np.zeros(len(ranges_m))])
         return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
+
+    def _moving(self, stamp_ns: int) -> Forecast | None:
+        """Return where moving obstacles will be, from a time on; None without any."""
+        ring = self._ring
+        age_s = -1.0 if ring is None else (stamp_ns - ring.stamp_ns) * 1e-9
+        return forecast(ring.moving, age_s) if ring is not None and 0 <= age_s <= RING_NS * 1e-9 else None
 
     def _place(self, update: PlaceUpdate) -> None:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)

@@ -3,7 +3,8 @@
 Fox, Burgard, Thrun, "The dynamic window approach to collision avoidance", IEEE RAM 1997; Brock, Khatib, "High-speed
 navigation using the global dynamic window approach", ICRA 1999: arcs that keep clear of all obstacles are judged by the
 distance that is left at their end, by a wave front (NF1) from a free point of the path behind the obstacle. So there
-are no local minima within the grid.
+are no local minima within the grid. What moves is judged at its predicted places: the base lets it pass by driving more
+slowly along the path, and arcs keep clear of it at each moment (`forecast.py`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.forecast import Forecast, Pace, yielding
 from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
@@ -47,12 +49,16 @@ MARGIN_M: Final = 0.02  # beside the room that the collision monitor demands
 FAR_M: Final = 1e3  # way left where no way leads to the path
 BEHIND_SHARE: Final = -0.17  # cosine of the direction beyond which an obstacle is behind
 
+STANDS: Final = "something stands on the path"
+CROSSES: Final = "somebody or something crosses the path"
+
 
 class Detour(NamedTuple):
     """Answer of the planner."""
 
     setpoint: Setpoint | None  # None: there is no way
     avoiding: bool
+    reason: str = ""  # why it does not follow the path at the speed that was wanted
 
 
 class LocalPlanner:
@@ -65,6 +71,9 @@ class LocalPlanner:
         self._ahead = collision.front_m + collision.stop_m, collision.rear_m  # m, of the base that drives on
         self._behind = collision.front_m, collision.rear_m + collision.stop_m
         self._turning = collision.front_m, collision.rear_m
+        # Around the origin, while it moves and while it stands, of what moves, too.
+        self._moving_room_m = max(self._half_m + settings.clearance_m, collision.front_m + collision.stop_m)
+        self._standing_room_m = max(self._half_m, collision.front_m, collision.rear_m)
         self._width_m = collision.half_width_m
         self._front_m = collision.front_m
         self._avoiding = False
@@ -83,13 +92,31 @@ class LocalPlanner:
         """Forget the detour of the last drive."""
         self._avoiding = False
 
-    def plan(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float = math.inf
-             ) -> Detour:
+    def plan(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, *, leg_left_m: float = math.inf,
+             moving: Forecast | None = None, speed_mps: float = 0.0) -> Detour:
         """Return the motion: that of the path where it is free.
 
-        pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2). wanted: the
-        motion on the path. leg_left_m: way to the next corner: what stands behind it does not matter yet.
+        pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2), with those of
+        `moving` among them. wanted: the motion on the path. leg_left_m: way to the next corner: what stands behind it
+        does not matter yet. speed_mps: of the base, as measured.
         """
+        if moving is None or not (self._avoiding or wanted.velocity_mps > 0):
+            return self._around_standing(pose, path, obstacles, wanted, leg_left_m, None)
+        pursuit = self._settings.pursuit
+        pace = Pace(max(speed_mps, 0.0), pursuit.velocity_mps, pursuit.acceleration_mps2, self._moving_room_m,
+                    self._standing_room_m)
+        share, coming = yielding(path, leg_left_m, moving, pace)
+        # The base goes around those that come to where it would stand.
+        outlines = moving.outlines(coming, pose[:2], SHARE * pursuit.velocity_mps)
+        obstacles = np.vstack([moving.others(obstacles), outlines])
+        detour = self._around_standing(pose, path, obstacles, wanted, leg_left_m, moving)
+        if share == 1.0 or detour.avoiding or detour.setpoint is None:
+            return detour
+        return Detour(_slower(detour.setpoint, share * pursuit.velocity_mps) if share else None, False, CROSSES)
+
+    def _around_standing(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float,
+                         moving: Forecast | None) -> Detour:
+        """Return the motion along the path, or around what stands on it, or up to it."""
         settings = self._settings
         offset_m = float(np.hypot(*(path[0] - pose[:2])))
         if not len(obstacles) or not (self._avoiding or wanted.velocity_mps > 0):
@@ -108,19 +135,18 @@ class LocalPlanner:
         # 2. A free point of the path behind the obstacle, and the distances to it within the corridor.
         goal = _rejoin(ways, is_blocked, first_m if first_m < math.inf else 0.0)
         if goal is not None and settings.corridor_m > 0:
-            motion = self._around(pose, path, obstacles, path[goal])
+            motion = self._around(pose, path, obstacles, path[goal], moving)
             if motion is not None:
                 self._avoiding = True
                 return Detour(motion, True)
         # 3. No way: up to the obstacle, and wait.
         left_m = first_m - self._front_m - BEFORE_M
         if self._avoiding or left_m <= 0:
-            return Detour(None, self._avoiding)
-        speed_mps = min(wanted.velocity_mps, math.sqrt(2 * WAIT_MPS2 * left_m))
-        slower = speed_mps / wanted.velocity_mps
-        return Detour(Setpoint(speed_mps, wanted.heading_rad, wanted.yaw_rate_radps * slower), False)
+            return Detour(None, self._avoiding, STANDS)
+        return Detour(_slower(wanted, math.sqrt(2 * WAIT_MPS2 * left_m)), False)
 
-    def _around(self, pose: Array, path: Array, obstacles: Array, goal: Array) -> Setpoint | None:
+    def _around(self, pose: Array, path: Array, obstacles: Array, goal: Array, moving: Forecast | None
+                ) -> Setpoint | None:
         """Return the best arc; None without one."""
         settings = self._settings
         corner = pose[:2] - HALF_CELLS * CELL_M
@@ -142,6 +168,8 @@ class LocalPlanner:
         rows, columns = cells[:, -1, 1], cells[:, -1, 0]
         way_m = left_m[rows, columns]
         is_open = self._keeps_clear(pose, obstacles) & (way_m < FAR_M) & is_free[rows, columns]
+        if moving is not None:
+            is_open &= self._lets_pass(places, moving)
         # The heading at the end against the way down the distances.
         down = _descent(left_m, rows, columns)
         off = np.abs(np.remainder(pose[2] + self._turned[:, -1] - down + np.pi, 2 * np.pi) - np.pi)
@@ -171,6 +199,14 @@ class LocalPlanner:
         return np.asarray(~hits.any(axis=1))
 
 
+    def _lets_pass(self, places: Array, moving: Forecast) -> NDArray[np.bool_]:
+        """Return which arcs, with their places (A, T, 2), meet none of what moves, or lead away from it."""
+        others, radii = moving.at(np.linspace(0.0, ARC_S, ARC_STEPS + 1))
+        gap_m = np.linalg.norm(others[:, None] - places, axis=-1) - radii[:, None] - self._standing_room_m
+        least_m = np.minimum(0.0, gap_m[..., :1]) - NEARER_M
+        return np.asarray((gap_m >= least_m).all(axis=(0, 2)))
+
+
 def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
     """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind, as the base drives."""
     if not len(obstacles):
@@ -180,6 +216,14 @@ def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
     distance = np.hypot(dx, dy)
     forward = sign * (math.cos(pose[2]) * dx + math.sin(pose[2]) * dy)
     return float(distance[forward > BEHIND_SHARE * distance].min(initial=math.inf))
+
+
+def _slower(wanted: Setpoint, speed_mps: float) -> Setpoint:
+    """Return the motion on the same arc, at most so fast."""
+    if wanted.velocity_mps <= speed_mps:
+        return wanted
+    share = speed_mps / wanted.velocity_mps
+    return Setpoint(speed_mps, wanted.heading_rad, wanted.yaw_rate_radps * share)
 
 
 def _distances(points: Array, obstacles: Array) -> Array:

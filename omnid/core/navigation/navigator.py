@@ -141,7 +141,7 @@ class Navigator:
         # 4. Obstacles.
         plan = self._around_obstacles(drive, now, setpoint)
         if plan.setpoint is None:
-            return self._wait(drive, NavigationState.BLOCKED, "something stands on the path", dt_s)._replace(
+            return self._wait(drive, NavigationState.BLOCKED, plan.reason, dt_s)._replace(
                 left_m=following.left_m, offset_m=following.offset_m)
         if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
             held = self._wait(drive, NavigationState.BLOCKED, now.wheels.held_by, dt_s)
@@ -152,7 +152,7 @@ class Navigator:
             return self._failed(f"no progress for {self._settings.stuck_s:g} s"
                                 f"{': ' + now.wheels.reason if _holds(now) else ''}: look at the robot")
         self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
-        self.reason = now.wheels.reason if _holds(now) else ""
+        self.reason = now.wheels.reason if _holds(now) else plan.reason
         drive.waits.clear()
         return Navigation(plan.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
@@ -219,7 +219,8 @@ class Navigator:
         T_odom_frame = relative(now.T_frame_odom(drive.frame), np.zeros(3))
         ahead = drive.follower.path_ahead(PLANNED_M)
         path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
-        detour = self._planner.plan(now.pose, path[:, :2], now.obstacles, setpoint, drive.follower.leg_left_m)
+        detour = self._planner.plan(now.pose, path[:, :2], now.obstacles, setpoint, moving=now.moving,
+                                    leg_left_m=drive.follower.leg_left_m, speed_mps=now.speed_mps)
         if detour.avoiding:
             drive.follower.skip_corner(now.pose_in(drive.frame))
         return detour

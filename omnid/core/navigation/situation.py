@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.places.planar import composed
 from omnid.tracking_state import MapState, TrackingState
@@ -46,6 +47,7 @@ class Situation(NamedTuple):
     wheels: WheelState
     in_map: MapPosition | None = None  # None: nothing is known yet
     obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
+    moving: Forecast | None = None  # those of them that move
     obstacle_m: float = math.inf  # from the outline of the base to the nearest one that is not behind it
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:

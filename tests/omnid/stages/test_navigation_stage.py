@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.navigation.local_planner import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
@@ -26,6 +27,7 @@ from omnid.core.navigation.requests import Request as NavigationRequest
 from omnid.core.navigation.route import KeyframePose
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
+from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.places.planar import planar, transform
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
@@ -187,6 +189,19 @@ def test_a_ring_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
         for _ in range(8):
             robot.pass_on()
         assert robot.updates[-1].state is expected
+
+
+def test_somebody_who_crosses_is_let_pass(tmp_path: Path) -> None:
+    walker = MovingObstacle(1.6, 2.0, 0.0, -0.6, np.eye(4) * 1e-4, 0.2)
+    for moving, reason in (((walker,), CROSSES), ((), "")):
+        robot = Robot(tmp_path)
+        robot.pass_on()
+        robot.send(GoalRequest(ODOM, 4.0, 0.0))
+        ranges = np.full(360, np.inf, np.float32)
+        robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS, ranges, ranges, ranges, np.eye(4), moving))
+        for _ in range(8):
+            robot.pass_on()
+        assert robot.updates[-1].reason == reason
 
 
 def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:

@@ -1,0 +1,161 @@
+"""People in the way in a closed loop: tracked by the real tracker, they are let pass, or the base goes around them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.navigation.forecast import Forecast, Pace, forecast, yielding
+from omnid.core.navigation.navigator import Navigator
+from omnid.core.navigation.path import DrivePath, straight_leg
+from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.situation import Situation
+from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.places.planar import relative
+from omnid.navigation_state import NavigationState
+from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
+
+Array = NDArray[np.float64]
+RADIUS_M = 0.2
+CORRIDOR = Boxes((-2.0, 2.2, 9.0, 2.4), (-2.0, -2.4, 9.0, -2.2), (8.0, -3.0, 8.2, 3.0))
+RING_S = 0.2
+
+
+class BaseAmongPeople(BaseAmongBoxes):
+    """A base whose ring shows a person who walks straight on from a time; the person does not look at the robot."""
+
+    boxes = CORRIDOR
+
+    def __init__(self, seed: int, start: tuple[float, float], velocity: tuple[float, float], begins_s: float) -> None:
+        self.person, self.walk, self.begins_s = np.array(start), np.array(velocity), begins_s
+        self.tracker, self.ring_s, self.moving = MovingTracker(), -math.inf, ()
+        self.gap_m, self.contact_mps = math.inf, 0.0  # to the person; forward speed just before a contact ahead
+        super().__init__(Navigator(SETTINGS), seed)
+        path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
+        self.navigator.start("goal", NavigationFrame.ODOM, [path], self.seen())
+
+    def where(self) -> Array:
+        """Return the place of the person now."""
+        return np.asarray(self.person + self.walk * max(0.0, self.t_s - self.begins_s))
+
+    def tick(self):  # type: ignore[no-untyped-def]
+        answer = super().tick()
+        x, y = relative(self.pose, np.array([*self.where(), 0.0]))[:2]
+        beside = max(abs(x) - OUTLINE.front_m, 0.0), max(abs(y) - OUTLINE.half_width_m, 0.0)
+        gap_m = math.hypot(*beside) - RADIUS_M
+        if 0.0 <= gap_m < 0.05 and x > 0:
+            self.contact_mps = max(self.contact_mps, self.v)
+        self.gap_m = min(self.gap_m, gap_m)
+        return answer
+
+    def seen(self) -> Situation:
+        now = super().seen()
+        directions = np.column_stack([np.cos(AZIMUTHS + self.pose[2]), np.sin(AZIMUTHS + self.pose[2])])
+        to = self.where() - self.pose[:2]
+        along = directions @ to
+        left2 = RADIUS_M**2 - (to @ to - along**2)
+        person = np.where((left2 > 0) & (along > 0), along - np.sqrt(np.maximum(left2, 0)), math.inf)
+        walls = self.boxes.ring(self.pose)
+        ranges = np.minimum(walls, person) + self.rng.normal(0, 0.01, 360)
+        if self.t_s - self.ring_s >= RING_S - 1e-6:
+            self.ring_s = self.t_s
+            T = se3.transform(se3.rotation_exp([0, 0, self.pose[2]]), [*self.pose[:2], 0.0])
+            self.moving = self.tracker.update(now.stamp_ns, T, ranges.astype(np.float32),
+                                              np.full(360, 0.01, np.float32))
+            points = tuple(MovingPoint(*relative(self.pose, np.array([m.x_m, m.y_m, 0.0]))[:2].tolist(),
+                                       *(T[:2, :2].T @ (m.vx_mps, m.vy_mps)).tolist(), m.radius_m)
+                           for m in self.moving)
+            self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
+        seen = np.isfinite(ranges)
+        obstacles = self.pose[:2] + ranges[seen, None] * directions[seen]
+        return now._replace(obstacles=obstacles, moving=forecast(self.moving, self.t_s - self.ring_s))
+
+    def slowest_mps(self, first_m: float, last_m: float) -> float:
+        """Return the least speed between two places on the way."""
+        return min(sample.speed_mps for sample in self.samples if first_m < sample.pose[0] < last_m)
+
+
+def test_a_person_who_crosses_is_let_pass_without_contact() -> None:
+    for seed, side in ((1, 1), (2, -1)):
+        base = BaseAmongPeople(seed, (2.6, side * 1.9), (0.0, -side * 0.8), 2.6)
+        assert base.run(60).state is NavigationState.REACHED
+        assert base.gap_m > 0.1, seed
+        assert not any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
+        assert max(abs(float(sample.pose[1])) for sample in base.samples) < 0.1, "it stays on its path"
+        assert base.t_s < 30.0
+
+
+@pytest.mark.parametrize(("at_m", "begins_s"), [(4.6, 0.5), (3.4, 2.6), (3.4, 3.8), (1.2, 5.0)])
+def test_nothing_changes_where_the_person_has_passed_before_or_comes_after(at_m: float, begins_s: float) -> None:
+    base = BaseAmongPeople(4, (at_m, 1.9), (0.0, -0.9), begins_s)
+    assert base.run(60).state is NavigationState.REACHED
+    assert base.gap_m > 0.3
+    assert base.slowest_mps(1.0, 4.0) > 0.35
+    assert {sample.navigation.reason for sample in base.samples} == {""}
+
+
+@pytest.mark.parametrize(("seed", "aside_m"), [(5, 0.3), (6, -0.2)])
+def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float) -> None:
+    base = BaseAmongPeople(seed, (7.0, aside_m), (-0.4, 0.0), 1.0)
+    assert base.run(60).state is NavigationState.REACHED
+    assert base.gap_m > 0.1
+    states = [sample.navigation.state for sample in base.samples]
+    assert NavigationState.AVOIDING in states and NavigationState.BLOCKED not in states
+
+
+def test_stands_when_a_person_walks_into_it() -> None:
+    base = BaseAmongPeople(5, (7.0, 0.0), (-0.7, 0.0), 1.0)
+    assert base.run(60).state is NavigationState.REACHED
+    assert base.gap_m < 0 and base.contact_mps < 0.02
+
+
+def test_follows_a_person_who_walks_ahead_more_slowly() -> None:
+    base = BaseAmongPeople(6, (1.3, 0.0), (0.25, 0.0), 0.0)
+    assert base.run(60).state is NavigationState.REACHED
+    assert base.gap_m > 0.1
+
+
+def at(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Forecast:
+    found = forecast([MovingObstacle(x_m, y_m, vx_mps, vy_mps, np.diag([1e-4] * 4), 0.2)], 0.0)
+    assert found is not None
+    return found
+
+
+def test_the_share_of_the_speed_by_hand() -> None:
+    path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
+    pace = Pace(0.4, 0.4, 0.3, 0.4, 0.26)
+
+    def judged(length_m: float, moving: Forecast) -> tuple[float, bool]:
+        share, coming = yielding(path, length_m, moving, pace)
+        return share, bool(coming[0])
+
+    assert judged(4.0, at(3.0, 2.0, 0.0, 0.0)) == (1.0, False)
+    # In 2.5 s the base is at 1 m, and the person, from 2 m aside at 0.8 m/s, there as well.
+    share, coming = judged(4.0, at(1.0, 2.0, 0.0, -0.8))
+    assert 0.0 <= share < 1.0 and not coming
+    assert judged(0.2, at(1.0, 2.0, 0.0, -0.8)) == (1.0, False), "it turns at a corner before"
+    assert judged(4.0, at(1.5, 0.0, -0.5, 0.0)) == (1.0, True), "it comes to where the base would wait"
+    assert judged(4.0, at(-0.8, 0.0, 0.8, 0.0)) == (1.0, False), "it comes from behind"
+    share, coming = judged(4.0, at(0.8, 0.0, 0.2, 0.0))
+    assert share == 0.5 and not coming, "it walks ahead, more slowly"
+
+
+def test_points_of_moving_obstacles_are_left_out() -> None:
+    points = np.array([(1.0, 0.1), (1.0, 0.5), (1.0, -0.4), (3.0, 0.0)])
+    others = at(1.0, 0.0, 0.0, -1.0).others(points)
+    np.testing.assert_array_equal(others, points[[3]])
+    np.testing.assert_array_equal(at(1.0, 0.0, 0.0, 0.0).others(points), points[[1, 3]])
+
+
+def test_a_forecast_goes_on_from_the_age_of_the_ring() -> None:
+    one = MovingObstacle(1.0, 0.0, 0.5, 0.0, np.diag([0.01, 0.01, 0.04, 0.04]), 0.2)
+    places, radii = forecast([one], 0.4).at(np.array([0.0, 1.0]))  # type: ignore[union-attr]
+    np.testing.assert_allclose(places[0], [(1.2, 0.0), (1.7, 0.0)])
+    np.testing.assert_allclose(radii[0], 0.2 + np.minimum(np.sqrt([0.01 + 0.04 * 0.16, 0.01 + 0.04 * 1.96]), 0.15))
+    assert forecast([], 0.1) is None
