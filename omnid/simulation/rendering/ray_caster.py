@@ -47,9 +47,10 @@ def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supers
     order = np.argsort(distance_m, kind="stable")
     atlas = cached_atlas([r.texture for r in scene.rectangles])
     image = np.zeros(table.shape[0] * table.shape[1], np.float32)
-    cast(table.rays, table.origins, table.spacing, table.index, table.starts, np.ascontiguousarray(poses[:, :3]),
-         np.ascontiguousarray(seen[:, order]), _surfaces([scene.rectangles[i] for i in order]),
-         distance_m[order] - reach_m, atlas.pyramids[order], atlas.levels, atlas.texels, image)
+    cast(table.rays, table.origins, table.spacing, table.index, table.starts,
+         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]), np.ascontiguousarray(seen[:, order]),
+         _surfaces([scene.rectangles[i] for i in order], poses[0]), atlas.pyramids[order], atlas.levels, atlas.texels,
+         image)
     return np.asarray(image.reshape(table.shape) / np.float32(supersample**2), np.float32)
 
 
@@ -63,15 +64,17 @@ def _row_poses(table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[A
     return T_world_rig @ se3.exp(rows[:, None] * row_twist), height * float(np.linalg.norm(row_twist[3:]))
 
 
-def _surfaces(rectangles: Sequence[Rectangle]) -> Array:
-    """Return what the caster knows of rectangles (R, SURFACE_COLUMNS)."""
+def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array) -> Floats:
+    """Return what the caster knows of rectangles (R, SURFACE_COLUMNS), in the camera frame."""
     rows = np.empty((len(rectangles), SURFACE_COLUMNS))
     edges = np.array([np.column_stack([r.edge_u, r.edge_v, r.normal]) for r in rectangles])
-    rows[:, :3] = [r.origin for r in rectangles]
-    rows[:, 3:12] = np.linalg.inv(edges).reshape(-1, 9)
+    from_origin = T_world_cam[:3, 3] - np.array([r.origin for r in rectangles])
+    u_v_n = np.linalg.inv(edges)
+    rows[:, :9] = (u_v_n @ T_world_cam[:3, :3])[:, [2, 0, 1]].reshape(-1, 9)
+    rows[:, 9:12] = np.einsum("rij,rj->ri", u_v_n, from_origin)[:, [2, 0, 1]]
     rows[:, 12] = [r.brightness for r in rectangles]
     rows[:, 13] = [r.texture.size / (r.width_m * r.height_m) for r in rectangles]
-    return rows
+    return rows.astype(np.float32)
 
 
 def tiles_that_see(table: RayTable, corners: Array, turned_rad: float, aside_rad: Array) -> NDArray[np.bool_]:

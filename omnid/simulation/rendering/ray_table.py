@@ -35,10 +35,10 @@ class RayTable:
 
     shape: tuple[int, int]  # (height, width) of the image without supersampling
     supersample: int
-    rays: Floats  # (N, 3) unit, camera frame
-    origins: Floats  # (N, 3) [m] camera frame; (1, 3) zero where all rays start at the camera's origin
+    rays: Floats  # (3, N) unit, camera frame
+    origins: Floats  # (3, N) [m] camera frame; (3, 1) zero where all rays start at the camera's origin
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
-    index: NDArray[np.int64]  # (N, 2) of the pixel in the flattened image, and of the row of samples
+    index: NDArray[np.int32]  # (2, N) of the pixel in the flattened image, and of the row of samples
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
     axes: Array  # (M, 3) unit
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
@@ -58,19 +58,19 @@ def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
     starts = np.append(starts, len(index))
     axes, angles = _cones(rays[index], starts)
     origins = _origins(mounted, supersample, index)
-    reach_m = float(np.linalg.norm(origins, axis=1).max())
+    reach_m = float(np.linalg.norm(origins, axis=0).max())
     pixel = rows[index] // supersample * width + columns[index] // supersample
-    return RayTable((height, width), supersample, np.ascontiguousarray(rays[index]), origins, spacing[index],
-                    np.column_stack([pixel, rows[index]]), starts, axes, angles, reach_m)
+    return RayTable((height, width), supersample, np.ascontiguousarray(rays[index].T), origins, spacing[index],
+                    np.stack([pixel, rows[index]]).astype(np.int32), starts, axes, angles, reach_m)
 
 
 def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats:
-    """Return the origins (N, 3) of the samples' rays of a non-central camera; (1, 3) for a central one."""
+    """Return the origins (3, N) of the samples' rays of a non-central camera; (3, 1) for a central one."""
     camera = mounted.camera
     if not isinstance(camera, NonCentralCamera):
-        return np.zeros((1, 3), np.float32)
+        return np.zeros((3, 1), np.float32)
     origins = [camera.rays(pixels)[0] for pixels in _sample_pixels(mounted, supersample)]
-    return np.ascontiguousarray(np.concatenate(origins)[index], np.float32)
+    return np.ascontiguousarray(np.concatenate(origins)[index].T, np.float32)
 
 
 def _sample_pixels(mounted: MountedCamera, supersample: int) -> list[Array]:

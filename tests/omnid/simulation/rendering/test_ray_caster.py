@@ -101,6 +101,17 @@ def test_nearer_surfaces_occlude_farther_ones_in_any_order() -> None:
     assert np.array_equal(one, render(Scene((dark,)), camera, pose))
 
 
+def test_no_ray_passes_between_walls_that_meet() -> None:
+    """The corner lies in a diagonal of the image, on which rays meet it exactly."""
+    white, up = np.full((8, 8), 255, np.uint8), np.array([0, 0, -2.0])
+    origins, edges = ([1.0, -1, 1], [1.0, 1, 1]), ([0, 2.0, 0], [-2.0, 0, 0])
+    walls = tuple(Rectangle(np.array(o), np.array(e), up, white) for o, e in zip(origins, edges, strict=True))
+    image = render(Scene(walls), RIGS["straight"].lower, np.eye(4)).astype(float)
+    seen = cv2.erode((cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5))) > 0).astype(np.uint8), np.ones((7, 7)))
+    assert (image[seen > 0] > 0.9 * np.median(image[seen > 0])).all()
+    assert seen.sum() > 2000
+
+
 def test_image_is_black_outside_the_rim_and_filled_inside() -> None:
     run = build("two_walls", 3, SIZE)
     mask = run.rig.lower.visible
