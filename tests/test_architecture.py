@@ -108,6 +108,7 @@ ARROWS: Mapping[str, str] = {
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
     "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.navigation omnid.core.places omnid.errors",
+    "omnid.light": "calib.panorama calib.rig drivers.cameras drivers.frame omnid.config omnid.messages omnid.transport",
     "omnid.messages":
         "drivers.motion omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "
         "omnid.core.stereo omnid.engine omnid.navigation_state omnid.tracking_state",
@@ -129,8 +130,8 @@ ARROWS: Mapping[str, str] = {
         "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.imu "
         "drivers.logs drivers.motion drivers.motor omnid.config omnid.controller omnid.core.control "
         "omnid.core.mapping omnid.core.navigation omnid.core.odometry omnid.core.places omnid.diagnostics "
-        "omnid.engine omnid.errors omnid.formats omnid.messages omnid.refinement omnid.settings_dump omnid.sinks "
-        "omnid.stages omnid.tracking_state omnid.transport",
+        "omnid.engine omnid.errors omnid.formats omnid.light omnid.messages omnid.refinement omnid.settings_dump "
+        "omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
     "omnid.settings": "calib.bounded_toml omnid.errors",

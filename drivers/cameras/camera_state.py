@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from drivers.cameras.camera_exposure import CameraExposure
+
 
 @dataclass(slots=True)
 class CameraState:
@@ -20,3 +22,4 @@ class CameraState:
     restarts: int = 0  # of the driver's sequence within a stream
     losses: int = 0  # transitions to the status "lost"
     reopens: int = 0
+    exposure: CameraExposure | None = None  # None: the camera offers no exposure time to set

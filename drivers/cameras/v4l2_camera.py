@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.camera_exposure import CameraExposure
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.v4l2_buffers import BufferAccounting
 from drivers.cameras.v4l2_settings import V4l2Settings
@@ -38,6 +39,9 @@ class V4l2Camera:
     def __init__(self, settings: V4l2Settings, camera: Camera, *, on_event: EventCallback = ignore_event) -> None:
         self._streams = deque([V4l2Stream(settings)])  # at most one; the thread that pops it closes it
         self.state = CameraState(mode=str(self._streams[0].image))
+        controls = self._streams[0].exposure
+        if settings.is_regulated and controls.ranges is not None:
+            self.state.exposure = CameraExposure(controls.ranges, in_force=controls.read())
         self._settings, self._camera, self._on_event = settings, camera, on_event
         self._name = f"{camera} camera"
         self._accounting = BufferAccounting(self.state)
@@ -84,6 +88,8 @@ class V4l2Camera:
             return  # the first image after reopening is skipped: it may be old (v4l2loopback) or dark (webcams)
         while (filled := self._next(stream)) is not None:
             stamp_ns, data = filled
+            if self.state.exposure is not None:
+                stream.exposure.follow(self.state.exposure, stamp_ns)
             seq = self._counted()
             yield Frame(seq, stamp_ns, self._camera, image.encoding, data, image.width_px, image.height_px,
                         image.step)
@@ -137,6 +143,8 @@ class V4l2Camera:
             raise DriverError(f"camera {self._settings.device} was at {self._bus_info}, and is another one at "
                               f"{stream.bus_info} now; use a persistent name, see `omnid cameras`")
         self.state.mode = str(stream.image)
+        if self.state.exposure is not None:
+            self.state.exposure.problem = ""
         return stream
 
     def _discard(self) -> None:

@@ -26,8 +26,9 @@ EXPOSURE: Final = 0x009A0902
 EXPOSURE_MAY_SLOW: Final = 0x009A0903  # V4L2_CID_EXPOSURE_AUTO_PRIORITY: automatic exposure may lower the rate
 FOCUS: Final = 0x009A090A
 AUTO_FOCUS: Final = 0x009A090C
-_EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
-_MANUAL, _APERTURE_PRIORITY, _AUTO = 1, 3, 0  # enum v4l2_exposure_auto_type
+EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
+MANUAL_EXPOSURE: Final = 1  # enum v4l2_exposure_auto_type, with the next two
+_APERTURE_PRIORITY, _AUTO = 3, 0
 _POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
 _MENU_VALUE: Final = slice(8, 16)  # of struct v4l2_querymenu: the 64-bit integer in the place of the name
 _NAMES: Final = {GAIN: "gain", AUTO_GAIN: "automatic gain", AUTO_WHITE_BALANCE: "automatic white balance",
@@ -112,7 +113,9 @@ def read_control(fd: int, control_id: int) -> int:
 def _automatic_modes(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
     """Yield (control id, value) of the automatic modes; a fixed value switches its automatic mode off."""
     if settings.auto_exposure != "keep" or settings.exposure_us:
-        yield AUTO_EXPOSURE, _automatic_exposure(offered) if settings.auto_exposure == "on" else _MANUAL
+        automatic = settings.auto_exposure == "on" or settings.is_regulated  # until the first request of a run
+        if AUTO_EXPOSURE in offered or not settings.is_regulated:
+            yield AUTO_EXPOSURE, _automatic_exposure(offered) if automatic else MANUAL_EXPOSURE
         if EXPOSURE_MAY_SLOW in offered:
             yield EXPOSURE_MAY_SLOW, 0
     for control_id, switch, fixed in ((AUTO_GAIN, settings.auto_gain, settings.gain >= 0),
@@ -130,7 +133,7 @@ def _automatic_exposure(offered: Mapping[int, CameraControl]) -> int:
 
 def _fixed_values(settings: V4l2Settings) -> Iterator[tuple[int, int]]:
     if settings.exposure_us:
-        yield EXPOSURE, round(settings.exposure_us / _EXPOSURE_UNIT_US)
+        yield EXPOSURE, round(settings.exposure_us / EXPOSURE_UNIT_US)
     if settings.gain >= 0:
         yield GAIN, settings.gain
     if settings.focus >= 0:

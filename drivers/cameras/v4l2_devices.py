@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.v4l2_exposure import ExposureControls
 from drivers.cameras.v4l2_modes import Mode, list_modes
 from drivers.cameras.v4l2_stream import device_error, query_capability
 from drivers.errors import DriverError
@@ -33,6 +34,7 @@ class CaptureDevice:
     id_path: str  # udev's ID_PATH, "" if unknown
     modes: tuple[Mode, ...] = ()
     problem: str = ""  # reason why it could not be queried
+    exposure: str = ""  # ranges of exposure time and gain as text, "" where they cannot be set
 
 
 def capture_devices(root: Path = Path("/")) -> list[CaptureDevice]:
@@ -70,6 +72,8 @@ def describe_device(device: CaptureDevice) -> Iterator[str]:
     for pixel_format in dict.fromkeys(mode.pixel_format for mode in device.modes):
         sizes = [mode for mode in device.modes if mode.pixel_format == pixel_format]
         yield f"  {pixel_format:<5}" + "; ".join(str(mode).partition(" ")[2] for mode in sizes)
+    if device.modes:
+        yield f"  {device.exposure or 'no exposure time to set'}"
 
 
 def _device(root: Path, entry: Path) -> CaptureDevice | None:
@@ -82,14 +86,14 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
         if found is None:
             return None
     except DriverError as error:
-        found, problem = (_linked_name(entry / "device/driver"), "", ()), str(error)
-    driver, bus, offered = found
+        found, problem = (_linked_name(entry / "device/driver"), "", (), ""), str(error)
+    driver, bus, offered, exposure = found
     return CaptureDevice(_in(root, node), _read(entry / "name"), driver, bus, by_path, by_id,
-                         _id_path(by_path or _sibling_link(root, entry)), offered, problem)
+                         _id_path(by_path or _sibling_link(root, entry)), offered, problem, exposure)
 
 
-def _query(node: Path) -> tuple[str, str, tuple[Mode, ...]] | None:
-    """Return driver, bus and modes of a node, None if it is not a capture device.
+def _query(node: Path) -> tuple[str, str, tuple[Mode, ...], str] | None:
+    """Return driver, bus, modes and ranges of the exposure of a node, None if it is not a capture device.
 
     Raises DriverError where it cannot be opened or queried.
     """
@@ -99,11 +103,20 @@ def _query(node: Path) -> tuple[str, str, tuple[Mode, ...]] | None:
             found = query_capability(fd)
             if not found.device_caps & v4l2.CAP_VIDEO_CAPTURE or found.device_caps & _MEMORY_TO_MEMORY:
                 return None
-            return _text(found.driver), _text(found.bus_info), tuple(list_modes(fd))
+            return _text(found.driver), _text(found.bus_info), tuple(list_modes(fd)), describe_exposure(fd)
         finally:
             os.close(fd)
     except OSError as error:
         raise device_error(str(node), error) from error
+
+
+def describe_exposure(fd: int) -> str:
+    """Return the ranges of exposure time and gain of an open device; "" where it has no exposure time to set."""
+    ranges = ExposureControls(fd).ranges
+    if ranges is None:
+        return ""
+    times = f"exposure {ranges.exposure_us.low / 1000:g} to {ranges.exposure_us.high / 1000:g} ms"
+    return times if ranges.gain is None else f"{times}, gain {ranges.gain.low} to {ranges.gain.high}"
 
 
 def _link(root: Path, folder: str, node: Path) -> str:

@@ -10,6 +10,7 @@ from drivers.cameras.v4l2_modes import ENCODINGS, MAX_SIZE_PX
 from drivers.errors import DriverError
 
 SWITCH: Final = ("keep", "on", "off")  # "keep" leaves a control as the camera has it
+EXPOSURE_MODES: Final = (*SWITCH, "rig")  # "rig": set by a run, by the requests of CameraExposure, else as "on"
 POWER_LINE: Final = ("keep", "off", "50", "60", "auto")
 PIXEL_FORMATS: Final = ("auto", *ENCODINGS)
 _MAX_CONTROL: Final = 2**31 - 1  # struct v4l2_control holds a signed 32-bit value
@@ -24,7 +25,7 @@ class V4l2Settings:
     height_px: int = 960
     rate_hz: float = 30.0  # 0: the device's own
     pixel_format: str = "auto"  # or GREY, NV12, YUYV, UYVY, MJPG, JPEG
-    auto_exposure: str = "keep"  # keep, on or off
+    auto_exposure: str = "keep"  # keep, on, off or rig
     exposure_us: int = 0  # above 0: fixed, automatic exposure off; in steps of 100
     auto_gain: str = "keep"
     gain: int = -1  # 0 and above: fixed, in the device's own units
@@ -38,8 +39,9 @@ class V4l2Settings:
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
 
     def __post_init__(self) -> None:
-        for name, allowed in (("pixel_format", PIXEL_FORMATS), ("power_line", POWER_LINE), ("auto_exposure", SWITCH),
-                              ("auto_gain", SWITCH), ("auto_white_balance", SWITCH), ("auto_focus", SWITCH)):
+        for name, allowed in (("pixel_format", PIXEL_FORMATS), ("power_line", POWER_LINE),
+                              ("auto_exposure", EXPOSURE_MODES), ("auto_gain", SWITCH), ("auto_white_balance", SWITCH),
+                              ("auto_focus", SWITCH)):
             self._require(name, getattr(self, name) in allowed, f"one of {', '.join(allowed)}")
         for name, low, high in (("width_px", 16, MAX_SIZE_PX), ("height_px", 16, MAX_SIZE_PX), ("rate_hz", 0, 1000),
                                 ("buffers", 2, 32), ("timeout_s", 0.05, 60), ("retry_s", 0.05, 60),
@@ -52,6 +54,11 @@ class V4l2Settings:
         for name, fixed in (("exposure", self.exposure_us > 0), ("gain", self.gain >= 0), ("focus", self.focus >= 0)):
             self._require(f"auto_{name}", not (fixed and getattr(self, f"auto_{name}") == "on"),
                           f"off where a fixed {name} is set")
+
+    @property
+    def is_regulated(self) -> bool:
+        """True if a run sets the exposure by requests."""
+        return self.auto_exposure == "rig" and not self.exposure_us
 
     def _require(self, name: str, valid: bool, allowed: str) -> None:
         if not valid:

@@ -11,6 +11,7 @@ from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_controls import apply_controls, list_controls, plan_controls
+from drivers.cameras.v4l2_exposure import ExposureControls
 from drivers.cameras.v4l2_modes import BYTES_PER_PIXEL, ENCODINGS, RATE_TOLERANCE, choose_format, list_modes
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
@@ -72,6 +73,8 @@ class V4l2Stream:
             self.image = _set_image(self.fd, settings)
             self._maps = [self._mapped(index) for index in range(_request_buffers(self.fd, settings.buffers))]
             apply_controls(self.fd, plan_controls(settings, list_controls(self.fd)))
+            self.exposure = ExposureControls(self.fd, with_gain=settings.gain < 0 and settings.auto_gain == "keep")
+            self._resources.callback(_release, self.exposure)
             self._start()
         except OSError as error:
             self._resources.close()
@@ -191,6 +194,11 @@ def _request_buffers(fd: int, count: int) -> int:
         raise DriverError(f"{count} buffers were requested, the device gave {request.count}; "
                           f"streaming needs {_MIN_BUFFERS}")
     return int(request.count)
+
+
+def _release(exposure: ExposureControls) -> None:
+    with suppress(OSError):  # a device that is gone starts with its automatic modes
+        exposure.release()
 
 
 def _stop(fd: int) -> None:

@@ -99,7 +99,8 @@ def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, roo
         if others:
             problems.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}",
                                     "end that program"))
-        yield from problems or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}")]
+        yield from problems or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}"
+                                            f"{_exposure(settings, device)}")]
 
 
 def _problems(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:
@@ -120,6 +121,13 @@ def _format(settings: V4l2Settings, device: CaptureDevice) -> str:
 def _image(settings: V4l2Settings, device: CaptureDevice) -> str:
     rate = f" at {settings.rate_hz:g} Hz" if settings.rate_hz else ""
     return f"{_format(settings, device)} {settings.width_px}x{settings.height_px}{rate}"
+
+
+def _exposure(settings: V4l2Settings, device: CaptureDevice) -> str:
+    """Return how the exposure is set, for the end of a line; "" where the camera's own is wanted."""
+    if not settings.is_regulated:
+        return ""
+    return f", {device.exposure} set by omnid run" if device.exposure else ", exposure left to it: it cannot be set"
 
 
 def _stream(name: str, settings: V4l2Settings, device: CaptureDevice, root: Path) -> CameraStream | None:

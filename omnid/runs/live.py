@@ -36,6 +36,8 @@ from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
+from omnid.light.exposure_control import ExposureControl
+from omnid.light.grey_levels import UsefulArea
 from omnid.messages import OdometryUpdate
 from omnid.refinement.rig_application import RigApplication
 from omnid.refinement.rig_refinement import RigRefinement
@@ -188,7 +190,11 @@ class LiveRun:
                       map_every_s=config.live.cloud_s, recorder=recorder,
                       recorded_frames=tuple(frames), record_depth=config.record.queue)
         sinks = run_places.known_to(sinks)
-        stages = wire(graph, graph.stage("pair", pairing, *frames), geometry, config, sinks)
+        pairs = graph.stage("pair", pairing, *frames)
+        states = {name: camera.state for name, camera in cameras.items()}
+        exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, states)
+        graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
+        stages = wire(graph, pairs, geometry, config, sinks)
         if config.live.shed_load:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
@@ -200,14 +206,14 @@ class LiveRun:
         self._subscribe(session, bus, recorder, commands, receiver, sensors)
         sources = StatusSources(
             graph.telemetry,
-            {name: camera.state for name, camera in cameras.items()},
+            states,
             pairing,
             session.statistics,
             self._latency.to_pose,
             controller.statistics if controller else None,
             commands,
             TICKERS,
-            (ladder.status, partial(start_status, stages.rig_gate),
+            (ladder.status, exposure.status, partial(start_status, stages.rig_gate),
              *([receiver.status] if controller else ()),
              motion_status(stages.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
              *([partial(places_status, stages.places)] if stages.places else ()),

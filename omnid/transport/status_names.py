@@ -27,6 +27,7 @@ MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
+EXPOSURE: Final = f"{PREFIX}exposure"
 RIG_AT_START: Final = f"{PREFIX}rig at start"
 RIG_REFINEMENT: Final = f"{PREFIX}rig refinement"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`

@@ -15,6 +15,7 @@ _OF_PART: Final = {
     status_names.BUS: "see bus.robot and bus.connect in the robot's configuration",
     status_names.RECORDING: "make room on the disk, or change record.folder",
     status_names.LOAD: "close other programs on the robot, or start it with --profile small",
+    status_names.EXPOSURE: "switch lights on, or set cameras.exposure_limit_ms",
     status_names.RIG: "omnid calibrate check on a recording",
     status_names.RIG_REFINEMENT: "omnid calibrate check on a recording",
     status_names.MOTION: "check motor.drive in the configuration, and the grip of the wheels",

@@ -92,7 +92,10 @@ def test_description_has_a_line_for_each_format() -> None:
     assert list(describe_device(device)) == [
         "/dev/video0  HD Webcam  (uvcvideo, usb-0)", "  /by/path",
         "  YUYV 640x480 at 30, 14.98 Hz; 640x480 at 30, 14.98 Hz", "  GREY 16..64x16..64",
+        "  no exposure time to set",
     ]  # fmt: skip
+    can_be_set = CaptureDevice("/dev/video0", "", "", "", "", "", "", offered, exposure="exposure 1 to 20 ms")
+    assert list(describe_device(can_be_set))[-1] == "  exposure 1 to 20 ms"
 
 
 def test_the_command_lists_the_cameras(

@@ -91,6 +91,13 @@ def test_accepts_cameras_with_the_configured_mode(robot: Robot) -> None:
     assert (usb.level, usb.subject) == ("ok", "usb bus 1") and "295 of 384 Mbit/s" in usb.found
 
 
+def test_tells_whether_a_run_can_set_the_exposure(robot: Robot) -> None:
+    mode: dict[str, str | int] = {"pixel_format": "YUYV", "width_px": 640, "height_px": 480, "auto_exposure": "rig"}
+    assert robot.examined(**mode)[0].found.endswith("30 Hz, exposure left to it: it cannot be set")
+    robot.known = [replace(device, exposure="exposure 1 to 9 ms") for device in robot.known]
+    assert robot.examined(**mode)[0].found.endswith("30 Hz, exposure 1 to 9 ms set by omnid run")
+
+
 def test_finds_a_mode_that_is_not_offered(robot: Robot) -> None:
     found = robot.examined(rate_hz=60.0)
     assert levels(found) == ["error", "error"] and "MJPG 1280x960 at 30, 15 Hz" in found[0].found

@@ -1,0 +1,1 @@
+"""Exposure of live cameras, by what the mirrors show."""
