@@ -156,13 +156,13 @@ class LiveRun:
         if sensors.gyro is not None:
             graph.source("imu", sensors.read_gyro, wake=sensors.gyro.close)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
-        recorder = self._recorder(session, rig) if config.record.enabled else None
+        versions = GeometryVersions(geometry)
+        recorder = self._recorder(session, versions) if config.record.enabled else None
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         ladder = LoadLadder()
         rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
-        versions = GeometryVersions(geometry)
         application = self._rig_application(session, versions, bus, recorder) if config.rig.refine == "apply" else None
         refinement = None
         if config.rig.refine != "off":
@@ -180,7 +180,7 @@ class LiveRun:
         receiver = NavigationReceiver(requests.put, config.controller.deadlines.command_s,
                                       synchronised=config.bus.command_clock == "synchronised",
                                       report=partial(self._report, logging.WARNING))
-        sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(rig, config.live.cloud_points)),
+        sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(versions, config.live.cloud_points)),
                       live_drive=LiveDrive(controller, rig.T_base_rig, requests.end) if controller else None,
                       navigation=self._navigation(session, controller, requests) if controller else None,
                       rings={"controller-ring": RingToController(controller)} if controller else {},
@@ -248,9 +248,9 @@ class LiveRun:
                                       _ready(self._config))
             self._graph.ticker("terminal", terminal.period_s, terminal)
 
-    def _recorder(self, session: Session, rig: Rig) -> Recorder:
-        encode = session.encoder(rig, self._config.record.cloud_points)
-        recorder = open_recorder(self._config, rig_toml(rig), self._report, encode=encode, offset_ns=session.offset_ns)
+    def _recorder(self, session: Session, versions: GeometryVersions) -> Recorder:
+        encode, rig = session.encoder(versions, self._config.record.cloud_points), rig_toml(versions[0].rig)
+        recorder = open_recorder(self._config, rig, self._report, encode=encode, offset_ns=session.offset_ns)
         session.outputs.callback(recorder.close)
         return recorder
 

@@ -43,7 +43,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_trajectory
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import Geometry, GeometryVersions
 from omnid.stages.rig_gate import RigContradictedError
 from omnid.stages.synchronise import Synchronise
 
@@ -226,12 +226,12 @@ class _Replay:
                 raise
             session.warn(f"the run goes on without a bus: {error}")
             return None
-        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points))
+        return BusSink(bus, session.encoder(GeometryVersions(geometry), self._config.record.cloud_points))
 
     def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
         config = self._config
         attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
-        encode = session.encoder(geometry.rig, config.record.cloud_points)
+        encode = session.encoder(GeometryVersions(geometry), config.record.cloud_points)
         recorder = Recorder(SingleLog(path, attachments), config.bus.robot, encode)
         session.outputs.callback(recorder.close)
         return recorder

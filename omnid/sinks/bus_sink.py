@@ -8,7 +8,9 @@ import cv2
 
 from drivers.frame import Frame
 from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.sinks.driven_path import DrivenPath
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
+from omnid.sinks.static_frames import StaticFrames
 from omnid.transport.bus import Bus
 from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
@@ -20,14 +22,18 @@ class BusSink:
 
     def __init__(self, bus: Bus, encode: Encoder) -> None:
         self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
+        self._static, self._path = StaticFrames(encode), DrivenPath(encode)
 
     def process(self, message: Outgoing) -> None:
-        """Publish a message, a pose with its attachment and the states where they have changed."""
+        """Publish a message; a pose with its attachment, and what has changed: states, static frames, the path."""
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
         if isinstance(message, OdometryUpdate | PlaceUpdate):
             for topic, _, payload in self._states(message):
+                self._bus.publish(topic, payload)
+        if isinstance(message, OdometryUpdate):
+            for topic, _, payload in (*self._static(message.stamp_ns), *self._path(message)):
                 self._bus.publish(topic, payload)
 
 

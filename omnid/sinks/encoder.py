@@ -15,6 +15,7 @@ from omnid.core.mapping.occupancy_grid import occupancy
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.navigation_status import navigation_status
+from omnid.stages.geometry import GeometryVersions
 from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, navigation_codec
@@ -51,9 +52,14 @@ def map_encoding(config: Config, points: int) -> MapEncoding:
 class Encoder:
     """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
-    def __init__(self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0) -> None:
-        """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time."""
-        self._T_base_rig, self._map_encoding, self.offset_ns = T_base_rig, map_encoding, offset_ns
+    def __init__(self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0,
+                 versions: GeometryVersions | None = None) -> None:
+        """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
+
+        versions: with the mounting of the cameras, for the static frames; None: they are left out.
+        """
+        self.T_base_rig, self._map_encoding, self.offset_ns = T_base_rig, map_encoding, offset_ns
+        self.versions = versions
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """Yield the encoded messages of a message."""
@@ -78,13 +84,12 @@ class Encoder:
 
     def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
-        T_odom_base, covariance, *velocity = of_base(odometry, self._T_base_rig)
+        T_odom_base, covariance, *velocity = of_base(odometry, self.T_base_rig)
         pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
         yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
         yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
-        edges = [codec.FrameTransform("odom", "base_link", T_odom_base),
-                 codec.FrameTransform("base_link", "rig", self._T_base_rig)]
-        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, edges))
+        edge = codec.FrameTransform("odom", "base_link", T_odom_base)
+        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
         yield from self._motion(odometry)
 
     def _motion(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
@@ -100,8 +105,8 @@ class Encoder:
 
     def _map_pose(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
-        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
-        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self._T_base_rig)
+        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
+        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, covariance)
         yield OutgoingMessage("map_pose", codec.MAP_POSE_SCHEMA, pose)
         edge = codec.FrameTransform("map", "odom", T_map_odom)
@@ -110,7 +115,7 @@ class Encoder:
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
         points = _most_confident(update.points, self._map_encoding.points)
-        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self._T_base_rig)
+        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
         path_xy = self._in_base(_on_ground(update.path_xy))[:, :2]
         grid = occupancy(self._in_base(update.points.xyz), update.points.confidence, path_xy,
@@ -129,7 +134,7 @@ class Encoder:
 
     def _in_base(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return points (N, 3) of the rig's first frame in the base's; float32 is enough for a grid of large cells."""
-        T = self._T_base_rig.astype(np.float32)
+        T = self.T_base_rig.astype(np.float32)
         if np.array_equal(T, np.eye(4)):
             return points.astype(np.float32, copy=False)
         return np.asarray(points.astype(np.float32, copy=False) @ T[:3, :3].T + T[:3, 3])

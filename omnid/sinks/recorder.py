@@ -14,7 +14,9 @@ from drivers.logs.rotating_log import RotatingLogState
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.sinks.driven_path import DrivenPath
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
+from omnid.sinks.static_frames import StaticFrames
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
 from omnid.transport.status_names import RECORDING
@@ -24,6 +26,7 @@ FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
 
 _PENDING: Final = 256  # messages of other threads that may wait
 _HELD: Final = 128  # beyond so many, they are written before their time: the clock may have been set
+_PATH_S_PER_POSE: Final = 0.02
 _POSE_AGE_NS: Final = 10**9  # a pose is recorded after it has been found, seldom later than that after its images
 
 
@@ -92,6 +95,8 @@ class Recorder:
         self._log, self._robot, self._encode = log, robot, encode
         self._offset_ns, self._skip_invalid = offset_ns, skip_invalid
         self._states = StateReports()
+        self._static: StaticFrames | None = None  # of the file that is written
+        self._path = DrivenPath(encode, _PATH_S_PER_POSE) if encode is not None else None
         self._added: deque[tuple[OutgoingMessage, int]] = deque(maxlen=_PENDING)
         self._files = 0
         self._newest_ns = 0
@@ -123,6 +128,7 @@ class Recorder:
             if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
                 if isinstance(message, OdometryUpdate):
                     self._statistics.process(message)
+                    self._write(self._frames_and_path(message), stamp_ns)
                 self._write(self._state_reports(replace(message, stamp_ns=stamp_ns)), stamp_ns)
             self._newest_ns = max(self._newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
@@ -143,6 +149,8 @@ class Recorder:
 
     def finish(self) -> None:
         """Write the final status and complete the last file."""
+        if self._path is not None:
+            self._write(self._path.finish(), self._newest_ns)
         if self.final_status is not None and self.state.messages:
             self._write([status_report(self._newest_ns, self.final_status(self._statistics))], self._newest_ns)
         self.close()
@@ -165,9 +173,18 @@ class Recorder:
 
     def _state_reports(self, pose: OdometryUpdate | PlaceUpdate) -> Iterable[OutgoingMessage]:
         """The state of the odometry or in the map when it changes, and once in every file."""
-        if self._files != self.state.files:
-            self._files, self._states = self.state.files, StateReports()
+        self._notice_new_file()
         return self._states(pose)
+
+    def _frames_and_path(self, pose: OdometryUpdate) -> Iterable[OutgoingMessage]:
+        """The static frames, once in every file and when they change, and the driven path as it grows."""
+        self._notice_new_file()
+        assert self._static is not None and self._path is not None
+        return [*self._static(pose.stamp_ns), *self._path(pose)]
+
+    def _notice_new_file(self) -> None:
+        if self._files != self.state.files and self._encode is not None:
+            self._files, self._states, self._static = self.state.files, StateReports(), StaticFrames(self._encode)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:

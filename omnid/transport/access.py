@@ -14,7 +14,8 @@ from omnid.transport.topics import STOP
 
 _ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
                   "declare_liveliness_subscriber")
-_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**")  # a star does not match parts that begin with @
+# A star does not match parts that begin with @; @adv is the history that zenoh keeps for ROS 2's late subscribers.
+_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**", "**/@adv/**")
 
 
 def access_control(config: BusConfig) -> dict[str, Any]:

@@ -6,7 +6,6 @@ so only sinks with a bounded inbox of their own, and tickers, call it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -18,8 +17,9 @@ from omnid.errors import OmnidError
 from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.publishers import RosGraph, TopicPublisher
 from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
-from omnid.transport.topics import PUBLISHED, Topic, ros_name
+from omnid.transport.topics import PUBLISHED
 
 __all__ = ["Bus", "BusConfig"]
 
@@ -45,11 +45,11 @@ class Bus:
         self._namesakes: set[str] = set()  # keys of the liveliness tokens of other robots of the same name
         self._warned = False
         self._session: zenoh.Session | None = None
-        self._publishers: dict[str, _TopicPublisher] = {}
+        self._publishers: dict[str, TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
         self._on_command: CommandCallback | None = None
         self._command_topics: Mapping[str, str] = {}
-        self._graph: _RosGraph | None = None
+        self._graph: RosGraph | None = None
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._closed = False
         self.lost = 0
@@ -144,11 +144,14 @@ class Bus:
                 raise OmnidError(self._same_name)
             self._report_same_name()
         self._watch_names(session)
-        self._graph = graph = _RosGraph(session, self._config)
+        self._graph = graph = RosGraph(session, self._config)
         self._declared.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
-        self._publishers = {name: _TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
+        self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
         for name in {*self._newest, *(name for name, topic in PUBLISHED.items() if topic.latched)}:
             self._declare_queryable(session, name)
+        for name, (payload, _, attached) in self._newest.items():  # published before the router was reached
+            if name in PUBLISHED and PUBLISHED[name].transient_local:
+                self._publishers[name].put(payload, attached)
         if self._on_command is not None:
             self._declare_subscribers(session, self._on_command)
         self._session = session
@@ -191,7 +194,7 @@ class Bus:
             self._warn(self._same_name)
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
-        key = f"{self._config.robot}/{name}"
+        key = f"{self._config.robot}/{name.removeprefix('/')}"
 
         def on_query(query: zenoh.Query) -> None:
             if name in self._newest:
@@ -211,7 +214,7 @@ class Bus:
             self._declared.append(session.declare_subscriber(key, on_sample))
         if self._graph is not None:
             for name, schema in self._command_topics.items():
-                self._graph.announce("MS", name, schema)
+                self._graph.subscription(name, schema)
 
 
 def _is_alive(session: zenoh.Session, robot: str) -> bool:
@@ -247,70 +250,3 @@ def _sender(sample: zenoh.Sample) -> str:
 def _sent_ns(sample: zenoh.Sample) -> int:
     """Return the time of sending that rmw_zenoh attaches to a sample, 0 without."""
     return 0 if sample.attachment is None else ros2.sent_ns_in(sample.attachment.to_bytes())
-
-
-class _RosGraph:
-    """The entries in the graph of ROS 2: a node and its topics."""
-
-    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
-        self._session, self._config = session, config
-        self._node = ros2.RmwNode(config.ros2_domain, str(session.zid()), ros2.node_name(config.robot))
-        self._tokens: list[zenoh.LivelinessToken] = []
-        self._topics = list(PUBLISHED)  # their places are the ids of the entities
-        if config.ros2 == "rmw_zenoh":
-            self._declare(self._node.token)
-
-    def announce(self, kind: str, topic: str, schema: str) -> str:
-        """Declare a publisher (MP) or a subscription (MS) and return its token, "" where ROS 2 is off."""
-        name = ros_name(self._config.robot, topic)
-        if self._config.ros2 == "rmw_zenoh":
-            if topic not in self._topics:
-                self._topics.append(topic)
-            entity = 1 + self._topics.index(topic)
-            make = self._node.publisher if kind == "MP" else self._node.subscription
-            return self._declare(make(entity, name, schema))
-        if self._config.ros2 == "ros2dds":
-            return self._declare(ros2.bridge_token(str(self._session.zid()), kind, name[1:], schema))
-        return ""
-
-    def _declare(self, token: str) -> str:
-        self._tokens.append(self._session.liveliness().declare_token(token))
-        return token
-
-
-class _TopicPublisher:
-    """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another."""
-
-    def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: _RosGraph) -> None:
-        topic, ros = PUBLISHED[name], ros_name(config.robot, name)
-        plain = f"{config.robot}/{name.removeprefix('/')}"
-        self._plain = _declared_publisher(session, plain, topic)
-        token = graph.announce("MP", name, topic.schema)
-        key = ros2.data_key(config.ros2_domain, ros, topic.schema) if config.ros2 == "rmw_zenoh" else ros[1:]
-        other = config.ros2 != "off" and key != plain
-        self._ros = _declared_publisher(session, key, topic) if other else None
-        self._gid = ros2.gid_of(token) if config.ros2 == "rmw_zenoh" else b""
-        self._seq = 0
-
-    def put(self, payload: bytes, attachment: bytes | None) -> None:
-        """Send to all subscribers; microseconds where there are none."""
-        self._plain.put(payload, attachment=attachment)
-        if self._ros is not None:
-            self._seq += 1
-            ros_attachment = ros2.attachment(self._seq, time.time_ns(), self._gid) if self._gid else None
-            self._ros.put(payload, attachment=ros_attachment)
-
-
-def _declared_publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh.Publisher:
-    """Declare a publisher, not express: each express message fills one of the few batches of every router on the way.
-
-    Poses were dropped there, and the latency is the same.
-    """
-    return session.declare_publisher(
-        key,
-        encoding=zenoh.Encoding.APPLICATION_CDR,
-        congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
-        express=False,
-        reliability=zenoh.Reliability.RELIABLE,
-    )

@@ -17,7 +17,9 @@ from typing import Final
 from rosbags.typesys import Stores, get_typestore
 
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
+TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message for those who come later, as of /tf_static
 BRIDGE_RELIABLE_LAST_10: Final = ":1:0:0,10"  # no key, then Cyclone DDS' numbers: reliable, volatile, keep last
+BRIDGE_TRANSIENT_LOCAL: Final = ":1:1:0,1"
 GID_BYTES: Final = 16
 
 
@@ -72,23 +74,24 @@ class RmwNode:
         """Token of the node itself."""
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/%/%/{self.name}"
 
-    def publisher(self, entity: int, topic: str, schema: str) -> str:
+    def publisher(self, entity: int, topic: str, schema: str, *, transient_local: bool = False) -> str:
         """Return the token of a publisher; entity: a number unique in the node."""
-        return self._endpoint("MP", entity, topic, schema)
+        return self._endpoint("MP", entity, topic, schema, TRANSIENT_LOCAL if transient_local else RELIABLE_LAST_10)
 
     def subscription(self, entity: int, topic: str, schema: str) -> str:
         """Return the token of a subscription; entity: a number unique in the node."""
-        return self._endpoint("MS", entity, topic, schema)
+        return self._endpoint("MS", entity, topic, schema, RELIABLE_LAST_10)
 
-    def _endpoint(self, kind: str, entity: int, topic: str, schema: str) -> str:
+    def _endpoint(self, kind: str, entity: int, topic: str, schema: str, quality: str) -> str:
         where = f"@ros2_lv/{self.domain}/{self.zid}/0/{entity}/{kind}/%/%/{self.name}"
-        return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{RELIABLE_LAST_10}"
+        return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{quality}"
 
 
-def bridge_token(zid: str, kind: str, key: str, schema: str) -> str:
+def bridge_token(zid: str, kind: str, key: str, schema: str, *, transient_local: bool = False) -> str:
     """Return the token that announces a publisher (kind MP) or a subscription (MS) to a bridge."""
     plain = (key.replace("/", "§"), schema.replace("/", "§"))
-    return "/".join((f"@/{zid}/@ros2_lv/{kind}", *plain, BRIDGE_RELIABLE_LAST_10))
+    quality = BRIDGE_TRANSIENT_LOCAL if transient_local else BRIDGE_RELIABLE_LAST_10
+    return "/".join((f"@/{zid}/@ros2_lv/{kind}", *plain, quality))
 
 
 def node_name(robot: str) -> str:

@@ -18,6 +18,7 @@ class Topic(NamedTuple):
     schema: str  # ROS 2 message type
     realtime: bool = False  # sent before messages of all other topics
     latched: bool = False  # late subscribers can query the newest message
+    transient_local: bool = False  # ... and those of ROS 2 receive it
 
 
 PUBLISHED: Final = {
@@ -25,9 +26,11 @@ PUBLISHED: Final = {
     "pose": Topic(codec.POSE_SCHEMA, realtime=True, latched=True),
     "map_pose": Topic(codec.MAP_POSE_SCHEMA, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
+    "/tf_static": Topic(codec.TRANSFORM_SCHEMA, latched=True, transient_local=True),
+    "path": Topic(navigation_codec.PATH_SCHEMA, latched=True),
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
-    "map": Topic(codec.GRID_SCHEMA, latched=True),
+    "map": Topic(codec.GRID_SCHEMA, latched=True, transient_local=True),
     "scan": Topic(SCAN_SCHEMA),
     "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),

@@ -111,7 +111,8 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
                 for chunk in summary.chunk_indexes[:1]] == [True, True]
     assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/rover/map_pose": PAIRS, "/tf": 2 * PAIRS,
                       "/rover/drive": PAIRS, "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 3,
-                      "/rover/scan": counts["/rover/scan"], "/rover/moving": counts["/rover/scan"]}
+                      "/rover/scan": counts["/rover/scan"], "/rover/moving": counts["/rover/scan"],
+                      "/tf_static": 1, "/rover/path": counts["/rover/path"]}
     assert PAIRS / 2 <= counts["/rover/scan"] < PAIRS  # five a second
     assert last.value(SUMMARY, "poses") == last.value(stage_name("odometry"), "processed") == str(PAIRS)
     assert float(last.value(stage_name("odometry"), "work_p50_ms")) > 0.1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -21,7 +22,7 @@ from omnid.client import Pose, Robot
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import PUBLISHED, command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
 ODOMETRY_KEY = ("0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
@@ -40,7 +41,8 @@ TOPICS = {
     "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
     "/omnid/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
-    "/tf": "tf2_msgs/msg/TFMessage", "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
+    "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage", "/omnid/path": "nav_msgs/msg/Path",
+    "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",
     "/omnid/cmd/arm": "std_msgs/msg/Header", "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/planner/heading": "geometry_msgs/msg/Vector3Stamped",
@@ -181,6 +183,30 @@ def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
     assert "MP/omnid§odom/nav_msgs§msg§Odometry/:1:0:0,10" in found
     assert "MP/tf/tf2_msgs§msg§TFMessage/:1:0:0,10" in found
     assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
+
+
+@pytest.mark.parametrize(("mode", "key"), [
+    ("rmw_zenoh", ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)), ("ros2dds", "tf_static")])
+def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) -> None:
+    """A subscriber that is transient local in ROS 2 is an AdvancedSubscriber with history of zenoh."""
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2=mode))) as bus:
+        for payload in (b"before a refinement", b"frames"):
+            bus.publish("/tf_static", payload)
+        with client(endpoint) as session:
+            history, came = ext.HistoryConfig(detect_late_publishers=True, max_samples=1), list[bytes]()
+            subscriber = ext.declare_advanced_subscriber(
+                session, key, lambda sample: came.append(sample.payload.to_bytes()), history=history)
+            wait_until(lambda: bool(came))
+            bus.publish("/tf_static", b"refined")
+            wait_until(lambda: len(came) == 2)
+            subscriber.undeclare()
+        quality, pattern = (ros2.TRANSIENT_LOCAL, "@ros2_lv/**") if mode == "rmw_zenoh" else \
+            (ros2.BRIDGE_TRANSIENT_LOCAL, "@/*/@ros2_lv/**")
+        publishers = tokens(endpoint, pattern, len(PUBLISHED))
+    kept = {topic for topic in ("tf_static", "map", "tf", "map_pose") for token in publishers
+            if re.search(f"[%/§]{topic}/", token) and token.endswith("/" + quality)}
+    assert came == [b"frames", b"refined"] and kept == {"tf_static", "map"}
 
 
 def test_a_name_that_ros_does_not_allow_is_refused() -> None:
