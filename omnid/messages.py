@@ -97,15 +97,20 @@ class StereoDepth:
         """The motion during the exposures that the depth is corrected for."""
         return self._exposure
 
-    def settle(self, exposure: Exposure | None) -> None:
-        """Set the motion during the exposures, unless the depth was already computed for one."""
+    def settle(self, exposure: Exposure | None, *, again: bool = False) -> None:
+        """Set the motion during the exposures, unless the depth was already computed for one.
+
+        again: then it is computed again.
+        """
+        if again and exposure is not self._exposure:
+            self._dense = None
         if self._dense is None:
             self._exposure = exposure
         self._settled = True
 
     def disparity_at(self, exposure: Exposure | None) -> NDArray[np.float32]:
         """Return the disparities for a motion during the exposures, and keep them if the depth is not settled."""
-        if self._settled and exposure is not None:
+        if self._settled and exposure is not None and exposure is not self._exposure:
             return self._compute(self.panoramas, exposure).disparity
         if not self._settled and exposure is not self._exposure:
             self._exposure, self._dense = exposure, None
@@ -150,6 +155,7 @@ class OdometryUpdate:
     features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    is_keyframe: bool = False  # odometry needs its dense depth in any case
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from omnid.engine.telemetry import StageStats
+from omnid.engine.telemetry import StageStats, Stopwatch
 
 T = TypeVar("T")
 In = TypeVar("In")
@@ -30,7 +30,10 @@ END: Final = object()
 
 
 class Stage(Protocol[In_contra, Out_co]):
-    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end."""
+    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end.
+
+    And `after() -> None`, called after the result of each message was passed on: for work that no reader waits for.
+    """
 
     def process(self, message: In_contra, /) -> Out_co | None:
         """Return the result of the message, None without one."""
@@ -46,6 +49,11 @@ class Chain(Generic[In, Mid, Out]):
         """Return the result of both stages, None without one."""
         between = self._first.process(message)
         return None if between is None else self._second.process(between)
+
+    def after(self) -> None:
+        """Do what both stages have left to do for the last message."""
+        for stage in (self._first, self._second):
+            getattr(stage, "after", nothing)()
 
 
 class Sink(Protocol[In_contra]):
@@ -111,13 +119,19 @@ class Node:
         self.stats = stats
         self.stream: Stream[Any] = Stream()
         self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
+        self._after: Callable[[], object] = getattr(work, "after", nothing)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
     def handle(self, message: object) -> None:
-        """Process the message and pass its result on."""
-        result = self.stats.timed(self._process, message)
+        """Process the message, pass its result on, and let the stage do what it has left to do."""
+        watch = Stopwatch()
+        result = self._process(message)
         if result is not None:
+            watch.pause()
             self.stream.push(result)
+            watch.resume()
+        self._after()
+        self.stats.count(watch)
 
     def finish(self) -> None:
         """Pass on the results that remain at the end of the stream."""

@@ -68,6 +68,30 @@ def _centre_s(index: int) -> float:
     return min(_LOW_S * math.exp(max(index - 0.5, 0.0) / _BINS_PER_E), _HIGH_S)
 
 
+class Stopwatch:
+    """Wall time and processor time of the calling thread [ns], from its creation on, without pauses."""
+
+    __slots__ = ("_cpu_ns", "_wall_ns")
+
+    def __init__(self) -> None:
+        self._wall_ns, self._cpu_ns = -time.perf_counter_ns(), -time.thread_time_ns()
+
+    def pause(self) -> None:
+        """Stop; elapsed_ns may be read."""
+        self._wall_ns += time.perf_counter_ns()
+        self._cpu_ns += time.thread_time_ns()
+
+    def resume(self) -> None:
+        """Go on."""
+        self._wall_ns -= time.perf_counter_ns()
+        self._cpu_ns -= time.thread_time_ns()
+
+    @property
+    def elapsed_ns(self) -> tuple[int, int]:
+        """Wall and processor time while it ran; it must be paused."""
+        return self._wall_ns, self._cpu_ns
+
+
 @dataclass(slots=True)
 class StageStats:
     """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
@@ -86,22 +110,25 @@ class StageStats:
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
-        wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+        watch = Stopwatch()
         result = call(*args)
-        self._record(wall_ns, cpu_ns)
+        self.count(watch)
         return result
 
     def timed_each(self, messages: Iterable[T]) -> Iterator[T]:
         """Yield the messages, each counted and timed."""
-        wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+        watch = Stopwatch()
         for message in messages:
-            self._record(wall_ns, cpu_ns)
+            self.count(watch)
             yield message
-            wall_ns, cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
+            watch = Stopwatch()
 
-    def _record(self, wall_ns: int, cpu_ns: int) -> None:
-        self.wall.add((time.perf_counter_ns() - wall_ns) * 1e-9)
-        self.cpu.add((time.thread_time_ns() - cpu_ns) * 1e-9)
+    def count(self, watch: Stopwatch) -> None:
+        """Stop a running stopwatch, and count a message that took so long."""
+        watch.pause()
+        wall_ns, cpu_ns = watch.elapsed_ns
+        self.wall.add(wall_ns * 1e-9)
+        self.cpu.add(cpu_ns * 1e-9)
         self.processed += 1
 
 

@@ -109,8 +109,7 @@ class Mapping:
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
         is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
         wait_ns = max(self._min_gap_ns, period_s * 1e9, STANDING_NS if is_same_view else 0)
-        is_keyframe = len(odometry.features.new) > 0
-        return since_ns >= (wait_ns / 2 if is_keyframe else wait_ns) - STAMP_JITTER_NS
+        return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:
         """Return the final map, if there was a pair."""

@@ -87,9 +87,8 @@ class Obstacles:
         if self._last_ns is None:
             return True
         wait_ns = max(self._period_ns, self._min_period_s() * 1e9)
-        is_keyframe = len(odometry.features.new) > 0
         since_ns = odometry.stamp_ns - self._last_ns
-        return since_ns < 0 or since_ns >= (wait_ns / 2 if is_keyframe else wait_ns) - STAMP_JITTER_NS
+        return since_ns < 0 or since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
 
 def controller_ring(ring: ObstacleRing) -> ControllerRing:

@@ -36,6 +36,9 @@ class OdometryMethod(Protocol):
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
 
+    def complete(self) -> None:
+        """Do what is left to do for the last frame; otherwise `process` does it before the next one."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Start:
@@ -87,7 +90,10 @@ class OdometryStage:
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, depth.stamp_ns)
         motion = RigVelocity(estimate.velocity, estimate.velocity_covariance)
-        depth.settle(None if pair.times is None else Exposure(pair.times, motion, self._model))
+        if estimate.keyframe_exposure is not None:
+            depth.settle(estimate.keyframe_exposure, again=True)
+        else:
+            depth.settle(None if pair.times is None else Exposure(pair.times, motion, self._model))
         T_start_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         since_start = se3.adjoint(se3.inverse(T_start_rig))
         covariance = since_start @ self._start.covariance @ since_start.T + self._in_rig(estimate.covariance)
@@ -97,8 +103,12 @@ class OdometryStage:
             depth.seq, depth.stamp_ns, newest.T_odom_rig, in_axes(newest.T_odom_rig, covariance),
             self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, depth), newest.resets, estimate.inliers, estimate.tracked, depth,
-            estimate.features, depth.panoramas.light, pair.motion,
+            estimate.features, depth.panoramas.light, pair.motion, estimate.is_keyframe,
         )
+
+    def after(self) -> None:
+        """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""
+        self._method.complete()
 
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""

@@ -104,7 +104,7 @@ class Places:
         of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
         return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, self._to_rect @ of_rig @ self._to_rect.T,
                              odometry.state is TrackingState.LOST, odometry.reset_counter,
-                             len(odometry.features.new) > 0, lambda: self._scan(odometry.depth))
+                             odometry.is_keyframe, lambda: self._scan(odometry.depth))
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.tracking_state import TrackingState
 
@@ -61,6 +62,8 @@ class OdometryEstimate:
     inliers: int
     features: Features = field(default_factory=Features)
     step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
+    is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
+    keyframe_exposure: Exposure | None = None  # the motion that it is then corrected for; None: exposed at once
 
 
 @dataclass(frozen=True, slots=True)

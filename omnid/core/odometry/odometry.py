@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import clear_around, corners
+from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
-from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
-from omnid.core.odometry.new_landmarks import located
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -36,7 +35,6 @@ Flags = NDArray[np.bool_]
 UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while poses are refused, m/s and rad/s
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
-LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
 START_ROUNDS = 2  # of starting a map again, once the velocity is known
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
@@ -51,10 +49,9 @@ class VisualOdometry:
     def __init__(self, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
                  relocaliser: KeyframeLocaliser, features: Callable[[], float] = lambda: 1.0) -> None:
         """features: called for each keyframe, the share of limits.features that it is to have."""
-        self._features = features
         self._limits, self._model = limits, model
-        self._stereo_klt = replace(klt, levels=1)
         self._map = LocalMap(model, klt, limits.keyframes)
+        self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
         self._frame_to_map = FrameToMap(self._map, model, klt)
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask()
@@ -64,13 +61,17 @@ class VisualOdometry:
         self._status = TrackingStatus()
         self._resets = 0
         self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
-        self._most_inliers = 0  # since the last keyframe
-        self._frames_since_keyframe = 0
+        self._requested: KeyframeRequest | None = None  # by the last frame, see complete
+        self._added: int | None = None  # seq of the keyframe that the last frame became
         # The frame that started the map, if it was exposed at several times, until the velocity is known.
         self._unmoved: StereoFrame | None = None
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
-        """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
+        """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
+
+        The keyframe that it may have to become is made by `complete`: its depths take longer than the pose.
+        """
+        self.complete()
         dt_s = max(dt_s, 0.0)
         self._step = None
         usable = self._static_mask.without(frame.usable)
@@ -116,9 +117,22 @@ class VisualOdometry:
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
-        new = self._update_map(frame, usable, estimate, self._exposure(frame, self._motion.at_exposure(dt_s)))
-        features = Features(estimate.pixels, estimate.rejected, new)
-        return self._result(estimate.tracked, estimate.inliers, features)
+        new = estimate.pixels[self._map.store.table.anchor[estimate.landmarks] == self._added]
+        self._added = None
+        exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
+        self._requested = self._update_map(frame, usable, estimate, exposure)
+        result = self._result(estimate.tracked, estimate.inliers, Features(estimate.pixels, estimate.rejected, new))
+        return result if self._requested is None else replace(result, is_keyframe=True, keyframe_exposure=exposure)
+
+    def complete(self) -> None:
+        """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.
+
+        Called between the two, it gives the same results, and the pose is not held up.
+        """
+        requested, self._requested = self._requested, None
+        if requested is not None:
+            self._keyframes.add(requested)
+            self._added = requested.frame.seq
 
     def _exposure(self, frame: StereoFrame, motion: RigVelocity | None) -> Exposure | None:
         """Return the exposure of a frame, None where one instant is shown; motion: None for that of the filter."""
@@ -151,7 +165,7 @@ class VisualOdometry:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             motion = self._motion.after(T_prev_curr, estimate.covariance, dt_s)
             self._map.clear()
-            self._add_keyframe(first, usable & first.usable, np.zeros((0, 2)), self._exposure(first, motion))
+            self._keyframes.add(self._request(first, usable & first.usable, self._exposure(first, motion)))
             exposure = self._exposure(frame, motion)
             tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked(), turn=frame.seq)
             coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
@@ -252,7 +266,7 @@ class VisualOdometry:
 
     def _start_map(self, frame: StereoFrame, usable: Flags, failed: FrameFacts) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks; failed: the facts where it has not."""
-        new = self._add_keyframe(frame, usable, np.zeros((0, 2)), self._exposure(frame, None))
+        new = self._keyframes.add(self._request(frame, usable, self._exposure(frame, None)))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._advance(failed)
@@ -261,7 +275,7 @@ class VisualOdometry:
         self._unmoved = frame if frame.times is not None else None
         self._motion.found()
         self._advance(FrameFacts(FrameOutcome.STARTED, failed.dt_s))
-        return self._result(len(self._map), len(self._map), Features(new=new))
+        return replace(self._result(len(self._map), len(self._map), Features(new=new)), is_keyframe=True)
 
     def _advance(self, facts: FrameFacts) -> None:
         """Advance the tracking state; while it has no fix the covariance grows as under an unknown steady velocity."""
@@ -272,40 +286,23 @@ class VisualOdometry:
             self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
 
     def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure | None
-                    ) -> Array:
-        """Remove lost landmarks and add a keyframe where too few are left; return the pixels (N, 2) of new ones."""
-        limits, store, inliers = self._limits, self._map.store, len(estimate.landmarks)
+                    ) -> KeyframeRequest | None:
+        """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
+        store = self._map.store
         ids = store.table.id[estimate.landmarks]
         disparity = estimate.views[:, 2] - estimate.views[:, 1]
         store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
-        if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
-            return self._add_keyframe(frame, usable, np.zeros((0, 2)), exposure)
-        self._most_inliers = max(self._most_inliers, inliers)
-        self._frames_since_keyframe += 1
-        sparse = inliers < limits.refresh * self._wanted() and self._frames_since_keyframe >= limits.sparse_every
-        if sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers:
-            new = self._add_keyframe(frame, usable, estimate.pixels, exposure)
-            store.add_observations(frame.seq, ids, estimate.views)
-            return new
-        return np.zeros((0, 2))
+        if not self._keyframes.is_due(len(estimate.landmarks)):
+            return None
+        request = self._request(frame, usable, exposure)
+        if self._limits.keyframes == 1:
+            return request
+        return replace(request, pixels=estimate.pixels, ids=ids, views=estimate.views)
 
-    def _add_keyframe(self, frame: StereoFrame, usable: Flags, known: Array, exposure: Exposure | None) -> Array:
-        """Add a keyframe with new landmarks between the known ones (N, 2); return the pixels (M, 2) of the new ones."""
-        free = clear_around(usable, known, LANDMARK_SPACING_PX)
-        points = corners(frame.lower, free, self._wanted() - len(known))
-        new = located(frame, points, self._model, self._stereo_klt, exposure)
-        keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._covariance)
-        self._map.add_keyframe(keyframe, new.views, new.slopes, new.noise, new.pixels)
-        if len(self._map) >= self._limits.min_inliers:
-            self._relocaliser.add(frame, keyframe)
-        self._most_inliers = self._frames_since_keyframe = 0
-        return new.pixels
-
-    def _wanted(self) -> int:
-        """Return the number of landmarks wanted in a keyframe."""
-        limits = self._limits
-        return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
+    def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure | None) -> KeyframeRequest:
+        """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
+        return KeyframeRequest(frame, usable, self._T_odom_rect, self._covariance, exposure)
 
     def _tracked(self) -> int:
         """Return the number of landmarks that are tracked at most."""

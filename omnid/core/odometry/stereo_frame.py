@@ -46,4 +46,4 @@ class Features:
 
     inliers: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks that support the pose
     rejected: NDArray[np.float64] = field(default_factory=_no_pixels)  # tracked landmarks, no inliers
-    new: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks added at this frame
+    new: NDArray[np.float64] = field(default_factory=_no_pixels)  # inliers, of the keyframe before

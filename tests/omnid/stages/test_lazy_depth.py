@@ -13,8 +13,8 @@ from calib.panorama import Cylinder
 from omnid.config import MappingConfig
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
 from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.stereo_frame import Features
 from omnid.engine.flow import Chain
+from omnid.engine.graph import Graph
 from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.mapping import Mapping
 from omnid.tracking_state import TrackingState
@@ -97,9 +97,8 @@ def test_keyframes_enter_the_map_after_half_the_time() -> None:
     for seq in range(60):
         stamp_ns = round(seq * 1e9 / 30)
         T = se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0]))
-        new = np.zeros((1 if seq % 4 == 0 else 0, 2))
         mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                       50, 50, counted.depth(seq, stamp_ns), Features(new=new)))
+                                       50, 50, counted.depth(seq, stamp_ns), is_keyframe=seq % 4 == 0))
     assert counted.computed == list(range(0, 60, 4))
 
 
@@ -113,6 +112,32 @@ class Half:
 def test_a_chain_passes_results_on_and_nothing_without_one() -> None:
     chain = Chain(Half(), Half())
     assert [chain.process(number) for number in (8, 6, 5)] == [2, None, None]
+
+
+class Late:
+    """Notes in a list when it takes a message and when it does what is left."""
+
+    def __init__(self, name: str, events: list[str]) -> None:
+        self._name, self._events = name, events
+
+    def process(self, number: int) -> int:
+        self._events.append(f"{self._name} {number}")
+        return number
+
+    def after(self) -> None:
+        self._events.append(f"after {self._name}")
+
+
+def test_a_chain_does_what_is_left_of_both_stages_after_the_result_was_passed_on() -> None:
+    events: list[str] = []
+    graph = Graph(threaded=False)
+    read = graph.source("read", lambda: [1, 2])
+    graph.sink("sink", Late("sink", events), graph.stage("stage", Chain(Late("first", events), Late("second", events)),
+                                                         read))
+    graph.run()
+    once = ["first {0}", "second {0}", "sink {0}", "after sink", "after first", "after second"]
+    assert events == [event.format(number) for number in (1, 2) for event in once]
+    assert graph.telemetry.of("stage").processed == 2
 
 
 def test_depth_follows_the_motion_until_it_is_settled() -> None:
@@ -130,3 +155,7 @@ def test_depth_follows_the_motion_until_it_is_settled() -> None:
     unread = counted.depth(4, 6 * MS)
     unread.settle(fast)
     assert len(unread.points) == 1 and counted.exposures[-1] is fast
+    unread.disparity_at(fast)  # that of a keyframe, which is made after the pose was passed on
+    assert len(counted.exposures) == 4
+    unread.settle(slow, again=True)
+    assert len(unread.points) == 1 and counted.exposures[-1] is slow

@@ -76,6 +76,9 @@ class PaperOdometry:
         self._reference: Reference | None = None
         self._most_inliers = 0
 
+    def complete(self) -> None:
+        """Do nothing: `process` leaves nothing to do."""
+
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first): the steps of figure 5."""
         reference = self._reference

@@ -1,0 +1,80 @@
+"""Keyframes of the local map: when one is needed, and the work that makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.odometry.corners import clear_around, corners
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
+from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.new_landmarks import located
+from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings
+
+Array = NDArray[np.float64]
+
+LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeRequest:
+    """A frame with a pose that is to become a keyframe, and the landmarks that are known in it."""
+
+    frame: StereoFrame
+    usable: NDArray[np.bool_]  # (H, W) pixels in which landmarks may lie
+    T_odom_rect: Array  # (4, 4)
+    covariance: Array  # (6, 6) [t; r] in the rectified frame
+    exposure: Exposure | None  # None: all pixels are exposed at the stamp
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px of the known landmarks
+    ids: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (N,) of them; () to observe none
+    views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) px of them at the stamp
+
+
+class Keyframes:
+    """Decides whether the local map needs a keyframe, and adds it."""
+
+    def __init__(self, local_map: LocalMap, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
+                 relocaliser: KeyframeLocaliser, features: Callable[[], float]) -> None:
+        """features: called for each keyframe, the share of limits.features that it is to have. klt: from the lower
+        panorama to the upper one.
+        """
+        self._map, self._model, self._klt, self._limits = local_map, model, klt, limits
+        self._relocaliser, self._features = relocaliser, features
+        self._most_inliers = self._frames = 0  # since the last keyframe
+
+    def is_due(self, inliers: int) -> bool:
+        """True if the local map needs a keyframe at the next accepted frame, which has so many inliers."""
+        limits = self._limits
+        if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
+            return True
+        self._most_inliers = max(self._most_inliers, inliers)
+        self._frames += 1
+        sparse = inliers < limits.refresh * self._wanted() and self._frames >= limits.sparse_every
+        return sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers
+
+    def add(self, request: KeyframeRequest) -> Array:
+        """Add a keyframe with new landmarks between the known ones; return the pixels (M, 2) of the new ones."""
+        frame = request.frame
+        free = clear_around(request.usable, request.pixels, LANDMARK_SPACING_PX)
+        points = corners(frame.lower, free, self._wanted() - len(request.pixels))
+        new = located(frame, points, self._model, self._klt, request.exposure)
+        keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
+        self._map.add_keyframe(keyframe, new.views, new.slopes, new.noise, new.pixels)
+        if len(self._map) >= self._limits.min_inliers:
+            self._relocaliser.add(frame, keyframe)
+        self._most_inliers = self._frames = 0
+        self._map.store.add_observations(frame.seq, request.ids, request.views)
+        return new.pixels
+
+    def _wanted(self) -> int:
+        """Return the number of landmarks wanted in a keyframe."""
+        limits = self._limits
+        return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
