@@ -63,6 +63,33 @@ def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, fram
         assert estimate.tracked >= estimate.inliers >= 50
 
 
+def test_a_keyframe_is_made_when_it_is_asked_for_or_before_the_next_frame(
+    cameras: RenderedCameras, frames: list[StereoFrame]
+) -> None:
+    made: list[int] = []
+
+    def features() -> float:
+        made.append(1)
+        return 1.0
+
+    found = []
+    for early in (False, True):
+        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(refresh=1.0),
+                                  Relocaliser(cameras.model), features)
+        for k, frame in enumerate(frames[:4]):
+            estimate = odometry.process(frame, PERIOD_S * (k > 0))
+            count = len(made)
+            if early:
+                odometry.complete()
+                odometry.complete()
+                assert (len(made) > count) == (estimate.is_keyframe and k > 0), "the first one is made with its pose"
+            assert len(estimate.features.new) <= len(estimate.features.inliers) or k == 0
+        found.append(estimate)
+    assert found[0].is_keyframe and found[0].inliers == found[1].inliers
+    np.testing.assert_array_equal(found[0].T_odom_rect, found[1].T_odom_rect)
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+
+
 def test_with_one_keyframe_every_frame_is_measured_against_the_previous_one(
     cameras: RenderedCameras, frames: list[StereoFrame]
 ) -> None:
