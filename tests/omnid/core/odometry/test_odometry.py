@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.pose_estimation import StereoModel
@@ -66,23 +67,23 @@ def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, fram
 def test_a_keyframe_is_made_when_it_is_asked_for_or_before_the_next_frame(
     cameras: RenderedCameras, frames: list[StereoFrame]
 ) -> None:
+    class Kept(Relocaliser):
+        def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
+            made.append(frame.seq)
+            super().add(frame, keyframe)
+
     made: list[int] = []
-
-    def features() -> float:
-        made.append(1)
-        return 1.0
-
     found = []
     for early in (False, True):
-        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(refresh=1.0),
-                                  Relocaliser(cameras.model), features)
+        made.clear()
+        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(sparse_every=1), Kept(cameras.model))
         for k, frame in enumerate(frames[:4]):
             estimate = odometry.process(frame, PERIOD_S * (k > 0))
-            count = len(made)
+            assert estimate.is_keyframe and (made[-1] == frame.seq) == (k == 0), "only the first comes with its pose"
             if early:
                 odometry.complete()
                 odometry.complete()
-                assert (len(made) > count) == (estimate.is_keyframe and k > 0), "the first one is made with its pose"
+                assert made == list(range(k + 1))
             assert len(estimate.features.new) <= len(estimate.features.inliers) or k == 0
         found.append(estimate)
     assert found[0].is_keyframe and found[0].inliers == found[1].inliers
