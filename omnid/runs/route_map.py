@@ -21,7 +21,7 @@ class RunRouteMap:
 
     def __init__(self, places: Places, T_base_rig: NDArray[np.float64], name: str) -> None:
         """name: of the map's file; empty: it is not saved."""
-        self.name = name
+        self.name, self.is_new = name, not places.keyframe_ids()
         self._places, self._T_base_rig, self._T_rig_base = places, T_base_rig, se3.inverse(T_base_rig)
 
     def keyframe(self, id: int) -> KeyframePose | None:

@@ -1,4 +1,4 @@
-"""A demonstration in lock-step: a simulated robot drives a square by goals, then along the path that it has driven."""
+"""A demonstration in lock-step: a simulated robot is taught a route by driving it, and repeats it in its map."""
 
 from __future__ import annotations
 
@@ -11,65 +11,86 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest
+from omnid.core.mapping.range_scan import azimuths
+from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
+from omnid.messages import ObstacleRing
 from omnid.navigation_state import NavigationState
 from omnid.simulation.clearance import footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.world import World
+from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
-SIDE_M: Final = 1.5
-GOALS: Final = ((SIDE_M, 0.0, 0.5 * math.pi), (SIDE_M, SIDE_M, math.pi), (0.0, SIDE_M, -0.5 * math.pi), (0.0, 0.0, 0.0))
+ROUTE: Final = "demo"
+STRAIGHT_M, RADIUS_M = 0.8, 0.7  # of the oval that is taught: 6 m
+ARC_STEPS: Final = 15
 ANSWER_S: Final = 0.5  # after a request, before its end is looked for
-SPACING_M: Final = 0.1  # of the path that is repeated
+RECOGNISED_S: Final = 5.0  # after the first drive, in which the robot must have recognised the start
+SHOWN_S: Final = 5.0  # between two lines of progress
 PX_PER_M: Final = 90.0
 MARGIN_PX: Final = 20
-_WHITE, _GREY, _BLACK, _RED = (255, 255, 255), (150, 150, 150), (0, 0, 0), (0, 0, 190)  # BGR
+_WHITE, _GREY, _BLACK, _RED, _BLUE = (255, 255, 255), (150, 150, 150), (0, 0, 0), (0, 0, 190), (210, 140, 60)  # BGR
 
 
-class SquareTwice:
-    """The script: goals first; then the path of the poses meanwhile. `show` takes a line at each step."""
+def oval() -> Array:
+    """Return the positions (N, 2) [m] in odom of a round drive that ends where it begins."""
+    turns = np.linspace(-0.5 * math.pi, 0.5 * math.pi, ARC_STEPS)
+    right = np.column_stack([STRAIGHT_M + RADIUS_M * np.cos(turns), RADIUS_M + RADIUS_M * np.sin(turns)])
+    left = np.array([STRAIGHT_M, 2 * RADIUS_M]) - right
+    return np.vstack([(0.0, 0.0), right, left])
+
+
+class TeachAndRepeat:
+    """The script: somebody drives an oval while the route is taught; then it is repeated. `show` takes lines."""
 
     def __init__(self, show: Callable[[str], None]) -> None:
         self._show = show
-        self._steps = 0
-        self._asked_s = 0.0
-        self._driven: list[Array] = []
+        self._taught = False
+        self._asked_s, self._driven_s, self._shown_s = 0.0, math.inf, 0.0
         self.repeated_s = math.inf  # when the repetition began
         self.end = ""  # in words
 
     def __call__(self, moment: Moment) -> Iterator[Request]:
-        """Send the next request when the one before has ended."""
-        if moment.odometry is None:
+        """Send the next requests when what was asked for has ended."""
+        if moment.place is None:
             return
-        if not self._steps and not moment.controller.armed:
-            yield "arm"
+        if not self._asked_s:
+            if not moment.controller.armed:
+                yield "arm"
+                return
+            self._tell(moment, "is taught the route: it is driven along an oval")
+            yield RouteRequest(RouteAction.TEACH, ROUTE)
+            yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
             return
-        if self._steps <= len(GOALS):
-            self._note(moment.T_odom_base)
         navigation = moment.navigation
-        waits = navigation is None or not navigation.state.is_end or moment.time_s < self._asked_s + ANSWER_S
-        if self._steps and waits:
+        if navigation is None or moment.time_s < self._asked_s + ANSWER_S:
             return
-        if self._steps and navigation is not None and navigation.state is not NavigationState.REACHED:
-            self.end = f"{navigation.state}: {navigation.reason}"
+        if moment.time_s >= self._shown_s + SHOWN_S and math.isfinite(navigation.left_m):
+            self._shown_s = moment.time_s
+            self._show(f"{moment.time_s:5.1f} s: {navigation.left_m:.1f} m left")
+        refusal = "" if navigation.answer is None else navigation.answer.refusal
+        if refusal or (navigation.state.is_end and navigation.state is not NavigationState.REACHED):
+            self.end = f"refused: {refusal}" if refusal else f"{navigation.state}: {navigation.reason}"
             yield "end"
-        elif self._steps < len(GOALS):
-            self._show(f"{moment.time_s:5.1f} s: drives to corner {self._steps + 1} of {len(GOALS)}")
-            yield GoalRequest(NavigationFrame.ODOM, *GOALS[self._steps])
-        elif self._steps == len(GOALS):
-            self._show(f"{moment.time_s:5.1f} s: drives along the path that it has driven")
+        elif navigation.state is NavigationState.REACHED and not self._taught:
+            self._driven_s = min(self._driven_s, moment.time_s)
+            if moment.place.state is not MapState.LOCALIZED:
+                if moment.time_s > self._driven_s + RECOGNISED_S:
+                    self.end = "the start of the route was not recognised"
+                    yield "end"
+                return
+            self._taught = True
+            self._tell(moment, "repeats the route in the map that it has made")
             self.repeated_s = moment.time_s
-            yield PathRequest(NavigationFrame.ODOM, np.array([T[:2, 3] for T in self._driven]), 0.0)
-        else:
-            self.end = "reached"
+            yield RouteRequest(RouteAction.FINISH)
+            yield RouteRequest(RouteAction.REPEAT, ROUTE)
+        elif navigation.state is NavigationState.REACHED:
+            self.end = NavigationState.REACHED
             yield "end"
-        self._steps, self._asked_s = self._steps + 1, moment.time_s
 
-    def _note(self, T_odom_base: Array) -> None:
-        """Keep a pose if it lies SPACING_M from the last one that was kept."""
-        if not self._driven or np.hypot(*(T_odom_base - self._driven[-1])[:2, 3]) >= SPACING_M:
-            self._driven.append(T_odom_base)
+    def _tell(self, moment: Moment, text: str) -> None:
+        self._asked_s = self._shown_s = moment.time_s
+        self._show(f"{moment.time_s:5.1f} s: {text}")
 
 
 def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
@@ -79,13 +100,36 @@ def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
     return np.array(first).reshape(-1, 2), np.array(second).reshape(-1, 2)
 
 
-def apart_m(first: Array, second: Array) -> Array:
-    """Return the distances (M,) [m] of the positions of the second path from the nearest ones of the first."""
-    return np.asarray(np.linalg.norm(second[:, None] - first[None], axis=2).min(axis=1))
+def cross_track_m(first: Array, second: Array) -> Array:
+    """Return the distances (M,) [m] of positions (M, 2) from the line through others (N, 2)."""
+    a, along = first[:-1], np.diff(first, axis=0)
+    a, along = a[np.any(along != 0, axis=1)], along[np.any(along != 0, axis=1)]
+    if not len(a):
+        return np.asarray(np.linalg.norm(second - first[:1], axis=1))
+    to = second[:, None] - a
+    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1))
 
 
-def draw(world: World, first: Array, second: Array) -> NDArray[np.uint8]:
-    """Return a image (H, W, 3): what stands in the world, the first path in black and the second one in red."""
+def seen_obstacles(run: SimulatedRun) -> Array:
+    """Return the obstacles (N, 2) [m] of all rings, where the robot believes them, in the world."""
+    if not len(run.T_world_base):
+        return np.zeros((0, 2))
+    directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))])
+
+    def places(ring: ObstacleRing) -> Array:
+        seen = np.isfinite(ring.ranges_m)
+        at = ring.ranges_m[seen, None] * directions[seen]
+        return np.asarray(se3.apply(run.T_world_base[0] @ ring.T_odom_base, at)[:, :2])
+
+    return np.vstack([np.zeros((0, 2)), *(places(ring) for ring in run.rings)])
+
+
+def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray[np.uint8]:
+    """Return an image (H, W, 3): the world in grey, what the robot has seen of it in blue, both paths on it.
+
+    The first path is black and wide, the second one red. All are positions (N, 2) [m] in the world.
+    """
     segments = footprints(world.standing, 1.2)
     low, high = segments.reshape(-1, 2).min(axis=0), segments.reshape(-1, 2).max(axis=0)
     width, height = (int(side) for side in np.ceil((high - low) * PX_PER_M) + 2 * MARGIN_PX)
@@ -97,7 +141,10 @@ def draw(world: World, first: Array, second: Array) -> NDArray[np.uint8]:
         return np.asarray(np.rint(np.column_stack([across, down])), np.int32)
 
     for segment in segments:
-        cv2.polylines(image, [pixels(segment)], False, _GREY, 3, cv2.LINE_AA)
+        cv2.polylines(image, [pixels(segment)], False, _GREY, 5, cv2.LINE_AA)
+    columns, rows = pixels(obstacles).T
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    image[rows[inside], columns[inside]] = _BLUE
     for path, color, thickness in ((first, _BLACK, 4), (second, _RED, 2)):
         if len(path):
             cv2.polylines(image, [pixels(path)], False, color, thickness, cv2.LINE_AA)

@@ -33,6 +33,7 @@ class RouteMap(Protocol):
     """The map of places that routes are tied to; called in the thread of the navigation."""
 
     name: str  # of its file; empty: it is not saved, so that no route can be tied to it
+    is_new: bool  # it was empty before this run, and lies where odom began
 
     def keyframe(self, id: int) -> KeyframePose | None:
         """Return a keyframe as the map knows it now."""
@@ -58,6 +59,7 @@ class Routes:
     def __init__(self, store: RouteStore, places: RouteMap | None) -> None:
         self._store, self._places = store, places
         self._recorder: RouteRecorder | None = None
+        self._resets = 0  # of odometry when the recording began
 
     @property
     def teaching(self) -> str:
@@ -70,19 +72,23 @@ class Routes:
         return self._recorder.length_m if self._recorder else 0.0
 
     def teach(self, name: str, now: Situation) -> None:
-        """Begin to record. Raise OmnidError where that is impossible."""
-        self._map()
+        """Begin to record: where the robot is localised, or in a map that begins with this run. Raise OmnidError else.
+        """
+        places = self._map()
         if self._recorder is not None:
             raise OmnidError(f"the route {self._recorder.name} is being taught: finish or stop it first")
         refusal = refusal_of_map(now, math.inf)
-        if refusal:
+        if refusal and not (places.is_new and now.resets == 0 and now.in_map is not None):
             raise OmnidError(refusal)
-        self._recorder = RouteRecorder(name)
+        self._recorder, self._resets = RouteRecorder(name), now.resets
 
     def record(self, now: Situation, tie: KeyframeTie | None) -> str:
         """Add the newest pose; return why the recording has ended, empty while it goes on."""
         if self._recorder is None or tie is None or now.in_map is None or now.in_map.state is MapState.LOST:
             return ""
+        if now.resets != self._resets and now.in_map.state is not MapState.LOCALIZED:
+            name, self._recorder = self._recorder.name, None
+            return f"odometry has begun again, so that the way of the route {name} is not known: teach it again"
         try:
             self._recorder.add(now.map_pose(), now.speed_mps, tie.id, tie.pose)
         except OmnidError as error:

@@ -1,7 +1,8 @@
 """Attack the daemon: `python -m tests.faults [PART ...]` prints tables in Markdown and returns 1 where it did not hold.
 
-Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), commands (mutated commands),
-files (mutated files). The whole campaign is seeded and bounded; with the numbers of the defaults it takes some hours.
+Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), routes (the same in the
+midst of a route, in a closed loop), commands (mutated commands), files (mutated files). The campaign is seeded and
+bounded; with the numbers of the defaults it takes some hours.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tests.faults import hostile_commands, hostile_files, stop_times
+from tests.faults import hostile_commands, hostile_files, route_stops, stop_times
 from tests.faults.trials import TRIALS, Outcome, Setting
 from tests.simulation import build, write_log
 
@@ -58,7 +59,7 @@ def busy_processes(count: int) -> Iterator[None]:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the options."""
     result = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parts = ("trials", "stops", "commands", "files")
+    parts = ("trials", "stops", "routes", "commands", "files")
     result.add_argument("parts", nargs="*", choices=[*parts, []], default=parts, metavar="PART", help=", ".join(parts))
     result.add_argument("--only", action="append", default=[], metavar="WORD",
                         help="of trials and stops, those whose name has the word; may be given several times")
@@ -84,6 +85,8 @@ def main() -> int:
             failed += run_trials(recorded, folder, args.only, report)
         if "stops" in args.parts:
             failed += stop_times.run(recorded, folder, args.only, args.stops, args.seed, report)
+        if "routes" in args.parts:
+            failed += route_stops.run(folder, args.only, args.stops, args.seed, report)
         if "commands" in args.parts:
             failed += hostile_commands.run(recorded, folder, args.commands, args.seed, report)
         if "files" in args.parts:

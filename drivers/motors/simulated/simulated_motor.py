@@ -42,11 +42,12 @@ class SimulatedMotor:
         self.drop_input = False  # fault: received bytes are ignored
         self.garbage = b""  # fault: sent before each reply
         self.poses: deque[tuple[int, Pose]] = deque(maxlen=POSES_KEPT)  # time (CLOCK_MONOTONIC) [ns] and pose
-        self._device, self._host = os.openpty()
+        device, self._host = os.openpty()
         tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
-        os.set_blocking(self._device, False)
+        os.set_blocking(device, False)
+        self._device: int | None = device  # None: unplugged
         self.port = os.ttyname(self._host)
-        self._expiring = threading.Event()
+        self._expiring, self._unplugging = threading.Event(), threading.Event()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._serve, name="simulated-motor", daemon=True)
         self._thread.start()
@@ -87,10 +88,17 @@ class SimulatedMotor:
         while self._expiring.is_set() and self._thread.is_alive():
             time.sleep(STEP_S)
 
+    def unplug(self) -> None:
+        """Close the pty for good, as a plug that is pulled; the controller goes on, and its watchdog stops the wheels.
+        """
+        self._unplugging.set()
+        while self._device is not None and self._thread.is_alive():
+            time.sleep(STEP_S)
+
     def send(self, data: bytes) -> None:
         """Send bytes; drop them where the host does not read."""
         with contextlib.suppress(BlockingIOError):
-            if os.write(self._device, data) == len(data):
+            if self._device is not None and os.write(self._device, data) == len(data):
                 return
         self.unsent += 1
 
@@ -100,13 +108,21 @@ class SimulatedMotor:
             return
         os.write(self._wake_write, b"x")
         self._thread.join()
-        for descriptor in (self._device, self._host, self._wake_read, self._wake_write):
+        self._close_pty()
+        for descriptor in (self._wake_read, self._wake_write):
             os.close(descriptor)
+
+    def _close_pty(self) -> None:
+        if self._device is not None:
+            os.close(self._device)
+            os.close(self._host)
+            self._device = None
 
     def _serve(self) -> None:
         last_s = time.monotonic()
         while True:
-            readable, _, _ = select.select([self._device, self._wake_read], [], [], STEP_S)
+            sources = [self._wake_read] if self._device is None else [self._wake_read, self._device]
+            readable, _, _ = select.select(sources, [], [], STEP_S)
             now_s = time.monotonic()
             self.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
             last_s = now_s
@@ -116,7 +132,9 @@ class SimulatedMotor:
             if self._expiring.is_set():
                 self.base.expire()
                 self._expiring.clear()
-            if readable:
+            if self._unplugging.is_set():
+                self._close_pty()
+            elif readable and self._device is not None:
                 self._receive(os.read(self._device, READ_LIMIT_BYTES))
 
     def _receive(self, data: bytes) -> None:

@@ -9,53 +9,84 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib import se3
 from omnid.controller.statistics import ControllerState
-from omnid.core.navigation.requests import GoalRequest, PathRequest
-from omnid.messages import NavigationUpdate
+from omnid.core.navigation.path import drive_path
+from omnid.core.navigation.requests import PathRequest, RouteAction, RouteRequest
+from omnid.messages import NavigationUpdate, PlaceUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.simulation.demonstration import GOALS, SIDE_M, SquareTwice, apart_m, draw
-from omnid.simulation.lockstep import Moment
+from omnid.simulation.demonstration import RECOGNISED_S, TeachAndRepeat, cross_track_m, draw, oval
+from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.world_file import load_world
+from omnid.tracking_state import MapState
 
-CORNERS = [(0.0, 0.0), (SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0), (0.0, 0.0)]
+REACHED, DRIVING = NavigationState.REACHED, NavigationState.DRIVING
 
 
-def moment(time_s: float, place: tuple[float, float], state: NavigationState | None) -> Moment:
-    """Return a moment of an armed robot that knows where it is."""
-    navigation = None if state is None else NavigationUpdate(0, 0, None, state, "why")
+def moment(time_s: float, state: NavigationState | None, map_state: MapState = MapState.LOCALIZED, refusal: str = ""
+           ) -> Moment:
+    """Return a moment of an armed robot."""
+    answer = RequestAnswer(1, 0, "teach", refusal)
+    navigation = None if state is None else NavigationUpdate(0, 0, None, state, "why", answer=answer)
     seen = cast("Any", object())  # only whether there is a pose counts
-    return Moment(time_s, np.eye(4), ControllerState(armed=True), seen, se3.transform(np.eye(3), [*place, 0.0]),
-                  navigation, None)
+    place = PlaceUpdate(0, 0, np.eye(4), np.eye(4), np.eye(6), map_state, 0, np.eye(4))
+    return Moment(time_s, np.eye(4), ControllerState(armed=True), seen, np.eye(4), navigation, place)
 
 
-def test_the_square_is_driven_by_goals_and_again_along_its_path() -> None:
+def begun() -> tuple[TeachAndRepeat, list[str]]:
+    """Return a script that has sent its first requests, and the list of its lines."""
     lines: list[str] = []
-    script, asked = SquareTwice(lines.append), []
-    assert list(script(replace(moment(0.0, CORNERS[0], None), odometry=None))) == []
-    assert list(script(replace(moment(0.1, CORNERS[0], None), controller=ControllerState()))) == ["arm"]
-    for number, place in enumerate(CORNERS):
-        state = NavigationState.REACHED if number else NavigationState.IDLE
-        asked += list(script(moment(10.0 * number + 1, place, state)))
-        assert list(script(moment(10.0 * number + 2, place, NavigationState.DRIVING))) == []
-    goals, path, end = asked[:4], asked[4], asked[5]
-    assert [(goal.x_m, goal.y_m, goal.heading_rad) for goal in goals if isinstance(goal, GoalRequest)] == list(GOALS)
-    assert isinstance(path, PathRequest) and path.xy.tolist() == [list(corner) for corner in CORNERS[:5]]
-    assert end == "end" and script.end == "reached" and script.repeated_s == 41.0 and len(lines) == 5
+    script = TeachAndRepeat(lines.append)
+    assert list(script(replace(moment(0.0, None), place=None))) == []
+    assert list(script(replace(moment(0.1, None), controller=ControllerState()))) == ["arm"]
+    teach, path = script(moment(1.0, None, MapState.ODOMETRY_ONLY))
+    assert teach == RouteRequest(RouteAction.TEACH, "demo")
+    assert isinstance(path, PathRequest) and len(drive_path(path.xy).legs) == 1, "it is driven without a halt"
+    return script, lines
 
 
-def test_a_drive_that_fails_is_reported() -> None:
-    script = SquareTwice(lambda line: None)
-    list(script(moment(1.0, (0.0, 0.0), NavigationState.REACHED)))
-    assert list(script(moment(9.0, (0.5, 0.0), NavigationState.FAILED))) == ["end"]
-    assert script.end == "failed: why" and math.isinf(script.repeated_s)
+def test_the_oval_is_round_and_closed() -> None:
+    xy = oval()
+    steps = np.hypot(*np.diff(xy, axis=0).T)
+    assert steps.sum() == pytest.approx(6.0, abs=0.05)
+    np.testing.assert_allclose(xy[0], xy[-1], atol=1e-9)
 
 
-def test_both_paths_are_drawn() -> None:
+def test_the_route_is_taught_and_repeated_when_its_start_is_recognised() -> None:
+    script, lines = begun()
+    sent: list[Request] = []
+    for at_s, state, map_state in ((1.2, REACHED, MapState.ODOMETRY_ONLY), (9.0, DRIVING, MapState.ODOMETRY_ONLY),
+                                   (17.0, REACHED, MapState.ODOMETRY_ONLY), (18.0, REACHED, MapState.LOCALIZED),
+                                   (18.1, REACHED, MapState.LOCALIZED), (30.0, DRIVING, MapState.LOCALIZED)):
+        sent += list(script(moment(at_s, state, map_state)))
+    assert sent == [RouteRequest(RouteAction.FINISH), RouteRequest(RouteAction.REPEAT, "demo")]
+    assert script.repeated_s == 18.0
+    assert list(script(moment(36.0, REACHED))) == ["end"] and script.end == "reached"
+    assert any("repeats" in line for line in lines)
+
+
+@pytest.mark.parametrize(("at_s", "state", "map_state", "refusal", "end"), [
+    (9.0, NavigationState.FAILED, MapState.LOCALIZED, "", "failed: why"),
+    (9.0, DRIVING, MapState.LOCALIZED, "no map", "refused: no map")])
+def test_a_drive_that_fails_is_reported(at_s: float, state: NavigationState, map_state: MapState, refusal: str,
+                                        end: str) -> None:
+    script, _ = begun()
+    assert list(script(moment(at_s, state, map_state, refusal))) == ["end"]
+    assert script.end == end and math.isinf(script.repeated_s)
+
+
+def test_a_start_that_is_not_recognised_ends_it() -> None:
+    script, _ = begun()
+    assert list(script(moment(17.0, REACHED, MapState.ODOMETRY_ONLY))) == []
+    assert list(script(moment(17.1 + RECOGNISED_S, REACHED, MapState.ODOMETRY_ONLY))) == ["end"]
+    assert "not recognised" in script.end
+
+
+def test_both_paths_and_what_was_seen_are_drawn() -> None:
     first = np.array([[-1.0, -1.0], [0.0, -1.0], [0.0, 0.0]])
     aside = np.array([0.0, 0.5])
-    image = draw(load_world("room", 1), first, first + aside)
-    assert image.shape[0] < image.shape[1] and image.dtype == np.uint8
-    red = (image[..., 2].astype(int) - image[..., 0] > 100).sum()
-    assert red > 200 and (image.max(axis=2) < 40).sum() > 300
-    assert apart_m(first, first + aside).max() == pytest.approx(0.5)
+    obstacles = np.column_stack([np.linspace(-2, 2, 400), np.full(400, 2.0)])
+    image = draw(load_world("room", 1), np.vstack([obstacles, [(90.0, 0.0)]]), first, first + aside).astype(int)
+    assert image.shape[0] < image.shape[1]
+    assert (image[..., 2] - image[..., 0] > 100).sum() > 200 and (image.max(axis=2) < 40).sum() > 300
+    assert 100 < (image[..., 0] - image[..., 2] > 100).sum() <= 400
+    np.testing.assert_allclose(cross_track_m(first, np.array([(-0.5, -1.2), (0.3, -0.5), (-1.0, -1.0)])), [0.2, 0.3, 0])

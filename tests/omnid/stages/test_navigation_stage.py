@@ -51,8 +51,8 @@ class FixedMap:
     name = "site.omap"
     saves = 0
 
-    def __init__(self, stamp_ns: int = 5) -> None:
-        self._stamp_ns = stamp_ns
+    def __init__(self, stamp_ns: int = 5, *, is_new: bool = False) -> None:
+        self._stamp_ns, self.is_new = stamp_ns, is_new
 
     def keyframe(self, id: int) -> KeyframePose | None:
         return KeyframePose(self._stamp_ns, np.zeros(3)) if id == 3 else None
@@ -75,7 +75,7 @@ class Robot:
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []
-        self.map_state = MapState.LOCALIZED
+        self.map_state, self.resets = MapState.LOCALIZED, 0
         self.in_map = True
 
     def send(self, request: NavigationRequest, stamp_ns: int = 0) -> NavigationUpdate:
@@ -100,7 +100,7 @@ class Robot:
             self.stage.process(PlaceUpdate(self.seq, stamp_ns, T_map_odom, T_map_rig, UNIT, self.map_state, 3,
                                            T_keyframe_rig))
         update = self.stage.process(OdometryUpdate(
-            self.seq, stamp_ns, T_odom_rig, UNIT, velocity, UNIT, TrackingState.TRACKING, 0, 100, 100, DEPTH))
+            self.seq, stamp_ns, T_odom_rig, UNIT, velocity, UNIT, TrackingState.TRACKING, self.resets, 100, 100, DEPTH))
         if update is not None:
             self.updates.append(update)
         if update is not None and update.setpoint is not None:
@@ -233,6 +233,24 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     other.places.name = ""
     update = other.send(RouteRequest(RouteAction.TEACH, "x"))
     assert update.answer is not None and "omnid run --map" in update.answer.refusal
+
+
+def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path: Path) -> None:
+    for is_new in (True, False):
+        robot = Robot(tmp_path, FixedMap(is_new=is_new))
+        robot.map_state = MapState.ODOMETRY_ONLY
+        robot.pass_on()
+        answer = robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer
+        assert answer is not None and answer.refusal.startswith("" if is_new else "not localised in a map")
+        robot.send(GoalRequest(ODOM, 1.5, 0.0))
+        robot.run()
+        assert robot.updates[-1].teaching == ("hall" if is_new else "")
+        if is_new:
+            robot.resets = 1
+            robot.pass_on()
+            answer = robot.updates[-1].answer
+            assert answer is not None and "teach it again" in answer.refusal and not robot.updates[-1].teaching
+            assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
 
 
 def test_the_state_is_given_each_second_while_nothing_happens(tmp_path: Path) -> None:
