@@ -69,12 +69,12 @@ ARROWS: Mapping[str, str] = {
     "omnid.client": "omnid.errors omnid.transport",
     "omnid.commands":
         "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file calib.rig "
-        "calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras drivers.errors "
-        "drivers.frame drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller "
-        "omnid.core.navigation omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics omnid.doctor "
-        "omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.recordings omnid.report "
-        "omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.simulation omnid.sinks omnid.stages "
-        "omnid.transport omnid.viewer omnid.web",
+        "calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras drivers.errors drivers.frame "
+        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller omnid.core.navigation "
+        "omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics omnid.doctor omnid.engine "
+        "omnid.errors omnid.formats omnid.messages omnid.monitor omnid.navigation_state omnid.recordings "
+        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.simulation omnid.sinks "
+        "omnid.stages omnid.transport omnid.viewer omnid.web",
     "omnid.config":
         "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation omnid.core.obstacles "
         "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "
@@ -140,8 +140,9 @@ ARROWS: Mapping[str, str] = {
     "omnid.simulation":
         "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.cameras drivers.errors "
         "drivers.frame drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated omnid.config "
-        "omnid.controller omnid.core.control omnid.core.navigation omnid.engine omnid.errors omnid.formats "
-        "omnid.messages omnid.navigation_state omnid.runs omnid.simulation.rendering omnid.sinks omnid.stages",
+        "omnid.controller omnid.core.control omnid.core.mapping omnid.core.navigation omnid.engine omnid.errors "
+        "omnid.formats omnid.messages omnid.navigation_state omnid.runs omnid.simulation.rendering omnid.sinks "
+        "omnid.stages omnid.tracking_state",
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":
