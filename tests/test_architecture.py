@@ -120,18 +120,18 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.se3 calib.validation drivers.errors drivers.logs omnid.errors omnid.formats "
         "omnid.tracking_state omnid.transport",
     "omnid.refinement":
-        "calib.errors calib.fit calib.rig calib.rig_covariance calib.rig_file calib.se3 omnid.calibration omnid.config "
-        "omnid.messages omnid.stages omnid.tracking_state omnid.transport",
+        "calib.errors calib.fit calib.rig calib.rig_covariance calib.rig_file calib.se3 omnid.calibration "
+        "omnid.config omnid.core.rig omnid.errors omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.report":
         "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
         "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
         "omnid.stages omnid.tracking_state omnid.transport omnid.version",
     "omnid.runs":
         "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.imu "
-        "drivers.logs drivers.motion drivers.motor omnid.config omnid.controller omnid.core.control "
-        "omnid.core.mapping omnid.core.navigation omnid.core.odometry omnid.core.places omnid.diagnostics "
-        "omnid.engine omnid.errors omnid.formats omnid.light omnid.messages omnid.refinement omnid.settings_dump "
-        "omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
+        "drivers.logs drivers.motion drivers.motor omnid.calibration omnid.config omnid.controller "
+        "omnid.core.control omnid.core.mapping omnid.core.navigation omnid.core.odometry omnid.core.places "
+        "omnid.diagnostics omnid.engine omnid.errors omnid.formats omnid.light omnid.messages omnid.refinement "
+        "omnid.settings_dump omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
     "omnid.settings": "calib.bounded_toml omnid.errors",

@@ -47,6 +47,7 @@ class Sinks:
     bus: Sink[Outgoing] | None = None
     live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
     replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
+    rig_gate: RigGate | None = None  # that has seen pairs of the log already; None: the run's own
     rig_monitor: Sink[OdometryUpdate] | None = None
     rig_broken: Callable[[], bool] = never  # what the rig monitor has found
     navigation: NavigationParts | None = None
@@ -96,7 +97,7 @@ class WiredStages(NamedTuple):
 
 def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
-    rig_gate = RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
+    rig_gate = sinks.rig_gate or RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
     versions = sinks.versions or GeometryVersions(geometry)
     stereo = Stereo(versions, config.stereo_settings(), rig_gate)
     panoramas = graph.stage("dewarp", Dewarp(versions, config.panorama, config.camera), pairs, direct=True)

@@ -33,6 +33,7 @@ from omnid.messages import MapUpdate
 from omnid.runs.log_rig import attached_rig
 from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.place_maps import RigPlaces, RunPlaces
+from omnid.runs.rig_examination import examined_gate
 from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import Session
@@ -127,9 +128,10 @@ class _Replay:
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
+            gate = examined_gate(reader, self._log, geometry, self._config)
             run_places = RunPlaces(self._config, geometry, session.warn, self._options.rig_places,
                                    build=self._options.build)
-            sinks = run_places.known_to(self._sinks(session, geometry))
+            sinks = replace(run_places.known_to(self._sinks(session, geometry)), rig_gate=gate)
             pairing = Synchronise(geometry.rig, self._config.pair, self._config.motion.R_base_imu)
             pairs = graph.stage("pair", pairing, self._messages(graph, reader, pairing))
             stages = wire(graph, pairs, geometry, self._config, sinks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import LogReader
+from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config, PanoramaConfig, RigConfig, StereoConfig
 from omnid.engine.graph import Graph
 from omnid.formats.tum import read_tum
@@ -22,13 +24,15 @@ from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.refinement.estimate import RefinementRequest, RigChange, estimate
 from omnid.refinement.rig_application import MARK, RigApplication
 from omnid.refinement.rig_refinement import RigRefinement
+from omnid.refinement.rig_verdict import other_rig
 from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.replay import ReplayOptions, run_log
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import GeometryVersions, geometry
 from omnid.stages.odometry import OdometryStage
-from omnid.stages.rig_gate import RigGate
+from omnid.stages.rig_gate import RigContradictedError, RigGate
 from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.codec import DiagnosticStatus
@@ -273,3 +277,29 @@ def test_a_late_upper_camera_is_found_where_there_is_one(offset_ms: float) -> No
     assert change.rig.times.upper_delay_s == pytest.approx(1e-3 * offset_ms, abs=3e-4 if offset_ms else 0.0)
     assert change.rig.lower == truth.lower, "the geometry stays where only the delay has changed"
     assert estimate(RefinementRequest(truth, state, observations)).delay_ms is None
+
+
+def test_another_mirror_is_no_rig_of_a_log_and_a_replay_writes_nothing(rooms: Path, tmp_path: Path) -> None:
+    right = read_rig(rooms / "rig.toml")
+    other = replace(right, lower=other_mirror(right.lower), upper=other_mirror(right.upper))
+    write_rig(tmp_path / "other.toml", other)
+    options = ReplayOptions(rig=tmp_path / "other.toml", tum=tmp_path / "a.tum", record=tmp_path / "a.mcap")
+    with pytest.raises(RigContradictedError, match=r"xi would change from 0.75 to .*rig_check=warn"):
+        run_log(rooms / "log.mcap", Config(), options)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other.toml"]
+
+
+def other_mirror(mounted: MountedCamera) -> MountedCamera:
+    """Return the camera below a mirror of another shape, about as large in the image."""
+    camera = mounted.camera
+    assert isinstance(camera, UnifiedCamera)
+    return replace(mounted, camera=replace(camera, xi=0.75, focal=(1.2 * camera.focal[0], 1.2 * camera.focal[1])))
+
+
+@pytest.mark.slow
+def test_a_rig_that_can_be_corrected_is_not_refused(rooms: Path) -> None:
+    right, config = read_rig(rooms / "rig.toml"), Config()
+    rig = replace(right, lower=shifted(right.lower, 1), upper=shifted(right.upper, -1))
+    place = geometry(rig, config.panorama)
+    with closing(LogReader(rooms / "log.mcap")) as reader:
+        assert other_rig(tracked_updates(reader, place, config, rooms), place) == ""
