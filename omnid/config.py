@@ -156,8 +156,8 @@ class PlacesConfig:
     """Recognition of places: loops, and the pose in the map."""
 
     enabled: bool = knob(True, "recognise places and correct the pose in the map; off: it is that of odometry")
-    map: str = knob("", "map of places (.omap) to localise in, made by `omnid map build`; a run that recognises it "
-                    "extends it")
+    map: str = knob("", "map of places (.omap) to localise in; a run that recognises it extends it, and makes it "
+                    "where there is none")
     localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
     save_s: float = knob(60.0, "time between two saves of the extended map, s; it is also saved at the end",
                          low=1, high=86400)

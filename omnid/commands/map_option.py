@@ -9,8 +9,9 @@ from pathlib import Path
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add --map and --localize-only."""
     group = parser.add_argument_group("map of places")
-    group.add_argument("--map", type=Path, metavar="FILE.omap", help="localise in a map of `omnid map build`, and "
-                       "extend it at the end; the points of the 3-D map are written by `omnid replay --cloud FILE.ply`")
+    group.add_argument("--map", type=Path, metavar="FILE.omap", help="localise in a map of places and extend it at "
+                       "the end; a file that does not exist is made; the points of the 3-D map are written by "
+                       "`omnid replay --cloud FILE.ply`")
     group.add_argument("--localize-only", action="store_true", help="leave the map as it is")
 
 

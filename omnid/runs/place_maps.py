@@ -37,6 +37,7 @@ class RunPlaces:
 
         warn: takes a line for the user.
 
+        A file that does not exist is made by this run, unless it only localises.
         Raises OmnidError for a file that is no map, or that of another rig.
         """
         settings, self._warn = config.places, warn
@@ -44,11 +45,14 @@ class RunPlaces:
         self._path = Path(settings.map) if settings.map and given is None and not build else None
         self._writes = self._path is not None and not settings.localize_only
         self._rig = place_rig(geometry)
-        if self._path is not None:
-            given = RigPlaces(*read_places(self._path, new_places(settings)))
         if self._path is not None and self._writes:
             check_outputs([("--map", self._path)], [])
-        self.places = given.places if given else new_places(settings) if build else None
+        begins = self._path is not None and self._writes and not self._path.exists()
+        if begins:
+            self._warn(f"{self._path}: there is no such map: this run begins a new one")
+        elif self._path is not None:
+            given = RigPlaces(*read_places(self._path, new_places(settings)))
+        self.places = given.places if given else new_places(settings) if build or begins else None
         self._saved = frozenset[int]()  # keyframes in the file
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         if given is not None and self._known:
@@ -108,6 +112,8 @@ class RunPlaces:
             self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
         if self._path is not None and self._writes and new:
             write_places(self._path, self.places, self._rig)
+        elif self._path is not None and self._writes and not self._known:
+            self._warn(f"{self._path}: no keyframe was found: no map was written")
         return found
 
     def _joined(self, places: PlaceMap) -> frozenset[int]:

@@ -55,6 +55,13 @@ def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     np.testing.assert_allclose(in_map.T[-1][:3, 3], T[:3, 3], atol=0.02)
 
 
+def test_a_map_that_does_not_exist_is_made_and_told(omnid: Command, scene: Path, built: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new.omap"
+    result = omnid.replay(scene / "log.mcap", "--map", new, rig=scene / "rig.toml")
+    assert result.code == 0 and f"{new}: there is no such map: this run begins a new one" in result.err
+    assert new.read_bytes() == built.read_bytes()
+
+
 def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_again_warns(
     omnid: Command, scene: Path, omap: Path, tmp_path: Path
 ) -> None:
@@ -110,7 +117,8 @@ def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Pa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--map", "{}/none.omap"], "cannot read the map"),
+        (["--map", "{}/none.omap", "--localize-only"], "cannot read the map"),
+        (["--map", "{}/none/a.omap"], "there is no folder"),
         (["--map", "{}/a.ply"], "--cloud FILE.ply"),
         (["--map", "{}/log.mcap"], "expected a map of places"),
         (["--localize-only"], "needs a map"),

@@ -21,7 +21,7 @@ CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
 KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
-SURE_INLIERS: Final = 40  # of recognitions that count without motion between them
+SURE_INLIERS: Final = 24  # of recognitions that count without motion: a robot may stand
 
 
 @dataclass(frozen=True, slots=True, eq=False)

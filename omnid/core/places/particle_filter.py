@@ -197,10 +197,12 @@ def _heaviest_group(poses: Array, weight: Array) -> tuple[Array, Array, float]:
         share = float(member.sum())
         apart = poses - centre
         apart[:, 2] = wrapped(apart[:, 2])
-        centre = centre + member @ apart / share
+        # Sums over particles in their order: those of BLAS depend on its threads, and the result would differ by a bit.
+        centre = centre + (member[:, None] * apart).sum(axis=0) / share
     apart = poses - centre
     apart[:, 2] = wrapped(apart[:, 2])
-    return centre, np.asarray((member[:, None] * apart).T @ apart / share), share
+    outer = member[:, None, None] * apart[:, :, None] * apart[:, None, :]
+    return centre, np.asarray(outer.sum(axis=0) / share), share
 
 
 def _is_near(poses: Array, centre: Array) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Search of a frame among the keyframes of a map: a shortlist by signatures, then geometry, then doubt."""
+"""Search of a frame among the keyframes of a map: a shortlist by signatures and votes, geometry, doubt."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition, recognise
 from omnid.core.places.signature import Signature, signature_of, similarities
+from omnid.core.places.votes import votes
 
 Array = NDArray[np.float64]
 
 NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
 NEAR_CANDIDATES: Final = 3  # keyframes that are compared where odometry tells about where the robot is
 FAR_CANDIDATES: Final = 8  # keyframes that are compared where it does not
+VOTED: Final = 200  # keyframes of the most similar signatures, among which features vote
 NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
-FAR_INLIERS, FAR_SECTORS = 30, 5  # least support where it cannot tell
+FAR_INLIERS, FAR_SECTORS = 24, 5  # least support where it cannot tell
 PER_PLACE, SAME_PLACE_M = 3, 1.5  # at most so many of the keyframes that are compared lie so near together
 ENOUGH_INLIERS: Final = 50  # of a place that is enough
 RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
@@ -76,7 +78,7 @@ class PlaceSearch:
 
     def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, among: tuple[PlaceMap, list[int]], most: int,
                  enough: int) -> list[Recognition]:
-        """Return the recognitions among the keyframes of a map (ids) that look most similar, at most so many.
+        """Return the recognitions among the keyframes of a map (ids) that get most votes, at most so many.
 
         The search ends at a recognition with enough inliers.
         """
@@ -85,12 +87,13 @@ class PlaceSearch:
         if not ids:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
-        similar, turns_rad = similarities(signature_of(small), others)
-        chosen = _spread(np.argsort(-similar, kind="stable"), places.positions(ids), most)
+        similar = similarities(signature_of(small), others)
+        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[:VOTED].tolist()]
+        voted = [votes(features, places.keyframes[id].features, self._model.cylinder.width) for id in ids]
+        ranked = np.argsort([-count for count, _ in voted], kind="stable")
         found: list[Recognition] = []
-        for n in chosen:
-            there = places.keyframes[ids[n]].features
-            place = recognise(features, there, ids[n], float(turns_rad[n]), self._model)
+        for n in _spread(ranked, places.positions(ids), most):
+            place = recognise(features, places.keyframes[ids[n]].features, ids[n], voted[n][1], self._model)
             self.compared[ids[n]] = 0 if place is None else place.inliers
             if place is not None:
                 found.append(place)

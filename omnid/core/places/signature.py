@@ -48,16 +48,10 @@ def similarity(a: Signature, b: Signature) -> float:
     return float(_correlation(a, b).max())
 
 
-def similarities(a: Signature, others: NDArray[np.complex64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the largest circular correlations (N,) with others (N, ROWS, ...), and the turns (N,) [rad] there.
-
-    A turn is the angle, to the left, from the heading of the other panorama to that of a.
-    """
+def similarities(a: Signature, others: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the largest circular correlations (N,) over all headings with others (N, ROWS, COLUMNS / 2 + 1)."""
     correlation = np.fft.irfft(np.einsum("rk,nrk->nk", a, others.conj()), COLUMNS, axis=1)
-    best = correlation.argmax(axis=1)
-    shift = (best + COLUMNS // 2) % COLUMNS - COLUMNS // 2
-    # Azimuth falls from left to right: what moved to the right was turned away from.
-    return correlation.max(axis=1).astype(np.float32), 2 * math.pi / COLUMNS * shift
+    return np.asarray(correlation.max(axis=1), np.float32)
 
 
 def _correlation(a: Signature, b: Signature) -> NDArray[np.float64]:

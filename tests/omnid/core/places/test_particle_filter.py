@@ -118,3 +118,4 @@ def test_the_same_input_gives_the_same_result_and_numpys_generator_is_left_alone
     first, second = (run(ParticleFilter(grid, 8), CORNERED, truth)[-1] for _ in range(2))
     assert np.random.random() == expected
     assert first.T_map_rect.tobytes() == second.T_map_rect.tobytes() and first.share == second.share
+    assert first.covariance.tobytes() == second.covariance.tobytes()
