@@ -58,6 +58,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield devices.memberships()
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield from machine.clock()
+    yield from machine.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
     yield from wiring.bus(config.bus)

@@ -1,8 +1,9 @@
-"""Checks of the machine: clocks, real-time rights, disk, packages."""
+"""Checks of the machine: clocks, real-time rights, disk, packages, compiled functions."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import shutil
 import time
@@ -15,6 +16,7 @@ from typing import Final
 
 from omnid.config import RecordConfig
 from omnid.doctor.finding import Finding
+from omnid.engine.kernel_cache import kept_kernels
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 
 PACKAGES: Final = {"numpy": "numpy", "opencv-python-headless": "cv2", "eclipse-zenoh": "zenoh", "mcap": "mcap",
@@ -24,6 +26,7 @@ _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
 _TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
 _SLOW_CLOCKS: Final = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
+CACHE: Final = Path("/var/cache/omnid")  # CacheDirectory of the unit
 
 
 def clock(now_s: float | None = None, synchronised: bool | None = None, root: Path = Path("/")) -> Iterator[Finding]:
@@ -93,6 +96,27 @@ def programs() -> Iterator[Finding]:
         except ImportError as error:
             yield Finding("error", "programs", f"{package}: {error}", f"/opt/omnid/bin/pip install {package}")
     yield Finding("ok", "programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
+
+
+def compiled_functions(service: Path = CACHE) -> Iterator[Finding]:
+    """Check that functions can be compiled, and whether the next start finds them compiled.
+
+    service: the cache of the unit, which root asks about once the unit has made it; other users ask about their own.
+    """
+    try:
+        kept = kept_kernels(service if os.geteuid() == 0 and service.is_dir() else None)
+    except (ImportError, OSError) as error:
+        yield Finding("error", "compiled code", f"numba cannot be used: {error}", "`/opt/omnid/bin/pip install numba`; "
+                      "remove MemoryDenyWriteExecute= from the unit, or what else denies executable memory")
+        return
+    if kept.unusable:
+        yield Finding("warning", "compiled code", f"cannot be kept in {kept.folder}: {kept.unusable}: every start "
+                      "takes half a minute longer", "make that folder writable, or set OMNID_CACHE_DIR to another one")
+    elif kept.missing:
+        yield Finding("ok", "compiled code", f"{kept.missing} functions will be compiled at the next start, which "
+                      f"takes half a minute, and be kept in {kept.folder}")
+    else:
+        yield Finding("ok", "compiled code", f"{kept.kept} functions in {kept.folder}")
 
 
 def _version(package: str) -> str:

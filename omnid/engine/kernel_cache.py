@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import omnid.core
 from omnid.core.compiled import KERNEL_FILES, Kernel, declared
@@ -68,6 +68,31 @@ def read_kept_kernels() -> None:
             _compile_into(name, folder)
             with suppress(OSError):
                 os.utime(folder)  # used: not the next to be removed
+
+
+class KeptKernels(NamedTuple):
+    """What is on the disk, as the next start finds it."""
+
+    folder: Path
+    unusable: str  # why nothing can be kept there; empty if it can
+    kept: int  # functions
+    missing: int  # functions that the next start compiles
+
+
+def kept_kernels(service: Path | None = None) -> KeptKernels:
+    """Return what is kept in the folder of this program, or in that of the service, which belongs to another user.
+
+    Raises OSError where the system allows no code that is made at run time.
+    """
+    folder = service or cache_folder()
+    unusable = "" if service else _why_unusable(folder)
+    owner = folder.stat().st_uid if service else os.geteuid()
+    counts = {True: 0, False: 0}
+    for name, path in _kernel_files().items():
+        importlib.import_module(name)
+        if functions := len(_functions_of(name)):
+            counts[not unusable and _is_intact(folder / _folder_of_state(path).name, owner)] += functions
+    return KeptKernels(folder, unusable, counts[True], counts[False])
 
 
 def _is_ready(name: str) -> bool:
@@ -189,11 +214,11 @@ def _digests(folder: Path) -> dict[str, str]:
             for path in sorted(folder.rglob("*")) if path.is_file() and path.name != DIGESTS}
 
 
-def _is_intact(folder: Path) -> bool:
-    """True if a folder is complete and its files are those that were written."""
+def _is_intact(folder: Path, owner: int | None = None) -> bool:
+    """True if a folder is complete and its files are those that its owner wrote; None: this user."""
     try:
         status = folder.stat()
-        if status.st_uid != os.geteuid() or status.st_mode & _OWN_ONLY:
+        if status.st_uid != (os.geteuid() if owner is None else owner) or status.st_mode & _OWN_ONLY:
             return False
         if sum(path.stat().st_size for path in folder.rglob("*")) > MAX_BYTES:
             return False

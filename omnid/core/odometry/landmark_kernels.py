@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.odometry.pose_kernels import CameraNumbers, moved
+from omnid.core.odometry.view_kernels import MIN_RADIUS_M, CameraNumbers, moved
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-MIN_RADIUS_M = 1e-9  # from the axis: a point on it has no disparity
 CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used
 

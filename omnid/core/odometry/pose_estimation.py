@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry import pose_kernels
-from omnid.core.odometry.pose_kernels import CameraNumbers
+from omnid.core.odometry import pose_kernels, ransac_kernels
+from omnid.core.odometry.view_kernels import CameraNumbers
 from omnid.core.stereo.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Ge
     seen = triangulate(views, model.cylinder, model.baseline_m)
     best, consensus = np.empty((4, 4)), np.empty(len(landmarks), bool)
     seed = rng.integers(2**64, dtype=np.uint64)
-    pose_kernels.ransac(landmarks, views, seen, model.camera, threshold_px, seed, best, consensus)
+    ransac_kernels.ransac(landmarks, views, seen, model.camera, threshold_px, seed, best, consensus)
     return best, consensus
 
 

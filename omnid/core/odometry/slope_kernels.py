@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
+from omnid.core.odometry.linear_kernels import factorise, solve
 from omnid.core.odometry.patch_kernels import LARGEST_GAIN, LEAST_GAIN, MIN_CONTRAST, NOISE_CORRELATION
 from omnid.core.odometry.plane_kernels import MAX_SLOPE
 
@@ -103,6 +104,7 @@ def iterate(upper: Image, design: Array, normal: Array, near: Array, disparity: 
         factor[3, 3] += prior
         factor[0, 0] += DAMPING
         factor[1, 1] += DAMPING
+        factorise(factor, factor)
         solve(factor, weighted, solution)
         gain = min(max(solution[4], LEAST_GAIN), LARGEST_GAIN)
         variance = max(residual_of(energy, right, normal, solution) / PIXELS, noise)
@@ -147,27 +149,6 @@ def residual_of(energy: float, right: Array, normal: Array, solution: Array) -> 
         for b in range(UNKNOWNS):
             residual += solution[a] * normal[a, b] * solution[b]
     return residual
-
-
-@inner
-def solve(factor: Array, right: Array, solution: Array) -> None:
-    """Write the solution (5,) of a positive definite system by Cholesky's method; NaN where it is not definite."""
-    for a in range(UNKNOWNS):
-        for b in range(a + 1):
-            rest = factor[a, b]
-            for k in range(b):
-                rest -= factor[a, k] * factor[b, k]
-            factor[a, b] = rest / factor[b, b] if a != b else np.sqrt(rest)
-    for a in range(UNKNOWNS):
-        rest = right[a]
-        for k in range(a):
-            rest -= factor[a, k] * solution[k]
-        solution[a] = rest / factor[a, a]
-    for a in range(UNKNOWNS - 1, -1, -1):
-        rest = solution[a]
-        for k in range(a + 1, UNKNOWNS):
-            rest -= factor[k, a] * solution[k]
-        solution[a] = rest / factor[a, a]
 
 
 @inner

@@ -5,6 +5,7 @@ from __future__ import annotations
 import grp
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -26,8 +27,9 @@ from omnid.doctor import machine
 from omnid.doctor.cameras import CameraStream, buses, cameras
 from omnid.doctor.devices import access, holders, memberships
 from omnid.doctor.finding import Finding, summary
-from omnid.doctor.machine import BUILT_S, clock, disk, is_synchronised, programs
+from omnid.doctor.machine import BUILT_S, clock, compiled_functions, disk, is_synchronised, programs
 from omnid.doctor.wiring import bus, motor, rig
+from omnid.engine.kernel_cache import cache_folder
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -329,6 +331,33 @@ def test_checks_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def router(endpoint: str) -> list[Finding]:
     return [finding for finding in bus(BusConfig(connect=(endpoint,))) if finding.subject == "router"]
+
+
+def test_tells_whether_functions_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = tmp_path / "no service"
+    (kept,) = compiled_functions(nowhere)
+    assert kept.level == "ok" and " functions in " in kept.found, "conftest.py has compiled them"
+    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "empty"))
+    (empty,) = compiled_functions(nowhere)
+    assert empty.level == "ok" and "will be compiled at the next start" in empty.found
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    (refused,) = compiled_functions(nowhere)
+    assert refused.level == "warning" and "Not a directory" in refused.found and "OMNID_CACHE_DIR" in refused.advice
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")
+def test_root_is_told_of_the_services_functions(tmp_path: Path) -> None:
+    service = tmp_path / "service"
+    shutil.copytree(cache_folder(), service, ignore=shutil.ignore_patterns("making-*"))
+    for path in (service, *service.rglob("*")):
+        os.chown(path, UNPRIVILEGED, UNPRIVILEGED)
+    (kept,) = compiled_functions(service)
+    assert kept.level == "ok" and str(service) in kept.found and " functions in " in kept.found
+    for folder in service.glob("kernels-*"):
+        folder.chmod(0o777)
+    (open_to_all,) = compiled_functions(service)
+    assert "will be compiled" in open_to_all.found
 
 
 def test_checks_that_a_router_answers() -> None:

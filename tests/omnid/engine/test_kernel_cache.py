@@ -81,7 +81,7 @@ def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
 
 def test_a_file_is_compiled_again_where_one_that_it_imports_changed() -> None:
     files = kernel_cache._kernel_files()
-    found = kernel_cache._with_imported(files["omnid.core.odometry.landmark_kernels"])
-    assert [path.stem for path in found] == ["landmark_kernels", "pose_kernels"]
+    found = kernel_cache._with_imported(files["omnid.core.odometry.slope_kernels"])
+    assert [path.stem for path in found] == ["slope_kernels", "linear_kernels", "patch_kernels", "plane_kernels"]
     assert kernel_cache._with_imported(files["omnid.core.odometry.patch_kernels"]) == [
         files["omnid.core.odometry.patch_kernels"]]
