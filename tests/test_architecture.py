@@ -166,7 +166,7 @@ ARROWS: Mapping[str, str] = {
         "omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.web":
         "drivers.errors drivers.logs omnid.client omnid.core.navigation omnid.engine omnid.errors omnid.monitor "
-        "omnid.tracking_state omnid.transport",
+        "omnid.report omnid.tracking_state omnid.transport",
 }
 
 

@@ -86,7 +86,10 @@ def shades(spans: Spans, clock: Clock) -> str:
     areas = (rectangles([(axis.px(a / seconds), axis.px(b / seconds)) for a, b in spans[rank]],
                         (_TOP, _BOTTOM)) for rank in (1, 2))
     drawn = "".join(f"<path class='r{rank}' d='{d}'/>" for rank, d in enumerate(areas, 1) if d)
-    return hidden(f"<g id='shades'>{drawn}</g>")
+    for_script = (f"data-clock='{axis.low!r} {axis.high!r} {seconds!r}' data-unit='{clock.unit[1]}' "
+                  f"data-box='{_LEFT} {_RIGHT} {_TOP} {_BOTTOM}'")
+    inside = f"<rect x='{_LEFT}' y='{_TOP}' width='{_RIGHT - _LEFT}' height='{_BOTTOM - _TOP}'/>"
+    return hidden(f"<clipPath id='inside'>{inside}</clipPath><g id='shades' {for_script}>{drawn}</g>")
 
 
 def chart(
@@ -106,27 +109,32 @@ def chart(
         return ""
     x = clock.axis(_LEFT, _RIGHT)
     y = axis_for([value for _, drawn in styled for _, value in drawn.points], (_BOTTOM, _TOP), log=log, zero=zero)
-    curves = [polyline([(x.px(t), y.px(value)) for t, value in piece], style)
-              for style, drawn in styled for piece in pieces(drawn.points)]
+    curves = "".join(_curve(style, drawn, x, y) for style, drawn in styled)
     keys = "".join(key(style, drawn.name) for style, drawn in styled if drawn.name)
     caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''} {keys}"
     footnote = f"<small>{escape(note)}</small>" if note else ""
-    image = "".join([*_grid(x, y), "<use href='#shades'/>", *_frame(x, y, clock), *curves])
+    plot = f"<g clip-path='url(#inside)'><g class='zoom'><use href='#shades'/>{curves}</g></g>"
+    image = "".join([*_grid(x, y), plot, *_frame(x, y, clock)])
     return (f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
-            f"aria-label='{escape(title)}'>{image}</svg>{footnote}</figure>")
+            f"aria-label='{escape(title)}' data-y='{y.low!r} {y.high!r} {int(y.log)}'>{image}</svg>{footnote}</figure>")
+
+
+def _curve(style: str, line: ChartLine, x: Axis, y: Axis) -> str:
+    drawn = [polyline([(x.px(t), y.px(value)) for t, value in piece], style) for piece in pieces(line.points)]
+    return f"<g data-name='{escape(line.name)}'>{''.join(drawn)}</g>"
 
 
 def _grid(x: Axis, y: Axis) -> Iterator[str]:
     rows = "".join(f"M{_LEFT} {coord(y.px(v))}H{_RIGHT}" for v in y.ticks(5))
     columns = "".join(f"M{coord(x.px(v))} {_TOP}V{_BOTTOM}" for v in x.ticks(8))
-    yield f"<path class='grid' d='{rows}{columns}'/>"
+    yield f"<path class='grid' d='{rows}'/><path class='grid columns' d='{columns}'/>"
 
 
 def _frame(x: Axis, y: Axis, clock: Clock) -> Iterator[str]:
     for value in y.ticks(5):
         yield text((_LEFT - 5, y.px(value) + 4), label(value), "text-anchor='end'")
     yield f"<path class='axis' d='M{_LEFT} {_TOP}V{_BOTTOM}H{_RIGHT}'/>"
-    yield from time_ticks(x, float(_BOTTOM), clock)
+    yield f"<g class='time'>{''.join(time_ticks(x, float(_BOTTOM), clock))}</g>"
 
 
 def time_ticks(x: Axis, bottom: float, clock: Clock) -> Iterator[str]:

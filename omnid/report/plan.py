@@ -71,8 +71,14 @@ def plan_figure(plan: Plan, clock: Clock) -> str:
              *(_cross(*sheet.px(*position)) for position in plan.lost), *_ends(sheet, plan.corners)]
     box = f"0 0 {coord(width + _MARGIN[0] + _MARGIN[2])} {coord(height + _MARGIN[1] + _MARGIN[3])}"
     return (f"<figure class='plan'><figcaption><b>Path and map</b> {_keys(plan)}</figcaption><svg viewBox='{box}' "
-            f"role='img' aria-label='Path and map'>{''.join(parts)}</svg>"
+            f"role='img' aria-label='Path and map' data-m='{_metres(sheet)}'>{''.join(parts)}</svg>"
             f"<small>{_footnote(plan, len(points_xy))}</small></figure>")
+
+
+def _metres(sheet: _PlanArea) -> str:
+    """Return x and y [m] of the figure's pixel (0, 0), and pixels per metre."""
+    x_m, y_m = sheet.low[0] - _MARGIN[0] / sheet.px_per_m, sheet.high[1] + _MARGIN[1] / sheet.px_per_m
+    return f"{x_m!r} {y_m!r} {sheet.px_per_m!r}"
 
 
 def _keys(plan: Plan) -> str:
@@ -165,7 +171,8 @@ def _line(sheet: _PlanArea, points: Sequence[Point], style: str) -> Iterator[str
 def _path(sheet: _PlanArea, corners: Sequence[Corner]) -> Iterator[str]:
     """Yield one line for each stretch of the same state, which starts at the end of the previous one."""
     at = [sheet.px(corner.x_m, corner.y_m) for corner in corners]
-    yield f"<path class='halo' d='{path_d(at)}'/>"
+    times = " ".join(f"{corner.t_s:.2f}" for corner in corners)
+    yield f"<path class='halo' d='{path_d(at)}' data-t='{times}'/>"
     for rank, group in groupby(range(1, len(corners)), lambda k: max(corners[k].rank, 0)):
         indices = list(group)
         yield polyline(at[indices[0] - 1 : indices[-1] + 1], f"class='p{rank}'")

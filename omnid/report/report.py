@@ -16,6 +16,7 @@ from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.chart import Clock
 from omnid.report.downsampling import Corner
 from omnid.report.page import figure, note, page
+from omnid.report.page_script import chart_script
 from omnid.report.panorama_images import WantedImages, panoramas
 from omnid.report.poses import MAX_KEPT
 from omnid.report.report_data import ReportData
@@ -26,21 +27,17 @@ from omnid.version import __version__
 _MOST_CROSSES: Final = 40
 _MAX_BEFORE_S: Final = 30.0  # time before the first pose that is shown, where there are events in it
 _JPEG_QUALITY: Final = 70
-_STYLE: Final = """body{max-width:1060px;font-family:system-ui,sans-serif}h1{margin-bottom:.1em;overflow-wrap:anywhere}
-h2{margin:1.6em 0 .4em;border-bottom:2px solid #222}.sub{color:#444;overflow-wrap:anywhere;margin-top:0}
-.tiles{display:flex;flex-wrap:wrap;gap:.6em 2em;margin:1em 0}.tiles b{display:block;font-size:1.35em}
-.tiles span{color:#444}.grid2{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,400px),1fr));
+_STYLE: Final = """.sub{color:#444;overflow-wrap:anywhere;margin-top:0}
+.numbers{display:flex;flex-wrap:wrap;gap:.6em 2em;margin:1em 0}.numbers b{display:block;font-size:1.35em}
+.numbers span{color:#444}.grid2{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,400px),1fr));
 gap:0 1.5em;align-items:end}
-figure{margin:.7em 0;position:relative;break-inside:avoid}figcaption{color:#222;min-height:1.5em}
-table{margin:.6em 0}small{color:#444}
 .key{white-space:nowrap;margin-left:.9em;font-size:.92em}.key svg{display:inline-block;width:34px;height:12px;
-vertical-align:middle;margin-right:.3em}.scroll{overflow-x:auto}.note{border-left:4px solid #999;padding-left:.7em;
-color:#333}.warn{color:#000;border-left:4px solid #000;padding-left:.7em}table{font-variant-numeric:tabular-nums}
+vertical-align:middle;margin-right:.3em}.scroll{overflow-x:auto}
 .words td,.words th,.events td,.events th{text-align:left;vertical-align:top}
 .events td:nth-child(-n+3){white-space:nowrap}.events{max-height:40em;overflow:auto;border:1px solid #ccc}
 .facts tr:first-child{display:none}.events td:nth-child(2){font-weight:bold}
 .lanes{overflow-x:auto}
-@media(max-width:640px){body{margin:1em auto;padding:0 .7em}td,th{padding:.15em .4em}.plan svg text{font-size:22px}
+@media(max-width:640px){.plan svg text{font-size:calc(22px*var(--px,1))}.chart svg text{font-size:16px}
 .events td:nth-child(-n+3){white-space:normal}.lanes>svg{min-width:620px}}
 @media print{@page{margin:14mm}body{font-size:10pt;margin:0;padding:0;max-width:none;-webkit-print-color-adjust:exact;
 print-color-adjust:exact}.plan>svg{max-height:150mm}.events{font-size:8.5pt}
@@ -66,7 +63,7 @@ def report_html(path: Path, data: ReportData, true: Trajectory | None = None) ->
     rest = [*_images(path, data), *setup.setup(data), *setup.contents(data),
             f"<p><small>Made by omnid {__version__}.</small></p>"]
     parts = [*top, *story, *measured, *rest]
-    return page(f"{data.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE)
+    return page(f"{data.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE, chart_script())
 
 
 def _head(path: Path, data: ReportData) -> list[str]:

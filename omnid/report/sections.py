@@ -36,7 +36,7 @@ def key_figures(data: ReportData) -> str:
     if p50:
         tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in tiles)
-    return f"<div class='tiles'>{cells}</div>"
+    return f"<div class='numbers'>{cells}</div>"
 
 
 def _shares(data: ReportData) -> Iterator[tuple[str, str]]:

@@ -18,7 +18,16 @@ STYLE: Final = """svg{display:block;width:100%;height:auto}svg text{font:12px sy
 stroke-width:2.6}.l4{stroke:#333;stroke-dasharray:9 3 2 3}.l5{stroke:#777;stroke-dasharray:3 5}
 .axis{stroke:#333;stroke-width:1;fill:none}.grid{stroke:#ddd;stroke-width:1;fill:none}
 .r1{fill:url(#weak)}.r2{fill:url(#gone)}.none{fill:#fff;stroke:#555;stroke-width:1;stroke-dasharray:2 2}
-.box{stroke:#555;stroke-width:.8}"""
+.box{stroke:#555;stroke-width:.8}
+.plan>svg text{font-size:calc(12px*var(--px,1))}.plan>svg circle{r:calc(5px*var(--px,1))}
+.zoom path,.plan>svg path,.plan>svg circle{vector-effect:non-scaling-stroke}
+.chart svg,.lanes>svg,.plan>svg{touch-action:pan-y;user-select:none;-webkit-user-select:none}
+.chart>svg,.lanes>svg,.plan>svg{cursor:crosshair}.drag{fill:#06c;fill-opacity:.15;pointer-events:none}
+.cursor{stroke:#06c;stroke-width:1;pointer-events:none}.robot{fill:#06c;stroke:#fff;stroke-width:2;pointer-events:none}
+output{display:block;position:relative;height:0;text-align:right;color:#048;font-size:.85em;pointer-events:none}
+output span{background:#fffd;padding:0 .3em}
+.hint{color:#555;font-size:.9em;margin:.2em 0}.all{position:fixed;right:1em;bottom:1em;padding:.5em 1em;font:inherit}
+@media print{.hint,.all,output{display:none}}"""
 PATTERNS: Final = """<pattern id="weak" width="7" height="7" patternUnits="userSpaceOnUse"
 patternTransform="rotate(45)"><rect width="7" height="7" fill="#fff"/>
 <path d="M0 0V7" stroke="#a8a8a8" stroke-width="1.6"/></pattern>

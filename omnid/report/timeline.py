@@ -25,7 +25,8 @@ def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock
         parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], (x, clock.unit[0]))
     parts += time_ticks(x, float(height), clock)
     return (f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
-            f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events'>{''.join(parts)}</svg>"
+            f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' "
+            f"data-x='{_LEFT} {_RIGHT}'>{''.join(parts)}</svg>"
             "</figure>")
 
 
