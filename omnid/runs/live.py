@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import islice
@@ -26,7 +27,7 @@ from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
-from omnid.diagnostics.rig_monitor import RigMonitor, RigMonitorSink, start_status
+from omnid.diagnostics.rig_monitor import start_status
 from omnid.diagnostics.status import StatusCollector, StatusSources, StatusTick
 from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.bounded_call import started
@@ -39,12 +40,11 @@ from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.messages import OdometryUpdate
-from omnid.refinement.rig_application import RigApplication
-from omnid.refinement.rig_refinement import RigRefinement
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, Sinks, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
+from omnid.runs.rig_watch import RigWatch
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
@@ -55,7 +55,7 @@ from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry, GeometryVersions
 from omnid.stages.obstacles import ASSUMED_HEIGHT_M, floor_is_assumed
-from omnid.stages.rig_gate import never
+from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
@@ -148,6 +148,7 @@ class LiveRun:
 
     def _wire(self, session: Session, geometry: Geometry, cameras: Mapping[Camera, LiveCamera],
               run_places: RunPlaces) -> None:
+        """Join cameras, stages, sinks and tickers."""
         config, graph, rig = self._config, self._graph, geometry.rig
         controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
@@ -158,38 +159,16 @@ class LiveRun:
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         versions = GeometryVersions(geometry)
         recorder = self._recorder(session, versions) if config.record.enabled else None
-        poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
-        if config.bus.panorama_hz:
-            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
-        ladder = LoadLadder()
-        rig_monitor = RigMonitor(geometry.cylinder, config.live.check_s) if config.live.check_s else None
-        application = self._rig_application(session, versions, bus, recorder) if config.rig.refine == "apply" else None
-        refinement = None
-        if config.rig.refine != "off":
-            has_time = partial(_has_time, ladder)
-            refinement = session.outputs.enter_context(closing(
-                RigRefinement(versions, config.rig, has_time, application,
-                              has_delay=config.camera.upper_delay_ms == 0)))
-        if refinement is not None:
-            poses["refine"] = refinement
-        looks_ahead = config.obstacles.enabled and config.controller.collision.check
-        if controller and looks_ahead and floor_is_assumed(geometry, config.obstacles):
-            session.warn(f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
-                         f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
-        requests = RequestQueue()
-        receiver = NavigationReceiver(requests.put, config.controller.deadlines.command_s,
-                                      synchronised=config.bus.command_clock == "synchronised",
-                                      report=partial(self._report, logging.WARNING))
-        sinks = Sinks(poses=poses, bus=BusSink(bus, session.encoder(versions, config.live.cloud_points)),
-                      live_drive=LiveDrive(controller, rig.T_base_rig, requests.end) if controller else None,
-                      navigation=self._navigation(session, controller, requests) if controller else None,
-                      rings={"controller-ring": RingToController(controller)} if controller else {},
-                      rig_monitor=RigMonitorSink(rig_monitor) if rig_monitor else None, rig_broken=_broken(rig_monitor),
-                      versions=versions, features=lambda: ladder.level.features,
-                      map_period_s=lambda: ladder.level.map_period_s, ring_period_s=lambda: ladder.level.ring_period_s,
-                      map_every_s=config.live.cloud_s, recorder=recorder,
-                      recorded_frames=tuple(frames), record_depth=config.record.queue)
-        sinks = run_places.known_to(sinks)
+        ladder, requests = LoadLadder(), RequestQueue()
+        rig_watch = RigWatch(session, versions, config, ladder, _rig_publisher(bus, recorder),
+                             from_log=self._rig is not None)
+        self._warn_of_assumed_floor(session, geometry, controller)
+        sinks = self._sinks(session, versions, ladder, rig_watch, bus)
+        if controller:
+            sinks = replace(sinks, live_drive=LiveDrive(controller, rig.T_base_rig, requests.end),
+                            navigation=self._navigation(session, controller, requests),
+                            rings={"controller-ring": RingToController(controller)})
+        sinks = run_places.known_to(replace(sinks, recorder=recorder, recorded_frames=tuple(frames)))
         pairs = graph.stage("pair", pairing, *frames)
         states = {name: camera.state for name, camera in cameras.items()}
         exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, states)
@@ -198,40 +177,52 @@ class LiveRun:
         if config.live.shed_load:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
-        saver = MapSaver(run_places, stages.places, config.places.save_s) \
-            if stages.places and run_places.is_extended else None
-        if saver is not None:
-            graph.ticker("save", saver.PERIOD_S, saver)
+        saver = self._saver(run_places, stages.places)
         commands = self._command_receiver(controller) if controller else None
+        receiver = self._navigation_receiver(requests)
         self._subscribe(session, bus, recorder, commands, receiver, sensors)
-        sources = StatusSources(
-            graph.telemetry,
-            states,
-            pairing,
-            session.statistics,
-            self._latency.to_pose,
-            controller.statistics if controller else None,
-            commands,
-            TICKERS,
-            (ladder.status, exposure.status, partial(start_status, stages.rig_gate),
-             *([receiver.status] if controller else ()),
-             motion_status(stages.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
-             *([partial(places_status, stages.places)] if stages.places else ()),
-             *(part.status for part in (bus, recorder, rig_monitor, refinement, saver) if part)),
-        )
+        status = [ladder.status, exposure.status, partial(start_status, stages.rig_gate),
+                  *([receiver.status] if controller else ()),
+                  motion_status(stages.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
+                  *([partial(places_status, stages.places)] if stages.places else ()),
+                  *(part.status for part in (bus, recorder, *rig_watch.parts, saver) if part)]
+        sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,
+                                controller.statistics if controller else None, commands, TICKERS, tuple(status))
         self._add_tickers(session, StatusCollector(sources), bus, recorder)
 
-    def _rig_application(self, session: Session, versions: GeometryVersions, bus: Bus, recorder: Recorder | None
-                         ) -> RigApplication:
-        """Return what lets the run go on with refined rigs; those of a log's attachment are not written."""
+    def _sinks(self, session: Session, versions: GeometryVersions, ladder: LoadLadder, rig_watch: RigWatch, bus: Bus
+               ) -> Sinks:
+        """Return the sinks of a run that neither drives nor records."""
+        config = self._config
+        poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
+        if config.bus.panorama_hz:
+            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+        return Sinks(poses={**poses, **rig_watch.pose_sinks},
+                     bus=BusSink(bus, session.encoder(versions, config.live.cloud_points)),
+                     rig_monitor=rig_watch.sink, rig_broken=rig_watch.is_broken, versions=versions,
+                     features=lambda: ladder.level.features, map_period_s=lambda: ladder.level.map_period_s,
+                     ring_period_s=lambda: ladder.level.ring_period_s, map_every_s=config.live.cloud_s,
+                     record_depth=config.record.queue)
 
-        def publish(rig: Rig) -> None:
-            bus.serve("rig", rig_toml(rig))
-            if recorder is not None:
-                recorder.attach("rig.toml", rig_toml(rig).encode())
+    def _warn_of_assumed_floor(self, session: Session, geometry: Geometry, controller: ControllerLink | None) -> None:
+        """Warn where the wheels depend on a floor that was never measured."""
+        looks_ahead = self._config.obstacles.enabled and self._config.controller.collision.check
+        if controller and looks_ahead and floor_is_assumed(geometry, self._config.obstacles):
+            session.warn(f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
+                         f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
 
-        path = Path(self._config.cameras.rig) if self._rig is None else None
-        return RigApplication(versions, path, publish, session.warn)
+    def _saver(self, run_places: RunPlaces, places: Places | None) -> MapSaver | None:
+        """Return what saves the map of places now and then; None where it stays as it is."""
+        if places is None or not run_places.is_extended:
+            return None
+        saver = MapSaver(run_places, places, self._config.places.save_s)
+        self._graph.ticker("save", saver.PERIOD_S, saver)
+        return saver
+
+    def _navigation_receiver(self, requests: RequestQueue) -> NavigationReceiver:
+        return NavigationReceiver(requests.put, self._config.controller.deadlines.command_s,
+                                  synchronised=self._config.bus.command_clock == "synchronised",
+                                  report=partial(self._report, logging.WARNING))
 
     def _add_tickers(self, session: Session, report: StatusCollector, bus: Bus, recorder: Recorder | None) -> None:
         publishers = [_status_on_bus(bus)]
@@ -307,14 +298,15 @@ def _ready(config: Config) -> str:
     return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
 
 
-def _has_time(ladder: LoadLadder) -> bool:
-    """True if the computer keeps up with all landmarks."""
-    return ladder.level.features >= 1
+def _rig_publisher(bus: Bus, recorder: Recorder | None) -> Callable[[Rig], None]:
+    """Return a function that publishes a refined rig, and records it."""
 
+    def publish(rig: Rig) -> None:
+        bus.serve("rig", rig_toml(rig))
+        if recorder is not None:
+            recorder.attach("rig.toml", rig_toml(rig).encode())
 
-def _broken(monitor: RigMonitor | None) -> Callable[[], bool]:
-    """Return a function that is True while the monitor finds the rig broken."""
-    return never if monitor is None else lambda: monitor.contradicted
+    return publish
 
 
 def _status_on_bus(bus: Bus) -> StatusPublisher:

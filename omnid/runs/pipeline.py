@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -108,38 +108,13 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         graph.sink("rig", sinks.rig_monitor, odometry, policy=NEWEST, depth=1)
     outgoing: dict[str, Stream[Outgoing]] = {
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
-    mapping: Mapping | None = None
-    if sinks.maps or sinks.recorder or sinks.bus:
-        mapping = Mapping(config.mapping, sinks.map_every_s, sinks.map_period_s)
-        maps: Stream[MapUpdate] = graph.stage("mapping", mapping, odometry)
-        outgoing["bus-map"] = maps
-        for name, map_sink in sinks.maps.items():
-            graph.sink(name, map_sink, maps)
-    places: Places | None = None
-    if config.places.enabled and (sinks.places or sinks.recorder or sinks.bus or sinks.navigation
-                                  or sinks.known_places is not None):
-        places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only,
-                        is_overloaded=lambda: sinks.map_period_s() == math.inf)
-        in_map: Stream[PlaceUpdate] = graph.stage("places", places, odometry)
-        outgoing["bus-places"] = in_map
-        for name, place_sink in sinks.places.items():
-            graph.sink(name, place_sink, in_map)
-    rings: Stream[ObstacleRing] | None = None
-    if config.obstacles.enabled and (sinks.rings or sinks.recorder or sinks.bus or sinks.navigation):
-        rings = graph.stage(
-            "obstacles", Obstacles(geometry, config.obstacles, sinks.ring_period_s), odometry)
-        outgoing["bus-scan"] = rings
-        for name, ring_sink in sinks.rings.items():
-            graph.sink(name, ring_sink, rings)
-    if sinks.navigation:
-        others = [outgoing[name] for name in ("bus-places", "bus-scan") if name in outgoing]
-        requests = sinks.navigation.requests
-        inputs: tuple[Stream[Any], ...] = (
-            odometry, *others, graph.source("requests", requests.batches, wake=requests.end))
-        navigation = _navigation(geometry, config, sinks.navigation, places)
-        updates: Stream[NavigationUpdate] = graph.stage("navigation", navigation, *inputs)
-        graph.sink("planner", sinks.navigation.drive, updates, policy=NEWEST, depth=1)
-        outgoing["bus-navigation"] = updates
+    mapping, maps = _mapping(graph, odometry, config, sinks)
+    places, in_map = _places(graph, odometry, geometry, config, sinks)
+    rings = _rings(graph, odometry, geometry, config, sinks)
+    updates = _navigation(graph, geometry, config, sinks.navigation, places,
+                          [odometry, *(stream for stream in (in_map, rings) if stream)])
+    named = {"bus-map": maps, "bus-places": in_map, "bus-scan": rings, "bus-navigation": updates}
+    outgoing.update({name: stream for name, stream in named.items() if stream})
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
     if sinks.recorder:
@@ -150,12 +125,56 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
     return WiredStages(rig_gate, odometry_stage, mapping, places)
 
 
-def _navigation(geometry: Geometry, config: Config, parts: NavigationParts, places: Places | None) -> NavigationStage:
-    """Return the stage of the navigation, whose setpoints go to the controller."""
+def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], config: Config, sinks: Sinks
+             ) -> tuple[Mapping | None, Stream[MapUpdate] | None]:
+    """Join the map; None where no sink takes it."""
+    if not (sinks.maps or sinks.recorder or sinks.bus):
+        return None, None
+    mapping = Mapping(config.mapping, sinks.map_every_s, sinks.map_period_s)
+    maps = graph.stage("mapping", mapping, odometry)
+    for name, sink in sinks.maps.items():
+        graph.sink(name, sink, maps)
+    return mapping, maps
+
+
+def _places(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
+            ) -> tuple[Places | None, Stream[PlaceUpdate] | None]:
+    """Join the places; None where they are not consumed."""
+    is_known = sinks.known_places is not None
+    if not config.places.enabled or not (sinks.places or sinks.recorder or sinks.bus or sinks.navigation or is_known):
+        return None, None
+    places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only,
+                    is_overloaded=lambda: sinks.map_period_s() == math.inf)
+    in_map = graph.stage("places", places, odometry)
+    for name, sink in sinks.places.items():
+        graph.sink(name, sink, in_map)
+    return places, in_map
+
+
+def _rings(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
+           ) -> Stream[ObstacleRing] | None:
+    """Join the obstacle ring; None where it is not consumed."""
+    if not config.obstacles.enabled or not (sinks.rings or sinks.recorder or sinks.bus or sinks.navigation):
+        return None
+    rings = graph.stage("obstacles", Obstacles(geometry, config.obstacles, sinks.ring_period_s), odometry)
+    for name, sink in sinks.rings.items():
+        graph.sink(name, sink, rings)
+    return rings
+
+
+def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: NavigationParts | None,
+                places: Places | None, inputs: Sequence[Stream[Any]]) -> Stream[NavigationUpdate] | None:
+    """Join the navigation, whose setpoints go to the controller; None in a run without wheels."""
+    if parts is None:
+        return None
     T_base_rig = geometry.rig.T_base_rig
     route_map = None if places is None else RunRouteMap(places, T_base_rig, parts.map_name)
-    return NavigationStage(config.navigation, config.controller.collision, T_base_rig, parts.wheels,
-                           Routes(parts.routes, route_map))
+    navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, parts.wheels,
+                                 Routes(parts.routes, route_map))
+    requests = graph.source("requests", parts.requests.batches, wake=parts.requests.end)
+    updates = graph.stage("navigation", navigation, *inputs, requests)
+    graph.sink("planner", parts.drive, updates, policy=NEWEST, depth=1)
+    return updates
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
