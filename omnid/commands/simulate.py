@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_map, map_settings
 
+IMU_BAUD = 115_200  # at which the stamps of the simulated gyro are right
+
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
     from omnid.runs.live import OpenCamera
@@ -26,8 +28,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "simulate", help="the daemon with a simulated robot in a simulated world",
         description="Run the daemon with a simulated robot: both cameras are rendered, and the motor controller is "
-        "simulated behind a pseudo-terminal. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, "
-        "`omnid goto`, `omnid web`.")
+        "simulated behind a pseudo-terminal, and so is a gyro (motion.imu=off: none). Everything else is as in `omnid "
+        "run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`.")
     parser.add_argument("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)")
     parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")
@@ -71,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
                           lambda line: log(logging.WARNING, line))
     with closing(robot):
         config = replace(config, motor=replace(config.motor, port=robot.port))
+        if config.motion.imu == "auto" and not config.motion.imu_port:
+            config = replace(config, motion=replace(config.motion, imu_port=robot.imu_port, imu_baud=IMU_BAUD))
         code = LiveRun(config, _opener(robot), log, robot.rig, show).run()
     if args.truth:
         _write_truth(args.truth, robot, config)

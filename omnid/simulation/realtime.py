@@ -1,12 +1,13 @@
-"""A simulated robot in real time: cameras for `omnid run`, and a motor controller on a pseudo-terminal.
+"""A simulated robot in real time: cameras for `omnid run`, a motor controller and a gyro on pseudo-terminals.
 
-The daemon is the same as on a robot: it opens the terminal as its serial port, and takes the frames as those of two
+The daemon is the same as on a robot: it opens the terminals as its serial ports, and takes the frames as those of two
 cameras. Only the wheels decide what the cameras see next.
 """
 
 from __future__ import annotations
 
 import math
+import random
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -19,6 +20,7 @@ from calib import se3
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.log_camera import LogClock
 from drivers.frame import Camera, Frame
+from drivers.imu.simulated_witmotion import SimulatedWitMotion
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_base import Pose
@@ -38,7 +40,7 @@ MOST_POSES: Final = 200_000  # kept of the truth: five hours; older ones give wa
 
 
 class RealtimeRobot:
-    """A robot whose time is that of the computer; `port` is its serial port."""
+    """A robot whose time is that of the computer; `port` is its serial port, `imu_port` that of its gyro."""
 
     def __init__(self, world: World, robot: SimulatedRobot, protocol: str, drive: DifferentialDrive, seed: int = 0,
                  report: Callable[[str], None] | None = None) -> None:
@@ -50,6 +52,11 @@ class RealtimeRobot:
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
         self._motor = SimulatedMotor(controller)
         self.port = self._motor.port
+        self._gyro_noise = random.Random(seed + 1)
+        self._turned = (0, base.pose[2])  # time [ns] and heading [rad] of the last measurement of the gyro
+        self._yaw_rate_radps = 0.0
+        self._imu = SimulatedWitMotion(self._rates, robot.gyro.rate_hz) if robot.has_gyro else None
+        self.imu_port = self._imu.port if self._imu else ""
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
         self._standing = footprints(world.standing, robot.height_m)
         self._touches = False
@@ -61,8 +68,23 @@ class RealtimeRobot:
         return SimulatedCamera(self, camera, clock, self._robot.rate_hz)
 
     def close(self) -> None:
-        """Close the terminal."""
+        """Close the terminals."""
+        if self._imu is not None:
+            self._imu.close()
         self._motor.close()
+
+    def _rates(self) -> tuple[float, float, float]:
+        """Return what the gyro measures about x, y, z [rad/s]: over the time since the pose before, as it was noted."""
+        poses, errors = self._motor.poses, self._robot.gyro
+        if poses:
+            at_ns, (_, _, heading_rad) = poses[-1]
+            before_ns, before_rad = self._turned
+            if at_ns > before_ns:
+                turned_rad = math.remainder(heading_rad - before_rad, math.tau) if before_ns else 0.0
+                self._yaw_rate_radps = turned_rad / ((at_ns - before_ns) * 1e-9)
+                self._turned = at_ns, heading_rad
+        x, y, z = (bias + errors.noise_radps * self._gyro_noise.gauss(0.0, 1.0) for bias in errors.bias_radps)
+        return x, y, z + self._yaw_rate_radps
 
     def pose_at(self, stamp_ns: int) -> Pose:
         """Return the pose at a time, as soon as the base has come to it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import closing
 from itertools import islice
@@ -11,6 +12,7 @@ import pytest
 
 from drivers.cameras.log_camera import LogClock
 from drivers.frame import Frame
+from drivers.imu.witmotion import WitMotionGyro
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
@@ -45,6 +47,22 @@ def test_commands_on_the_serial_port_move_the_cameras() -> None:
     assert [stamp for stamp, _ in truth] == [frame.stamp_ns for frame in frames["lower"]]
     assert truth[-1][1][0] - truth[0][1][0] > 0.1
     assert robot.contacts == 0
+
+
+def test_the_gyro_measures_the_turn_of_the_base() -> None:
+    drive = DifferentialDrive()
+    with closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot, \
+            closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor, \
+            closing(WitMotionGyro(robot.imu_port, 115_200)) as gyro:
+        turned_rad, first_ns, last_ns, begin_rad = 0.0, 0, 0, robot.pose_at(0)[2]
+        for sample in gyro.samples():
+            motor.send(VelocityCommand(0, 0.2, 1.0, 0.0))
+            turned_rad += (sample.stamp_ns - last_ns) * 1e-9 * sample.z_radps if last_ns else 0.0
+            last_ns, first_ns = sample.stamp_ns, first_ns or sample.stamp_ns
+            if turned_rad > 0.4 or sample.stamp_ns - first_ns > 5e9:
+                break
+        truth_rad = math.remainder(robot.pose_at(last_ns)[2] - begin_rad, math.tau)
+    assert truth_rad > 0.2 and turned_rad == pytest.approx(truth_rad, abs=0.1)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
