@@ -1,4 +1,4 @@
-"""A recorded log that replaces a live camera: its images at a chosen pace, stamped with the time of delivery."""
+"""A recorded log that replaces live cameras, wheels and IMU: at a chosen pace, stamped with the time of delivery."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
+from drivers.logs.topic_choice import MotionTopics
+from drivers.motion import GyroSample, MotionSample, WheelSample
 
 MAX_LOG_BYTES: Final = 1 << 30
+MAX_SAMPLES: Final = 4_000_000  # of wheels and IMU: hours
 MIN_PACE, MAX_PACE = 0.001, 1000.0
 POLL_PERIOD_S: Final = 0.02  # between two checks for close()
 MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
@@ -24,25 +27,32 @@ TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's f
 
 @dataclass(frozen=True, slots=True)
 class LogImages:
-    """The frames of both cameras of a log in memory."""
+    """The frames of both cameras of a log in memory, and the samples of its wheels and IMU."""
 
     lower: TimedFrames
     upper: TimedFrames
+    motion: tuple[tuple[int, MotionSample], ...] = ()  # time since the log's first frame [ns], sample
+    warnings: tuple[str, ...] = ()  # of the reader, a line each
 
     @staticmethod
-    def load(path: Path, lower: str | None = None, upper: str | None = None) -> LogImages:
+    def load(path: Path, lower: str | None = None, upper: str | None = None, motion: MotionTopics | None = None
+             ) -> LogImages:
         """Load the images of a log. lower, upper: topics, where their names do not identify the cameras.
 
-        Raises DriverError where a camera has fewer than two images, and beyond MAX_LOG_BYTES.
+        motion: topics of wheels and IMU; None: they are not read. Raises DriverError where a camera has fewer than two
+        images, and beyond MAX_LOG_BYTES or MAX_SAMPLES.
         """
-        reader = LogReader(path, lower, upper)
+        reader = LogReader(path, lower, upper, motion=motion)
+        samples: list[MotionSample] = []
         try:
-            frames = list(_limited(reader.frames(), path))
+            frames = list(_limited(reader.messages(), samples, path))
         finally:
             reader.close()
         timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
         images = LogImages(lower=tuple(entry for entry in timed if entry[1].camera == "lower"),
-                           upper=tuple(entry for entry in timed if entry[1].camera == "upper"))
+                           upper=tuple(entry for entry in timed if entry[1].camera == "upper"),
+                           motion=tuple((sample.stamp_ns - frames[0].stamp_ns, sample) for sample in samples),
+                           warnings=tuple(reader.warnings))
         if min(len(images.lower), len(images.upper)) < 2:
             raise DriverError(f"{path}: {len(images.lower)} images of the lower and {len(images.upper)} of the "
                               "upper camera: give a log with two or more of each")
@@ -59,13 +69,20 @@ class LogImages:
         return self.last_ns + max(1, self.last_ns // (max(len(self.lower), len(self.upper)) - 1))
 
 
-def _limited(frames: Iterator[Frame], path: Path) -> Iterator[Frame]:
+def _limited(messages: Iterator[Frame | MotionSample], samples: list[MotionSample], path: Path) -> Iterator[Frame]:
+    """Yield the frames, and add the samples to the list; both are limited."""
     total_bytes = 0
-    for frame in frames:
-        total_bytes += len(frame.data)  # LogReader delivers bytes
+    for message in messages:
+        if not isinstance(message, Frame):
+            samples.append(message)
+        else:
+            total_bytes += len(message.data)  # LogReader delivers bytes
+            yield message
         if total_bytes > MAX_LOG_BYTES:
             raise DriverError(f"{path}: more than {MAX_LOG_BYTES >> 20} MiB of images: cut the log into shorter ones")
-        yield frame
+        if len(samples) > MAX_SAMPLES:
+            raise DriverError(f"{path}: more than {MAX_SAMPLES} samples of wheels and IMU: cut the log into shorter "
+                              "ones")
 
 
 class LogClock:
@@ -138,3 +155,45 @@ class LogCamera:
     def _sleep_until(self, due_ns: int) -> None:
         while not self._closed and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
             time.sleep(min(left_s, POLL_PERIOD_S))
+
+
+class LogMotion:
+    """Wheels and IMU of a log, played as its cameras are: on the way back all rates have the other sign."""
+
+    def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:
+        """clock: that of the cameras. pace, once: as theirs."""
+        self._images, self._clock, self._pace, self._once = images, clock, pace, once
+        self._closed = False
+
+    def samples(self) -> Iterator[MotionSample]:
+        """Yield the samples when they are due, until closed."""
+        if not self._images.motion:
+            return
+        epoch_ns = self._clock.epoch_ns()
+        for due_ns, sample, direction in self._schedule():
+            stamp_ns = epoch_ns + round(due_ns / self._pace)
+            while not self._closed and (left_s := (stamp_ns - time.monotonic_ns()) * 1e-9) > 0:
+                time.sleep(min(left_s, POLL_PERIOD_S))
+            if self._closed:
+                break
+            yield _scaled(sample, stamp_ns, direction * self._pace)
+
+    def close(self) -> None:
+        """End samples(); may be called twice, from any thread."""
+        self._closed = True
+
+    def _schedule(self) -> Iterator[tuple[int, MotionSample, int]]:
+        last_ns, pass_ns = self._images.last_ns, self._images.pass_ns
+        for start_ns in count(0, 2 * pass_ns):
+            yield from ((start_ns + at_ns, sample, 1) for at_ns, sample in self._images.motion)
+            if self._once:
+                return
+            yield from ((start_ns + pass_ns + last_ns - at_ns, sample, -1)
+                        for at_ns, sample in reversed(self._images.motion))
+
+
+def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:
+    """Return the sample of a log that is played so many times as fast."""
+    if isinstance(sample, WheelSample):
+        return WheelSample(stamp_ns, factor * sample.velocity_mps, factor * sample.yaw_rate_radps)
+    return GyroSample(stamp_ns, factor * sample.x_radps, factor * sample.y_radps, factor * sample.z_radps)

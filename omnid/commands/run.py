@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_map, map_settings
 
+RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
+
 if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
-    from drivers.cameras.log_camera import LogCamera
+    from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
     from omnid.runs.live import OpenCamera
@@ -62,9 +64,9 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         _require_no_log_options(args)
         return LiveRun(config, _devices(config), log, show=show).run()
-    unrelated = replace(config.motion, wheels="off", imu="off")  # to the images of a log, and the wheels to them
-    config = replace(config, controller=config.controller.of_log, motion=unrelated)
-    return LiveRun(config, _recorded(args), log, None if args.rig else _rig_of(args), show).run()
+    config = replace(config, controller=config.controller.of_log)
+    opener, motion = _recorded(args, config)
+    return LiveRun(config, opener, log, None if args.rig else _rig_of(args), show, motion).run()
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:
@@ -81,10 +83,15 @@ def _devices(config: Config) -> OpenCamera:
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
-def _recorded(args: argparse.Namespace) -> OpenCamera:
-    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
+def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, LogMotion]:
+    """Return what opens the cameras of a log, and its wheels and gyro: no others fit its images."""
+    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+    from omnid.engine.logging_setup import log
+    from omnid.runs.sensor_sources import motion_topics
 
-    images = LogImages.load(args.log, args.lower, args.upper)
+    images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config.motion))
+    for warning in images.warnings:
+        log(logging.WARNING, warning)
     clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened
     opened: Counter[Camera] = Counter()
 
@@ -92,7 +99,7 @@ def _recorded(args: argparse.Namespace) -> OpenCamera:
         opened[camera] += 1
         return LogCamera(images, camera, clocks[opened[camera]], pace=args.pace, once=args.once)
 
-    return open_camera
+    return open_camera, LogMotion(images, clocks[RUNNING], pace=args.pace, once=args.once)
 
 
 def _rig_of(args: argparse.Namespace) -> Rig:

@@ -45,7 +45,7 @@ from omnid.runs.pipeline import NavigationParts, Sinks, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.rig_watch import RigWatch
-from omnid.runs.sensor_sources import SensorSources
+from omnid.runs.sensor_sources import MotionSource, SensorSources
 from omnid.runs.session import CAMERAS, TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -82,9 +82,12 @@ class LiveRun:
     """One run of the daemon."""
 
     def __init__(self, config: Config, open_camera: OpenCamera, report: Report, rig: Rig | None = None,
-                 show: Callable[[str], None] | None = None) -> None:
-        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
-        self._show = show
+                 show: Callable[[str], None] | None = None, motion: MotionSource | None = None) -> None:
+        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal.
+
+        motion: wheels and gyro where the images are those of a log; None: those of the robot.
+        """
+        self._show, self._motion = show, motion
         self._config, self._open_camera, self._report, self._rig = config, open_camera, report, rig
         on_thread = ThreadStart(priorities(config.realtime, *CAMERAS), report)
         self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
@@ -153,9 +156,9 @@ class LiveRun:
         controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
-        sensors = SensorSources(config.motion, pairing.motion, session, controller, self._report)
-        if sensors.gyro is not None:
-            graph.source("imu", sensors.read_gyro, wake=sensors.gyro.close)
+        sensors = SensorSources(config.motion, pairing.motion, session, controller, self._report, self._motion)
+        if sensors.read_by_thread is not None:
+            graph.source("imu" if sensors.gyro else "motion", sensors.read, wake=sensors.read_by_thread.close)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         versions = GeometryVersions(geometry)
         recorder = self._recorder(session, versions) if config.record.enabled else None

@@ -16,7 +16,6 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogReader
-from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
@@ -36,6 +35,7 @@ from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.rig_examination import examined_gate
 from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.runs.sensor_sources import motion_topics
 from omnid.runs.session import Session
 from omnid.settings_dump import dump
 from omnid.sinks.bus_sink import BusSink
@@ -160,11 +160,9 @@ class _Replay:
     def _reader(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
-        rig, motion = self._options.rig, self._config.motion
-        open_log = partial(LogReader, self._log, window=self._config.log.reorder_frames,
-                           span_s=self._options.span_s, motion=MotionTopics(
-            "" if motion.wheels == "off" else motion.wheel_topic or None,
-            "" if motion.imu == "off" else motion.imu_topic or None))
+        rig, motion = self._options.rig, motion_topics(self._config.motion)
+        open_log = partial(LogReader, self._log, window=self._config.log.reorder_frames, span_s=self._options.span_s,
+                           motion=motion)
         named = ("", "")
         if rig and not (lower and upper):
             named = (read_rig(rig) if isinstance(rig, Path) else rig).topics

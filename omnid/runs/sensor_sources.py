@@ -1,12 +1,15 @@
-"""Sources of wheel and gyro samples of a live run: the motor controller, a serial IMU, the bus."""
+"""Sources of wheel and gyro samples of a live run: the motor controller, a serial IMU, the bus, or a log."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Protocol
 
 from drivers.imu.witmotion import WitMotionGyro
+from drivers.logs.topic_choice import MotionTopics
+from drivers.motion import MotionSample
 from omnid.controller.link import ControllerLink
 from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.runs.session import Session
@@ -15,32 +18,60 @@ from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.topics import IMU, WHEEL_ODOM
 
 
+def motion_topics(settings: MotionSensorSettings) -> MotionTopics:
+    """Return the topics of a log to read."""
+    return MotionTopics("" if settings.wheels == "off" else settings.wheel_topic or None,
+                        "" if settings.imu == "off" else settings.imu_topic or None)
+
+
+class MotionSource(Protocol):
+    """A source of samples, read by a thread of its own."""
+
+    def samples(self) -> Iterator[MotionSample]:
+        """Yield the samples until closed."""
+
+    def close(self) -> None:
+        """End samples(); from any thread."""
+
+
 class SensorSources:
-    """One source for the wheels, one for the gyro: the nearest device that the settings name."""
+    """One source for the wheels, one for the gyro: the nearest device that the settings name.
+
+    With the images of a log both are those of the log: no other wheels and no other gyro fit them.
+    """
 
     def __init__(self, settings: MotionSensorSettings, inbox: MotionInbox, session: Session,
-                 controller: ControllerLink | None, report: Callable[[int, str], None]) -> None:
-        """Open the IMU; DriverError where its port cannot be opened."""
+                 controller: ControllerLink | None, report: Callable[[int, str], None],
+                 of_log: MotionSource | None = None) -> None:
+        """Open the IMU; DriverError where its port cannot be opened. of_log: with the images of a log."""
         self._inbox = inbox
-        topics = set()
-        if settings.wheels == "auto":
-            if controller is not None:
-                controller.take_wheels = inbox.add
-            else:
-                topics.add(WHEEL_ODOM)
+        self.read_by_thread: MotionSource | None = of_log
         self.gyro: WitMotionGyro | None = None
-        if settings.imu == "auto":
-            if settings.imu_port:
-                self.gyro = WitMotionGyro(settings.imu_port, settings.imu_baud, partial(report, logging.WARNING))
-                session.outputs.callback(self.gyro.close)
-            else:
-                topics.add(IMU)
+        topics: set[str] = set() if of_log else self._open(settings, session, controller, report)
         self.receiver = SensorReceiver(inbox.add, session.offset_ns, frozenset(topics),
                                        partial(report, logging.WARNING))
 
-    def read_gyro(self) -> Iterator[None]:
-        """Pass the samples of the serial IMU on until it is closed; yields once for each."""
-        assert self.gyro is not None
-        for sample in self.gyro.samples():
+    def _open(self, settings: MotionSensorSettings, session: Session, controller: ControllerLink | None,
+              report: Callable[[int, str], None]) -> set[str]:
+        """Open the devices; return the topics of the bus that are taken."""
+        topics = set()
+        if settings.wheels == "auto":
+            if controller is not None:
+                controller.take_wheels = self._inbox.add
+            else:
+                topics.add(WHEEL_ODOM)
+        if settings.imu == "auto":
+            if settings.imu_port:
+                self.gyro = WitMotionGyro(settings.imu_port, settings.imu_baud, partial(report, logging.WARNING))
+                self.read_by_thread = self.gyro
+                session.outputs.callback(self.gyro.close)
+            else:
+                topics.add(IMU)
+        return topics
+
+    def read(self) -> Iterator[None]:
+        """Pass the samples of `read_by_thread` on until it is closed; yields once for each."""
+        assert self.read_by_thread is not None
+        for sample in self.read_by_thread.samples():
             self._inbox.add(sample)
             yield

@@ -92,34 +92,42 @@ def text(operator: Operator, topic: str, words: str) -> None:
 class RouteDrive:
     """Begins the route, and goes on with it after each cause."""
 
-    def __init__(self) -> None:
-        self._begun = False
+    def __init__(self, rng: random.Random) -> None:
+        self._rng, self._begun = rng, False
 
     def __call__(self, robot: Robot) -> None:
-        """Arm; the wheels stand until the route is asked for, or the drive is resumed, and then turn at full speed."""
-        operator, base = robot.operator, robot.base
+        """Arm; the wheels stand until the route is asked for, or the drive is resumed; then wait for full speed.
+
+        On a busy machine a pose may be late, which disarms: then it is armed and resumed again.
+        """
         since_s = time.monotonic()
-
-        def armed() -> bool:
-            operator.arm()
-            time.sleep(ARM_PERIOD_S)
-            return operator.values("wheels").get(Key.ARMED) == "1"
-
-        wait_until(armed, "the arming", PATIENCE_S)
+        wait_until(lambda: armed(robot.operator), "the arming", PATIENCE_S)
         time.sleep(STILL_S)
-        assert not base.line.moved_since(since_s), "the wheels turned before somebody asked for it"
+        assert not robot.base.line.moved_since(since_s), "the wheels turned before somebody asked for it"
+        wait_until(lambda: self._drives(robot), "motion", PATIENCE_S)
+        time.sleep(self._rng.uniform(0.0, PHASE_S))
+        wait_until(lambda: self._drives(robot), "motion", PATIENCE_S)
 
-        def drives() -> bool:
-            if not base.drives:
-                if self._begun:
-                    text(operator, topics.NAVIGATION, "resume")
-                else:
-                    text(operator, topics.ROUTE, f"repeat {ROUTE} loops={LOOPS}")
-                time.sleep(ARM_PERIOD_S)
-            return base.line.base.velocity_mps > DRIVES_MPS
+    def _drives(self, robot: Robot) -> bool:
+        """Ask for motion where there is none; True at full speed."""
+        operator = robot.operator
+        if not robot.base.drives and armed(operator):
+            if self._begun:
+                text(operator, topics.NAVIGATION, "resume")
+            else:
+                text(operator, topics.ROUTE, f"repeat {ROUTE} loops={LOOPS}")
+            time.sleep(ARM_PERIOD_S)
+        self._begun = self._begun or robot.base.drives
+        return robot.base.line.base.velocity_mps > DRIVES_MPS
 
-        wait_until(drives, "motion", PATIENCE_S)
-        self._begun = True
+
+def armed(operator: Operator) -> bool:
+    """Return whether the robot is armed; ask for it where it is not."""
+    if operator.values("wheels").get(Key.ARMED) == "1":
+        return True
+    operator.arm()
+    time.sleep(ARM_PERIOD_S)
+    return False
 
 
 def stop_times(site: Path, folder: Path, name: str, count: int, seed: int) -> list[StopTime]:
@@ -128,9 +136,9 @@ def stop_times(site: Path, folder: Path, name: str, count: int, seed: int) -> li
     ends_drive = cause.end is None or name.startswith("cmd/stop")  # a stop cancels it: it is asked for again
     for number in range(count if ends_drive else 1):
         with started_robot(site, folder / f"{number}") as robot:
-            drive = RouteDrive()
+            drive = RouteDrive(rng)
             for _ in range(1 if ends_drive else count):
-                times.append(measured(robot, cause, rng, drive, PHASE_S))
+                times.append(measured(robot, cause, rng, drive))
                 if cause.end is not None:
                     since_s = time.monotonic()
                     cause.end(robot)

@@ -112,12 +112,12 @@ def begin_motion(robot: Robot) -> None:
     wait_until(moves, "motion")
 
 
-def measured(robot: Robot, cause: Cause, rng: random.Random, begin: Callable[[Robot], None] = begin_motion,
-             phase_s: float = PHASE_S) -> StopTime:
+def measured(robot: Robot, cause: Cause, rng: random.Random, begin: Callable[[Robot], None] = begin_motion
+             ) -> StopTime:
     """Drive, bring the cause about, and return the times until the wheels rest."""
     base = robot.base
     begin(robot)
-    time.sleep(rng.uniform(0.0, phase_s))
+    time.sleep(rng.uniform(0.0, PHASE_S))
     begin_s = time.monotonic()
     cause.begin(robot)
     while base.line.base.velocity_mps or base.line.base.yaw_rate_radps or base.drives:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from omnid.transport.status_names import MOTION
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
+from tests.replay.live import robot, wait_until
 from tests.simulation.motion_samples import SensorErrors, motion_samples
 
 DARK = range(12, 18)
@@ -158,3 +160,17 @@ def test_wheels_that_contradict_the_cameras_are_reported(scene: Path, samples: l
     assert offsets_m(result, scene)[:DARK.start].max() < 0.01
     assert TrackingState.LOST in result.states  # no wheels to be trusted in the dark
 
+
+
+def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, scene: Path, tmp_path: Path) -> None:
+    for name, source in (("log.mcap", log), ("rig.toml", scene / "rig.toml")):
+        shutil.copy(source, tmp_path / name)
+    with robot(tmp_path, tmp_path) as (daemon, operator, _):
+        wait_until(lambda: float(operator.values("wheels and gyro").get("gyro_samples", 0)) > 150, "samples")
+        values = operator.values("wheels and gyro")
+        # The gyro of the log measures twice as often as its wheels; the motor's reports would come besides.
+        assert float(values["wheel_samples"]) == pytest.approx(float(values["gyro_samples"]) / 2, rel=0.1)
+        operator.send("cmd/imu", gyro_cdr(GyroSample(1, 0.0, 0.0, 0.0), 10**18))
+        wait_until(lambda: float(operator.values("wheels and gyro").get("refused_gyro", 0)) > 0, "a refusal")
+        code, err = daemon.end()
+    assert code == 0 and "Traceback" not in err

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages, LogMotion
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
+from drivers.motion import GyroSample, WheelSample
 from tests.conftest import PAIRS
 from tests.replay.edited import Image, images, save
 
@@ -70,6 +72,22 @@ def test_cameras_stay_synchronised_where_one_has_lost_images(tmp_path: Path, sce
     assert abs(lower[-1] - upper[-1]) < 5e6
     nearest_ns = [min(abs(at_ns - other_ns) for other_ns in lower) for at_ns in upper[:300]]
     assert max(nearest_ns) < 5e6
+
+
+def test_wheels_and_gyro_are_played_with_the_images_and_backwards_on_the_way_back(recorded: LogImages) -> None:
+    samples = (WheelSample(0, 0.3, 0.1), GyroSample(0, 0.0, -0.1, 0.2))
+    log = replace(recorded, motion=tuple(zip((10_000_000, 50_000_000), samples, strict=True)))
+    source = LogMotion(log, LogClock(epoch_ns := time.monotonic_ns()), pace=FAST)
+    first, second, third, fourth = islice(source.samples(), 4)
+    assert first == WheelSample(epoch_ns + round(10e6 / FAST), FAST * 0.3, FAST * 0.1)
+    assert second == GyroSample(epoch_ns + round(50e6 / FAST), 0.0, -0.1 * FAST, 0.2 * FAST)
+    assert isinstance(third, GyroSample) and isinstance(fourth, WheelSample)
+    assert (third.z_radps, fourth.velocity_mps) == pytest.approx((-0.2 * FAST, -0.3 * FAST))
+    assert third.stamp_ns == epoch_ns + round((recorded.pass_ns + recorded.last_ns - 50e6) / FAST)
+    assert fourth.stamp_ns - third.stamp_ns == pytest.approx(40e6 / FAST, abs=2)
+    assert len(list(LogMotion(log, LogClock(), pace=FAST, once=True).samples())) == 2
+    source.close()
+    assert list(source.samples()) == list(LogMotion(recorded, LogClock()).samples()) == []
 
 
 def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
