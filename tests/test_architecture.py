@@ -44,7 +44,7 @@ ARROWS: Mapping[str, str] = {
         "calib.bounded_yaml calib.errors calib.kalibr calib.models calib.rig calib.se3 calib.validation",
     "calib.validation": "calib.bounded_toml calib.errors calib.models calib.se3",
     "drivers": "",
-    "drivers.cameras": "drivers.errors drivers.events drivers.frame drivers.logs",
+    "drivers.cameras": "drivers.errors drivers.events drivers.frame drivers.logs drivers.motion",
     "drivers.errors": "",
     "drivers.events": "",
     "drivers.frame": "drivers.errors",
@@ -139,10 +139,10 @@ ARROWS: Mapping[str, str] = {
     "omnid.settings_migration": "omnid.settings",
     "omnid.simulation":
         "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.cameras drivers.errors "
-        "drivers.frame drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated omnid.config "
-        "omnid.controller omnid.core.control omnid.core.mapping omnid.core.navigation omnid.engine omnid.errors "
-        "omnid.formats omnid.messages omnid.navigation_state omnid.runs omnid.simulation.rendering omnid.sinks "
-        "omnid.stages omnid.tracking_state",
+        "drivers.frame drivers.imu drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated "
+        "omnid.config omnid.controller omnid.core.control omnid.core.mapping omnid.core.navigation omnid.engine "
+        "omnid.errors omnid.formats omnid.messages omnid.navigation_state omnid.runs omnid.simulation.rendering "
+        "omnid.sinks omnid.stages omnid.tracking_state",
     "omnid.simulation.rendering": "calib.models calib.rig calib.se3 omnid.core",
     "omnid.simulation.worlds": "",
     "omnid.sinks":
