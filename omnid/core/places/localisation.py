@@ -125,7 +125,7 @@ class MapLocaliser:
                 self._age(found)
         # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
         if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
-            by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan)
+            by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
             if by_scan is not None:
                 return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED, NO_KEYFRAME, np.eye(4))
         return self._pose(frame, self._state())
@@ -136,7 +136,8 @@ class MapLocaliser:
         return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
                 "dropped": self.places.dropped, "aged": self.ageing.aged, "rejected": self.correction.rejected,
                 "unjoined": len(set(self._part_of.values())) - 1 if self._part_of else 0,
-                "ambiguous": self.search.ambiguous, "refused": self.search.refused}
+                "ambiguous": self.search.ambiguous, "refused": self.search.refused} | (
+                    {} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
 
     def map(self) -> PlaceMap:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
@@ -161,6 +162,8 @@ class MapLocaliser:
         """True if the view has changed enough; better at a keyframe of odometry, whose depth is known already."""
         if self._newest is None:
             return True
+        if frame.stamp_ns - self._newest.stamp_ns < 1e9 / self._limits.rate_hz:
+            return False
         moved = se3.inverse(self._newest.T_odom_rect) @ frame.T_odom_rect
         change = max(length_m(moved) / self._limits.keyframe_m,
                      angle_rad(moved) / math.radians(self._limits.keyframe_deg))
@@ -171,8 +174,10 @@ class MapLocaliser:
         if self._searched is None:
             return True
         since_ns, moved = frame.stamp_ns - self._searched[0], se3.inverse(self._searched[1]) @ frame.T_odom_rect
+        if since_ns < SEARCH_NS:
+            return False
         if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
-            return since_ns >= SEARCH_NS
+            return True
         pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
         return pending and (length_m(moved) > CHECK_M or angle_rad(moved) > CHECK_RAD)
 
@@ -189,9 +194,17 @@ class MapLocaliser:
         self._searched = frame.stamp_ns, frame.T_odom_rect
         found = self.search.near(small, features, self.places, self._expected(frame))
         if found is None and (far := self._elsewhere()):
-            found = self.search.far(small, features, self.places, far)
+            by_scan = None if self._by_scan is None else self._by_scan.T_map_rect(frame.T_odom_rect)
+            found = self.search.far(small, features, self.places, far, by_scan)
         self._failed = 0 if found is not None else self._failed + 1
         return found
+
+    def _proposed(self, frame: OdometryFrame) -> list[Array]:
+        """Return the poses (4, 4) in the map that the last search suggests for a frame, ambiguous ones too."""
+        if self._searched is None:
+            return []
+        since = se3.inverse(self._searched[1]) @ frame.T_odom_rect
+        return [T @ since for T in self.search.proposed(self.places.poses)]
 
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""

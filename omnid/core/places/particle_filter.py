@@ -50,7 +50,7 @@ class ParticleEstimate:
     covariance: Array  # (3, 3) of x, y, yaw in the map, m^2 and rad^2
     share: float  # of the weight in the group
     fitting: float  # share of the beams that end at obstacles of the map, in the mean of the last scans
-    ambiguous: bool  # another pose explains the last scans as well
+    ambiguous: bool  # another pose explains the last scans as well, or several groups are left that do
     converged: bool
 
 
@@ -90,11 +90,14 @@ class ParticleFilter:
         sigma = MOTION_SIGMA + MOTION_RATIO * np.array([np.hypot(step[0], step[1])] * 2 + [abs(step[2])])
         self._poses = composed(self._poses, step + sigma * self._rng.normal(size=self._poses.shape))
 
-    def update(self, scan: RangeScan) -> ParticleEstimate:
-        """Weight the particles by a scan and return the estimate; to be called when the robot has moved."""
+    def update(self, scan: RangeScan, proposed: Sequence[Array] = ()) -> ParticleEstimate:
+        """Weight the particles by a scan and return the estimate; to be called when the robot has moved.
+
+        proposed: poses T_map_rect (4, 4) at which most of the particles are placed where the filter begins.
+        """
         # 1. Begin, or begin again where the map has long not fitted.
         if not len(self._poses) or self._poor_updates >= LOST_UPDATES:
-            self.start(scan)
+            self.start(scan, proposed)
         self._scans.append((scan, planar(self._T_odom_rect)))
         if not len(self._poses):
             return ParticleEstimate(np.eye(4), np.full((3, 3), np.inf), 0.0, 0.0, True, False)
@@ -105,7 +108,8 @@ class ParticleFilter:
         estimate = self._estimate(weight, scan)
         self._poor_updates = self._poor_updates + 1 if self._fitting[-1] < FITTING else 0
         # 4. Resample where few particles carry the weight.
-        if not estimate.ambiguous and 1 / (weight**2).sum() < len(weight) / 2:
+        weight = _normalised(self._log_weight)  # even where the particles have been placed at two poses
+        if 1 / (weight**2).sum() < len(weight) / 2:
             self._poses = self._poses[self._resampled(weight)]
             self._log_weight = np.zeros(len(self._poses))
         return estimate
@@ -117,7 +121,7 @@ class ParticleFilter:
         fitting = sum(self._fitting) / len(self._fitting)
         sigma = np.sqrt(np.diag(covariance))
         is_one = share >= SHARE and sigma[:2].max() < SIGMA_XY_M and sigma[2] < SIGMA_YAW_RAD and fitting >= FITTING
-        ambiguous = False
+        ambiguous = share < SHARE and fitting >= FITTING and len(self._scans) == SCANS
         if is_one and not self._is_only and len(self._scans) == SCANS:
             other = self._other_pose(pose)
             ambiguous, self._is_only = other is not None, other is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,23 @@ from omnid.core.places.votes import votes
 Array = NDArray[np.float64]
 
 NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
-NEAR_CANDIDATES: Final = 3  # keyframes that are compared where odometry tells about where the robot is
-FAR_CANDIDATES: Final = 8  # keyframes that are compared where it does not
-VOTED: Final = 200  # keyframes of the most similar signatures, among which features vote
 NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
 FAR_INLIERS, FAR_SECTORS = 24, 5  # least support where it cannot tell
 PER_PLACE, SAME_PLACE_M = 3, 1.5  # at most so many of the keyframes that are compared lie so near together
 ENOUGH_INLIERS: Final = 50  # of a place that is enough
 RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
+
+
+class Effort(NamedTuple):
+    """Keyframes that a search takes a closer look at: fewer at each step, as each step costs more."""
+
+    voted: int  # of the most similar signatures: on these the features vote
+    compared: int  # of them, those with most votes
+
+
+NEAR_EFFORT: Final = Effort(16, 3)  # where odometry tells about where the robot is
+FAR_EFFORT: Final = Effort(200, 8)  # where it does not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +60,7 @@ class PlaceSearch:
         self.ambiguous = 0  # frames that fit two places equally well
         self.refused = 0  # recognitions that odometry contradicts
         self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
+        self._seen: list[Recognition] = []  # by the last search, whether they count or not
 
     def near(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
              ) -> Recognition | None:
@@ -61,7 +70,7 @@ class PlaceSearch:
         near = apart_m < NEAR_M + np.array(list(expected.error_m.values()))
         ids = [known[n] for n in np.flatnonzero(near).tolist()]
         enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
-        found = [place for place in self._compare(small, features, (places, ids), NEAR_CANDIDATES, enough)
+        found = [place for place in self._compare(small, features, (places, ids), NEAR_EFFORT, enough)
                  if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS]
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
@@ -69,36 +78,44 @@ class PlaceSearch:
             return None
         return best
 
-    def far(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int]
-            ) -> Recognition | None:
-        """Return the best recognition among keyframes (ids) of which odometry does not know where they are."""
-        found = [place for place in self._compare(small, features, (places, ids), FAR_CANDIDATES, FEATURES + 1)
+    def far(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int],
+            T_map_rect: Array | None = None) -> Recognition | None:
+        """Return the best recognition among keyframes (ids) of which odometry does not know where they are.
+
+        T_map_rect: the pose by other evidence, which settles which of several places that look alike it is.
+        """
+        found = [place for place in self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1)
                  if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS]
+        if T_map_rect is not None:
+            found = [place for place in found
+                     if not _is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)]
         return self._unambiguous(found, places.poses)
 
-    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, among: tuple[PlaceMap, list[int]], most: int,
-                 enough: int) -> list[Recognition]:
-        """Return the recognitions among the keyframes of a map (ids) that get most votes, at most so many.
+    def proposed(self, poses: Mapping[int, Array]) -> list[Array]:
+        """Return the poses T_map_rect (4, 4) that the last search recognised, whether they count or not."""
+        return [poses[place.id] @ place.T_place_rect for place in self._seen if place.id in poses]
 
-        The search ends at a recognition with enough inliers.
-        """
+    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, among: tuple[PlaceMap, list[int]],
+                 effort: Effort, enough: int) -> list[Recognition]:
+        """Return the recognitions among the keyframes of a map (ids); it ends at one with enough inliers."""
         places, ids = among
-        self.compared = {}
+        self.compared, self._seen = {}, []
         if not ids:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
         similar = similarities(signature_of(small), others)
-        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[:VOTED].tolist()]
+        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[:effort.voted].tolist()]
         voted = [votes(features, places.keyframes[id].features, self._model.cylinder.width) for id in ids]
         ranked = np.argsort([-count for count, _ in voted], kind="stable")
         found: list[Recognition] = []
-        for n in _spread(ranked, places.positions(ids), most):
+        for n in _spread(ranked, places.positions(ids), effort.compared):
             place = recognise(features, places.keyframes[ids[n]].features, ids[n], voted[n][1], self._model)
             self.compared[ids[n]] = 0 if place is None else place.inliers
             if place is not None:
                 found.append(place)
                 if place.inliers >= enough:
                     break
+        self._seen = found
         return found
 
     def _signature(self, keyframe: PlaceKeyframe) -> Signature:
@@ -117,9 +134,8 @@ class PlaceSearch:
             return None
         T = poses[best.id] @ best.T_place_rect
         for place in found:
-            other = se3.inverse(T) @ poses[place.id] @ place.T_place_rect
-            elsewhere = length_m(other) > RUNNER_UP_M or angle_rad(other) > RUNNER_UP_RAD
-            if elsewhere and place.inliers > RUNNER_UP * best.inliers:
+            if (_is_elsewhere(T, poses[place.id] @ place.T_place_rect)
+                    and place.inliers > RUNNER_UP * best.inliers):
                 self.ambiguous += 1
                 return None
         return best
@@ -138,6 +154,12 @@ def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
         if len(chosen) == most:
             break
     return chosen
+
+
+def _is_elsewhere(a: Array, b: Array) -> bool:
+    """True if two poses (4, 4) are different places."""
+    between = se3.inverse(a) @ b
+    return length_m(between) > RUNNER_UP_M or angle_rad(between) > RUNNER_UP_RAD
 
 
 def _is_expected(place: Recognition, poses: Mapping[int, Array], expected: Expected) -> bool:

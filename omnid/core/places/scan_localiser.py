@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,6 +40,7 @@ class ScanLocaliser:
         ids = sorted(places.keyframes)
         self._scans = [places.keyframes[id].scan.astype(np.float32) for id in ids]
         self._poses = np.array([places.poses[id] for id in ids]).reshape(-1, 4, 4)
+        self.ambiguous = 0  # scans that another pose explained as well
         self.restart()
 
     def restart(self) -> None:
@@ -48,8 +49,16 @@ class ScanLocaliser:
         self._last_T: Array | None = None
         self._found: ScanPose | None = None
 
-    def process(self, T_odom_rect: Array, scan: Callable[[], RangeScan]) -> ScanPose | None:
-        """Return the pose of odom; None while the filter has not converged. scan is called where it is compared."""
+    def T_map_rect(self, T_odom_rect: Array) -> Array | None:
+        """Return the pose (4, 4) in the map of a frame after the last scan; None while the filter has not converged."""
+        return None if self._found is None else np.asarray(self._found.T_map_odom @ T_odom_rect)
+
+    def process(self, T_odom_rect: Array, scan: Callable[[], RangeScan], proposed: Sequence[Array] = ()
+                ) -> ScanPose | None:
+        """Return the pose of odom; None while the filter has not converged. scan is called where it is compared.
+
+        proposed: poses T_map_rect (4, 4), at which the filter begins.
+        """
         if self._filter is None:
             self._filter = ParticleFilter(scan_grid(self._scans, self._poses, CELL_M))
         if self._last_T is not None:
@@ -58,7 +67,8 @@ class ScanLocaliser:
                 return self._found
             self._filter.move(moved)
         self._last_T = T_odom_rect
-        estimate = self._filter.update(scan())
+        estimate = self._filter.update(scan(), proposed)
+        self.ambiguous += estimate.ambiguous
         self._found = _pose(estimate, T_odom_rect) if estimate.converged else None
         return self._found
 

@@ -42,7 +42,7 @@ def odometry(frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 
             step = se3.inverse(poses[k - 1]) @ poses[k] @ DRIFT
             A = se3.adjoint(se3.inverse(step))
             T, covariance = T @ step, A @ covariance @ A.T + COVARIANCE
-        found.append(OdometryFrame(stereo, (start + k) * 100_000_000, T, covariance, False, resets, True,
+        found.append(OdometryFrame(stereo, (start + k) * 200_000_000, T, covariance, False, resets, True,
                                    lambda: range_scan(np.zeros((0, 3)), (-1.0, 1.0))))
     return found
 
@@ -82,6 +82,15 @@ def test_loops_halve_the_error_and_odom_never_jumps(
     assert all(np.array_equal(pose.T_map_odom, np.eye(4)) for pose in found[:first])
     # A place that was left 3 m ago is recognised within 1 m.
     assert first * STEP_M < 3.0 + OUT[-1] / 2 + 1.0 + 1.0
+
+
+def test_keyframes_are_limited_by_time(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+    """As many a second as the settings say, however dense they are to be; the first one at once."""
+    dense = PlaceLimits(keyframe_m=0.05, rate_hz=1.0)
+    localiser = MapLocaliser(cameras.model, dense)
+    run(localiser, odometry(frames[:11]))
+    stamps_ns = [localiser.places.keyframes[id].stamp_ns for id in sorted(localiser.places.keyframes)]
+    assert stamps_ns == [0, 1_000_000_000, 2_000_000_000]
 
 
 def test_an_idle_localiser_follows_odometry_and_keeps_nothing(frames: list[StereoFrame], out: MapLocaliser) -> None:

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 
 CORNERED = np.concatenate([box((-3, -2), (4, 2.5)), box((2.5, 1), (4, 2.5)), box((-3, -2), (-2, -0.5))])
 SYMMETRIC = box((-3, -2), (3, 2))
+# In the place of one of its short walls: a passage.
+DOOR = np.array([[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [9, 0.6]], [[3, -0.6], [9, -0.6]],
+                 [[9, -0.6], [9, 0.6]]], float)
 NOISE_M = 0.03
 
 
@@ -70,9 +73,7 @@ def test_a_symmetric_room_is_ambiguous_as_long_as_one_drives_in_it() -> None:
 
 def test_leaving_the_symmetric_room_resolves_it() -> None:
     """The room has a door at one end only, and a passage behind it."""
-    door = np.array([[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [9, 0.6]], [[3, -0.6], [9, -0.6]],
-                     [[9, -0.6], [9, 0.6]]], float)
-    walls = np.concatenate([np.delete(SYMMETRIC, 1, axis=0), door])
+    walls = np.concatenate([np.delete(SYMMETRIC, 1, axis=0), DOOR])
     path = drive(pose(-2.0, 0.0, 0.0), 45, 0.0)
     inside = drive(pose(-1.0, 0.4, 0.3), 10, 0.6)
     truth = np.concatenate([inside, drive(pose(-0.9, 0.0, 0.0), 30, 0.0)])

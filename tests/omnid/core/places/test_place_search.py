@@ -49,6 +49,13 @@ def test_of_two_equal_places_none_is_recognised_and_it_is_counted(
 ) -> None:
     search, small = PlaceSearch(twins.model), thumbnail(query.lower.panorama)
     assert search.far(small, describe(query), places, list(places.keyframes)) is None and search.ambiguous == 1
+    # Both are proposed, to what may settle it: here a pose that is known by other evidence.
+    there = se3.exp([PERIOD_M, 0, 0, 0, 0, 0]) @ QUERY
+    assert {round(T[0, 3] - QUERY[0, 3]) for T in search.proposed(places.poses)} == {0, round(PERIOD_M)}
+    near = there @ se3.exp([0.2, -0.1, 0, 0, 0, 0.05])
+    settled = search.far(small, describe(query), places, list(places.keyframes), near)
+    assert settled is not None and motion_errors(places.poses[settled.id] @ settled.T_place_rect, there)[0] < 0.02
+    assert search.ambiguous == 1
     alone = search.far(small, describe(query), places, [0, 1, 2])
     assert alone is not None and search.ambiguous == 1
     assert motion_errors(places.poses[alone.id] @ alone.T_place_rect, QUERY)[0] < 0.02

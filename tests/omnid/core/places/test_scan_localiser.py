@@ -10,6 +10,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.tracking_state import MapState
 from tests.omnid.core.mapping.rooms import pose, scan_of
 from tests.omnid.core.places.test_particle_filter import CORNERED, MAPPED, SYMMETRIC, drive
@@ -18,10 +19,10 @@ from tests.omnid.core.scenery import Array, RenderedCameras
 OUT = drive(pose(-0.6, 0.2, 2.0), 24, 0.3)
 
 
-def saved(walls: Array) -> PlaceMap:
+def saved(walls: Array, path: Array = MAPPED) -> PlaceMap:
     """Return a map of a drive in a room, without anything by which a view is recognised."""
     places = PlaceMap()
-    for id, T in enumerate(MAPPED):
+    for id, T in enumerate(path):
         nothing = PlaceFeatures(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
         places.add(PlaceKeyframe(id, 0, id, T, np.eye(6), np.zeros((16, 128), np.int8),
                                  scan_of(walls, T, 0.02, id).astype(np.float16), nothing), T)
@@ -49,6 +50,26 @@ def test_the_shape_of_the_room_gives_the_pose(cameras: RenderedCameras) -> None:
     assert np.linalg.norm(error[:2]) < 0.15 and abs(error[5]) < np.radians(4)
     at = se3.log(se3.inverse(last.T_map_odom @ se3.inverse(OUT[0]) @ OUT[-1]) @ OUT[-1])
     assert at @ np.linalg.solve(last.covariance, at) < 30 and np.linalg.eigvalsh(last.covariance)[0] > 0
+
+
+def test_two_proposed_poses_are_ambiguous_until_moving_tells_them_apart() -> None:
+    """Two halls of one shape with a passage between them, in which an alcove lies nearer to one of them."""
+    halls = np.concatenate([np.delete(SYMMETRIC, 1, axis=0), np.delete(SYMMETRIC + np.array([10, 0]), 3, axis=0)])
+    passage = np.array([[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [7, 0.6]], [[7, -2], [7, -0.6]],
+                        [[7, 0.6], [7, 2]], [[3, -0.6], [3.4, -0.6]], [[3.4, -0.6], [3.4, -1.8]],
+                        [[3.4, -1.8], [4.9, -1.8]], [[4.9, -1.8], [4.9, -0.6]], [[4.9, -0.6], [7, -0.6]]], float)
+    walls = np.concatenate([halls, passage])
+    truth = np.concatenate([drive(pose(-1.0, 0.4, 0.3), 12, 0.6), drive(pose(-0.9, 0.0, 0.0), 24, 0.0)])
+    localiser = ScanLocaliser(saved(walls, drive(pose(-2.0, 0.0, 0.0), 65, 0.0)))
+    found = []
+    for number, T in enumerate(truth):
+        scan = scan_of(walls, T, 0.02, number)
+        found.append(localiser.process(T, lambda scan=scan: scan, [pose(10.0, 0.0, np.pi) @ truth[0], truth[0]]))
+        if number == 12:
+            assert localiser.ambiguous >= 3 and localiser.T_map_rect(T) is None
+    # In this drive odom is the map.
+    located = [one for one in found if one is not None]
+    assert found[-1] is not None and all(np.linalg.norm(one.T_map_odom[:2, 3]) < 0.1 for one in located)
 
 
 @pytest.mark.parametrize(("walls", "limits"), [(CORNERED, PlaceLimits()), (SYMMETRIC, PlaceLimits(by_scan=True))])
