@@ -34,6 +34,7 @@ ROUND_PAIRS: Final = 2  # pairs of a round with enough matches
 MOST_ROUND_PAIRS: Final = 8  # pairs of a round where matches are few
 CONTRADICTIONS: Final = 2  # rounds that must agree before the rig is refused
 MOST_ROUNDS: Final = 40  # rounds without a decision, after which the check ends
+SCATTERED_PX: Final = 0.6  # of the columns: right rigs stay below 0.45, other mirrors have 0.3 to 7
 EXCHANGED_RATIO: Final = 1.2  # matches with the cameras exchanged, per match, that show exchanged cameras
 
 StartCondition = Literal["undecided", "fits", "drifted", "exchanged", "turned"]
@@ -104,7 +105,7 @@ def start_finding(straight: RigFinding, exchanged_matches: int) -> StartFinding:
         condition = "exchanged"
     elif straight.misfit_deg > BROKEN_DEG:
         condition = "turned"
-    elif straight.misfit_deg > DRIFTED_DEG:
+    elif straight.misfit_deg > DRIFTED_DEG or straight.spread_px > SCATTERED_PX:
         condition = "drifted"
     elif straight.drift is not None:
         condition = "fits"
