@@ -122,14 +122,18 @@ class Node:
         self._after: Callable[[], object] = getattr(work, "after", nothing)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
-    def handle(self, message: object) -> None:
-        """Process the message, pass its result on, and let the stage do what it has left to do."""
+    def handle(self, message: object, passed_on: Callable[[], object] = nothing) -> None:
+        """Process the message, pass its result on, and let the stage do what it has left to do.
+
+        passed_on: called between the last two.
+        """
         watch = Stopwatch()
         result = self._process(message)
         if result is not None:
             watch.pause()
             self.stream.push(result)
             watch.resume()
+        passed_on()
         self._after()
         self.stats.count(watch)
 

@@ -253,7 +253,7 @@ class Graph:
 
     def _drain(self, node: Node, inbox: StageInbox) -> None:
         while (message := inbox.get()) is not END:
-            node.handle(message)
+            node.handle(message, inbox.passed_on)
         self._finish(node)
 
     def _finish(self, node: Node) -> None:

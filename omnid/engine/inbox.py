@@ -10,6 +10,10 @@ from collections import deque
 from omnid.engine.flow import END, LOSSLESS, NEWEST, Policy
 from omnid.engine.telemetry import StageStats
 
+NOTABLE_S = 1e-3  # shorter work after a result was passed on is none
+LASTING = 0.9  # share of an earlier longest time that still counts after each message
+EARLY = 0.75  # of the time expected for that work: to come late would cost the reader more than an older message does
+
 
 class StageInbox:
     """Bounded queue of a reader for a number of writers; it ends when all of them have ended.
@@ -25,7 +29,9 @@ class StageInbox:
         self._changed = threading.Condition()
         self._closed = False
         self._taken_ns = 0  # when the reader took the message it works on; 0: it is idle
-        self._work_s = 0.0  # how long the reader works on a message, see _finished
+        self._passed_ns = 0  # when the result of that message was passed on; 0: not yet
+        self._work_s = 0.0  # how long the reader works on a message, see passed_on
+        self._after_s = 0.0  # how long it works after it has passed on the result, where it does: a moving mean
         self._behind: StageInbox | None = None  # of the stage for which the reader prepares messages
         self._ahead: list[StageInbox] = []  # of readers that prepare messages for this one
 
@@ -72,25 +78,42 @@ class StageInbox:
         self._tell_ahead()
         return message
 
-    def _finished(self) -> None:
-        """Note that the reader is idle, and how long it worked: the longest time, which decays by a tenth each time.
+    def passed_on(self) -> None:
+        """Note that the reader has passed on its result, and how long that took: the longest time, which decays.
 
         The mean would not do for a reader that combines messages: only every second frame completes a pair.
         """
-        if self._taken_ns:
-            self._work_s = max((time.monotonic_ns() - self._taken_ns) * 1e-9, 0.9 * self._work_s)
-            self._taken_ns = 0
-            self._tell_ahead()
+        self._passed_ns = time.monotonic_ns()
+        self._work_s = max((self._passed_ns - self._taken_ns) * 1e-9, LASTING * self._work_s)
+        self._tell_ahead()
+
+    def _finished(self) -> None:
+        """Note that the reader is idle."""
+        if not self._taken_ns:
+            return
+        after_s = (time.monotonic_ns() - self._passed_ns) * 1e-9
+        if after_s > NOTABLE_S:
+            self._after_s = (after_s + (self._after_s or after_s)) / 2
+        self._taken_ns = self._passed_ns = 0
+        self._tell_ahead()
 
     def _spare_s(self) -> float:
-        """Return for how long the result of a message taken now would wait for its reader, s."""
+        """Return for how long the result of a message taken now would wait for its reader, s.
+
+        Where a result waits already, none is prepared, except towards the end of what the reader does after a message:
+        that lasts so long that what was prepared has become old, and is replaced by the newest.
+        """
         behind = self._behind
         if behind is None:
             return 0.0
-        if behind._messages:
+        now_ns, taken_ns, passed_ns = time.monotonic_ns(), behind._taken_ns, behind._passed_ns
+        left_s = 0.0
+        if passed_ns:
+            left_s = EARLY * behind._after_s - (now_ns - passed_ns) * 1e-9
+        elif taken_ns:
+            left_s = behind._work_s - (now_ns - taken_ns) * 1e-9
+        if behind._messages and not passed_ns:
             return math.inf
-        taken_ns = behind._taken_ns
-        left_s = behind._work_s - (time.monotonic_ns() - taken_ns) * 1e-9 if taken_ns else 0.0
         return left_s - self._work_s
 
     def _tell_ahead(self) -> None:
@@ -112,7 +135,7 @@ class StageInbox:
             self._stats.dropped += len(self._messages)
             self._messages.clear()
             self._stats.busy_since_ns = 0
-            self._taken_ns = 0
+            self._taken_ns = self._passed_ns = 0
             self._changed.notify_all()
         self._tell_ahead()
 

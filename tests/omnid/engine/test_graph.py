@@ -12,6 +12,7 @@ from functools import partial
 from itertools import count
 from typing import NoReturn
 
+import numpy as np
 import pytest
 
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
@@ -592,6 +593,42 @@ def test_a_bound_head_works_only_for_what_the_tail_will_take(bound: bool) -> Non
     graph.run()
     assert tail.seen[-1] == 199  # the last one is not lost
     assert (len(head.seen) <= len(tail.seen) + 1) == bound
+
+
+def test_after_long_work_that_follows_a_result_the_tail_takes_the_newest() -> None:
+    """What was prepared for it during its own work has become old meanwhile."""
+    made: list[int] = []  # numbers so far, of which the last one is the newest
+    ages: list[int] = []  # how many newer ones there were when the tail took one after its long work
+    during: list[int] = []  # how many were made during that
+
+    class Tail:
+        after_work = False
+        taken = 0
+
+        def process(self, number: int) -> None:
+            if self.after_work:
+                ages.append(made[-1] - number)
+            self.taken += 1
+            self.after_work = self.taken % 5 == 0
+            time.sleep(0.005)
+
+        def after(self) -> None:
+            if self.after_work:
+                before = made[-1]
+                time.sleep(0.06)
+                during.append(made[-1] - before)
+
+    def numbers() -> Iterator[int]:
+        for number in range(600):
+            made.append(number)
+            time.sleep(0.001)
+            yield number
+
+    graph = Graph(policy=NEWEST, depth=1)
+    graph.sink("tail", Tail(), graph.stage("head", Recorded(0.003), graph.source("numbers", numbers)))
+    graph.bound("head", "tail")
+    graph.run()
+    assert np.median(ages) < np.median(during) / 2
 
 
 def test_a_bound_head_ends_with_a_tail_that_fails() -> None:
