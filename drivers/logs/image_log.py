@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, Protocol
 
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.ros_image import RosImage
 from drivers.logs.ros_motion import MotionReading
 
@@ -22,7 +23,7 @@ class LoggedMotion(NamedTuple):
 
     topic: str
     log_time_ns: int
-    read: Callable[[], MotionReading]  # raises FrameDecodeError or RecordError where there is no valid message
+    read: Callable[[JointWheels | None], MotionReading]  # raises FrameDecodeError or RecordError: no valid message
 
 
 class LogDamage(NamedTuple):

@@ -17,12 +17,13 @@ from drivers.logs.mcap_records import RecordError
 from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import RosImage
 from drivers.logs.topic_choice import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
-from drivers.motion import MotionSample
+from drivers.motion import MotionSample, WheelSample
 
 _WARNINGS = {
     "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
+    "no_joints": "none of {} messages of joints names the wheels: see motion.left_joint and motion.right_joint",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
@@ -56,6 +57,7 @@ class LogReader:
         self._window, self._closed, self._span_s = window, False, span_s
         self._log = open_image_log(path)
         self._motion = MotionChoice(frozenset())
+        self._joints = motion.joints if motion else None
         try:
             wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
             topics = self._log.topics()
@@ -141,6 +143,8 @@ class LogReader:
         self.truncated = False
         self._fault = ""  # of the first message without a valid image
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
+        self._other_joints = 0  # messages of joints without the wheels
+        self._has_wheels = False
 
     def _image(self, logged: LoggedImage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -159,7 +163,13 @@ class LogReader:
     def _sample(self, logged: LoggedMotion) -> MotionSample | None:
         """Return a sample, None of a broken one."""
         try:
-            return logged.read().sample(logged.log_time_ns)
+            reading = logged.read(self._joints)
+            if not reading.rates:
+                self._other_joints += 1
+                return None
+            sample = reading.sample(logged.log_time_ns)
+            self._has_wheels = self._has_wheels or isinstance(sample, WheelSample)
+            return sample
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken_motion"] += 1
             self._motion_fault = self._motion_fault or str(error)
@@ -171,6 +181,7 @@ class LogReader:
         self.truncated = bool(damage.cut)
         if damage.cut:
             self.warnings.append(damage.cut)
+        self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
         faults = {"fault": self._fault, "motion_fault": self._motion_fault}
         self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]

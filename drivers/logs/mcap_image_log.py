@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
 from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
@@ -84,5 +85,5 @@ def _read(kind: str, message: LogMessage, aligned: bool) -> RosImage:
     return parse_image(kind, message.data(), aligned=aligned)
 
 
-def _read_motion(kind: str, message: LogMessage, aligned: bool) -> MotionReading:
-    return parse_motion(kind, message.data(), aligned=aligned)
+def _read_motion(kind: str, message: LogMessage, aligned: bool, joints: JointWheels | None) -> MotionReading:
+    return parse_motion(kind, message.data(), aligned=aligned, joints=joints)

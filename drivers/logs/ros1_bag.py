@@ -19,6 +19,7 @@ import lz4.frame  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
 from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_catalog import ros_name
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
@@ -255,8 +256,8 @@ def _read(kind: str, source: _Source, record: _Record) -> RosImage:
     return parse_image(kind, _data(source, record), aligned=False)
 
 
-def _read_motion(kind: str, source: _Source, record: _Record) -> MotionReading:
-    return parse_motion(kind, _data(source, record), aligned=False)
+def _read_motion(kind: str, source: _Source, record: _Record, joints: JointWheels | None) -> MotionReading:
+    return parse_motion(kind, _data(source, record), aligned=False, joints=joints)
 
 
 def _data(source: _Source, record: _Record) -> memoryview:

@@ -18,6 +18,7 @@ import zstandard
 
 from drivers.errors import DriverError
 from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
 from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
@@ -115,8 +116,8 @@ def _read(kind: str, data: bytes) -> RosImage:
     return parse_image(kind, memoryview(_unpacked(data)))
 
 
-def _read_motion(kind: str, data: bytes) -> MotionReading:
-    return parse_motion(kind, memoryview(_unpacked(data)))
+def _read_motion(kind: str, data: bytes, joints: JointWheels | None) -> MotionReading:
+    return parse_motion(kind, memoryview(_unpacked(data)), joints=joints)
 
 
 def _unpacked(data: bytes) -> bytes:

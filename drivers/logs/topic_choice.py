@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
+from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from drivers.logs.ros_motion import IMU, ODOMETRY
 
@@ -48,6 +49,7 @@ class MotionTopics(NamedTuple):
 
     wheels: str | None = None
     imu: str | None = None
+    joints: JointWheels | None = None  # the wheels are these joints of a JointState; None: they are an Odometry
 
 
 class MotionChoice(NamedTuple):
@@ -60,11 +62,13 @@ class MotionChoice(NamedTuple):
 def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> MotionChoice:
     """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
 
-    A topic of odometry is that of wheels if its name contains "wheel": others are results. Raises DriverError for a
+    A topic of odometry is that of wheels if its name contains "wheel": others are results; one of joints by any name.
+    Raises DriverError for a
     requested topic that does not exist or is of another type.
     """
     chosen, warnings = [], []
-    for kind, name, knob in ((ODOMETRY, wanted.wheels, "motion.wheel_topic"), (IMU, wanted.imu, "motion.imu_topic")):
+    wheels = JOINT_STATE if wanted.joints else ODOMETRY
+    for kind, name, knob in ((wheels, wanted.wheels, "motion.wheel_topic"), (IMU, wanted.imu, "motion.imu_topic")):
         if name:
             if topics.get(name) != kind:
                 found = f"holds {topics[name]}" if topics.get(name) else "is not"
@@ -72,7 +76,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
             chosen.append(name)
         elif name is None:
             found_names = [topic for topic, found in topics.items()
-                           if found == kind and (kind == IMU or "wheel" in topic.lower())]
+                           if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())]
             if len(found_names) > 1:
                 warnings.append(f"{log} has several topics of {kind}: {_listed(found_names)}; none is used: set {knob}")
             else:

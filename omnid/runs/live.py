@@ -156,7 +156,7 @@ class LiveRun:
         controller = session.start_controller(config.realtime) if config.motor.port else None
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
-        sensors = SensorSources(config.motion, pairing.motion, session, controller, self._report, self._motion)
+        sensors = SensorSources(config, pairing.motion, session, controller, self._report, self._motion)
         if sensors.read_by_thread is not None:
             graph.source("imu" if sensors.gyro else "motion", sensors.read, wake=sensors.read_by_thread.close)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]

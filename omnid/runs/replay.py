@@ -160,7 +160,7 @@ class _Replay:
     def _reader(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
-        rig, motion = self._options.rig, motion_topics(self._config.motion)
+        rig, motion = self._options.rig, motion_topics(self._config)
         open_log = partial(LogReader, self._log, window=self._config.log.reorder_frames, span_s=self._options.span_s,
                            motion=motion)
         named = ("", "")

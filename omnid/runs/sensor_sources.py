@@ -8,20 +8,36 @@ from functools import partial
 from typing import Protocol
 
 from drivers.imu.witmotion import WitMotionGyro
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import MotionSample
+from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.core.odometry.motion_settings import MotionSensorSettings
+from omnid.errors import OmnidError
 from omnid.runs.session import Session
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.transport.sensor_receiver import SensorReceiver
-from omnid.transport.topics import IMU, WHEEL_ODOM
+from omnid.transport.topics import IMU, JOINT_STATES, WHEEL_ODOM
 
 
-def motion_topics(settings: MotionSensorSettings) -> MotionTopics:
-    """Return the topics of a log to read."""
+def motion_topics(config: Config) -> MotionTopics:
+    """Return the topics of a log to read. Raise OmnidError for half of a pair of joints."""
+    settings = config.motion
     return MotionTopics("" if settings.wheels == "off" else settings.wheel_topic or None,
-                        "" if settings.imu == "off" else settings.imu_topic or None)
+                        "" if settings.imu == "off" else settings.imu_topic or None, joint_wheels(config))
+
+
+def joint_wheels(config: Config) -> JointWheels | None:
+    """Return the wheels as joints, None where they are an Odometry. Raise OmnidError where only one is named."""
+    left, right = config.motion.left_joint, config.motion.right_joint
+    if not left and not right:
+        return None
+    if not (left and right) or left == right:
+        raise OmnidError(f"motion.left_joint = {left!r}, motion.right_joint = {right!r}: expected the names of two "
+                         "joints, or none")
+    drive = config.motor.drive.geometry()
+    return JointWheels(left, right, drive.wheel_radius_m, drive.track_m)
 
 
 class MotionSource(Protocol):
@@ -40,26 +56,27 @@ class SensorSources:
     With the images of a log both are those of the log: no other wheels and no other gyro fit them.
     """
 
-    def __init__(self, settings: MotionSensorSettings, inbox: MotionInbox, session: Session,
+    def __init__(self, config: Config, inbox: MotionInbox, session: Session,
                  controller: ControllerLink | None, report: Callable[[int, str], None],
                  of_log: MotionSource | None = None) -> None:
         """Open the IMU; DriverError where its port cannot be opened. of_log: with the images of a log."""
         self._inbox = inbox
         self.read_by_thread: MotionSource | None = of_log
         self.gyro: WitMotionGyro | None = None
-        topics: set[str] = set() if of_log else self._open(settings, session, controller, report)
+        joints = joint_wheels(config)
+        topics: set[str] = set() if of_log else self._open(config.motion, session, controller, report, joints)
         self.receiver = SensorReceiver(inbox.add, session.offset_ns, frozenset(topics),
-                                       partial(report, logging.WARNING))
+                                       partial(report, logging.WARNING), joints)
 
     def _open(self, settings: MotionSensorSettings, session: Session, controller: ControllerLink | None,
-              report: Callable[[int, str], None]) -> set[str]:
+              report: Callable[[int, str], None], joints: JointWheels | None) -> set[str]:
         """Open the devices; return the topics of the bus that are taken."""
         topics = set()
         if settings.wheels == "auto":
             if controller is not None:
                 controller.take_wheels = self._inbox.add
             else:
-                topics.add(WHEEL_ODOM)
+                topics.add(JOINT_STATES if joints else WHEEL_ODOM)
         if settings.imu == "auto":
             if settings.imu_port:
                 self.gyro = WitMotionGyro(settings.imu_port, settings.imu_baud, partial(report, logging.WARNING))

@@ -1,4 +1,4 @@
-"""Samples of wheels and gyro as nav_msgs/msg/Odometry and sensor_msgs/msg/Imu, both ways."""
+"""Samples of wheels and gyro as nav_msgs/msg/Odometry and sensor_msgs/msg/Imu, both ways; wheels of a JointState."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
 from drivers.errors import FrameDecodeError
+from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
 from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
@@ -16,6 +17,7 @@ from omnid.transport.codec import header_message, message_cdr, odometry_cdr
 
 WHEEL_SCHEMA: Final = ODOMETRY
 IMU_SCHEMA: Final = IMU
+JOINT_SCHEMA: Final = JOINT_STATE
 LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # of a pose that wheels do not give
 _UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
@@ -36,15 +38,19 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int) -> bytes:
     return message_cdr(message, IMU_SCHEMA)
 
 
-def sample_from_cdr(payload: bytes, schema: str, offset_ns: int) -> MotionSample:
-    """Decode a sample from the network; offset_ns: from the stamps of images to the sender's clock.
+def sample_from_cdr(payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
+                    ) -> MotionSample | None:
+    """Decode a sample from the network; None of other joints. offset_ns: from the stamps of images to the sender's
+    clock. joints: the wheels in a JointState.
 
     Raise OmnidError for a message without a stamp, with rates that are not finite or absurd, and for other bytes.
     """
     try:
-        reading = parse_motion(schema, memoryview(payload))
+        reading = parse_motion(schema, memoryview(payload), joints=joints)
     except FrameDecodeError as error:
         raise OmnidError(str(error)) from error
+    if not reading.rates:
+        return None
     if not reading.stamp_ns:
         raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
     if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):

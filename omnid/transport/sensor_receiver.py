@@ -1,4 +1,5 @@
-"""Samples of wheels and gyro from the network, validated: `cmd/wheel_odom` (nav_msgs/msg/Odometry), `cmd/imu` (Imu).
+"""Samples of wheels and gyro from the network, validated: `cmd/wheel_odom` (nav_msgs/msg/Odometry), `cmd/imu` (Imu),
+`cmd/joint_states` (JointState).
 
 They stand below `cmd`, because they move the pose while the cameras show nothing: only programs that may command the
 robot may write them.
@@ -10,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
+from drivers.logs.joint_wheels import JointWheels
 from drivers.motion import MotionSample
 from omnid.errors import OmnidError
 from omnid.transport.motion_codec import sample_from_cdr
@@ -22,11 +24,12 @@ class SensorReceiver:
     """Passes valid samples on and counts the others; called from threads of the bus, never raises."""
 
     def __init__(self, target: Callable[[MotionSample], None], offset_ns: int, topics: frozenset[str],
-                 report: Callable[[str], None]) -> None:
+                 report: Callable[[str], None], joints: JointWheels | None = None) -> None:
         """target: may be called from any thread. offset_ns: from the stamps of images to Unix time.
 
-        topics: those that are used. report: takes a line for the log, once for each topic.
+        topics: those that are used. report: takes a line for the log, once for each topic. joints: the wheels.
         """
+        self._joints = joints
         self._target, self._offset_ns, self._topics, self._report = target, offset_ns, topics, report
         self.refused: Counter[str] = Counter()  # by topic
 
@@ -38,13 +41,14 @@ class SensorReceiver:
         """Handle one message."""
         try:
             if key not in self._topics:
-                raise OmnidError("it is not used: see motion.wheels, motion.imu and motion.imu_port")
+                raise OmnidError("it is not used: see motion.wheels, motion.left_joint, motion.imu and motion.imu_port")
             if len(payload) > LONGEST_PAYLOAD:
                 raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_PAYLOAD}")
-            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._offset_ns)
+            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._offset_ns, self._joints)
         except OmnidError as error:
             self.refused[key] += 1
             if self.refused[key] == 1:
                 self._report(f"a message on {key} is refused: {error}; more of them are counted in the status")
             return
-        self._target(sample)
+        if sample is not None:
+            self._target(sample)

@@ -50,7 +50,9 @@ NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH
                             NAVIGATION: navigation_codec.STRING_SCHEMA, ROUTE: navigation_codec.STRING_SCHEMA}
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
-SENSOR_TOPICS: Final = {WHEEL_ODOM: motion_codec.WHEEL_SCHEMA, IMU: motion_codec.IMU_SCHEMA}
+JOINT_STATES: Final = "cmd/joint_states"
+SENSOR_TOPICS: Final = {WHEEL_ODOM: motion_codec.WHEEL_SCHEMA, IMU: motion_codec.IMU_SCHEMA,
+                        JOINT_STATES: motion_codec.JOINT_SCHEMA}
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}

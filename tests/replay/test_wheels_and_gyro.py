@@ -16,18 +16,21 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.errors import DriverError, FrameDecodeError
+from drivers.logs.joint_wheels import JOINT_STATE
 from drivers.logs.log_reader import LogReader
 from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
 from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
+from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
+from omnid.runs.sensor_sources import motion_topics
 from omnid.tracking_state import TrackingState
 from omnid.transport.decode import decode_diagnostics
 from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
-from omnid.transport.status_names import MOTION
+from omnid.transport.status_names import MOTION, REFUSED_PREFIX
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
@@ -126,6 +129,38 @@ def test_broken_messages_and_topics_that_are_not_clear_are_reported(scene: Path,
         LogReader(log, motion=MotionTopics(wheels="/nothing"))
 
 
+def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[MotionSample], tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = store.types
+    wheels, (radius_m, track_m) = [each for each in samples if isinstance(each, WheelSample)], (0.05, 0.3)
+
+    def joint_entry(sample: WheelSample) -> Entry:
+        half_mps = sample.yaw_rate_radps * track_m / 2
+        speeds = np.array([sample.velocity_mps - half_mps, 0.0, sample.velocity_mps + half_mps]) / radius_m
+        stamp = t["builtin_interfaces/msg/Time"](*divmod(sample.stamp_ns, 10**9))
+        message = t[JOINT_STATE](t["std_msgs/msg/Header"](stamp, ""), ["left", "arm", "right"], np.zeros(3), speeds,
+                                 np.zeros(0))
+        return Entry("/joint_states", JOINT_STATE, bytes(store.serialize_cdr(message, JOINT_STATE)), sample.stamp_ns)
+
+    log = saved(tmp_path / "log.mcap", scene, [*(joint_entry(each) for each in wheels), entry(wheels[0])])
+    settings = ["motion.left_joint=left", "motion.right_joint=right"]
+    reader = LogReader(log, motion=motion_topics(load_config(None, settings)))
+    read = [message for message in reader.messages() if isinstance(message, WheelSample)]
+    assert len(read) > 50 and not reader.warnings
+    for sample, expected in zip(read, wheels, strict=False):
+        assert sample.stamp_ns == expected.stamp_ns
+        assert (sample.velocity_mps, sample.yaw_rate_radps) == pytest.approx(
+            (expected.velocity_mps, expected.yaw_rate_radps), abs=1e-9)
+    reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.left_joint=l", "motion.right_joint=r"])))
+    assert len(list(reader.messages())) == 2 * PAIRS
+    assert reader.warnings[0].startswith("none of ") and "motion.left_joint" in reader.warnings[0]
+    reader = LogReader(log, motion=motion_topics(load_config()))
+    assert len([message for message in reader.messages() if isinstance(message, WheelSample)]) == 1
+    for wrong in (["motion.left_joint=l"], ["motion.left_joint=l", "motion.right_joint=l"]):
+        with pytest.raises(OmnidError, match="expected the names of two joints"):
+            motion_topics(load_config(None, wrong))
+
+
 @pytest.mark.parametrize("aligned", [True, False])
 def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
     """Serialised by rosbags, which knows both."""
@@ -171,6 +206,6 @@ def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, 
         # The gyro of the log measures twice as often as its wheels; the motor's reports would come besides.
         assert float(values["wheel_samples"]) == pytest.approx(float(values["gyro_samples"]) / 2, rel=0.1)
         operator.send("cmd/imu", gyro_cdr(GyroSample(1, 0.0, 0.0, 0.0), 10**18))
-        wait_until(lambda: float(operator.values("wheels and gyro").get("refused_gyro", 0)) > 0, "a refusal")
+        wait_until(lambda: operator.values("wheels and gyro").get(f"{REFUSED_PREFIX}cmd/imu") == "1", "a refusal")
         code, err = daemon.end()
     assert code == 0 and "Traceback" not in err

@@ -22,7 +22,10 @@ class MotionSensorSettings:
     imu_baud: int = knob(9600, "its baud rate; 9600 carries 10 measurements a second: set it to 115200 and 100 Hz with "
                          "its maker's program", low=1200, high=4_000_000)
     wheel_topic: str = knob("", "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
-                            "name contains 'wheel'")
+                            "name contains 'wheel'. With left_joint: of JointState; empty: the only one")
+    left_joint: str = knob("", "name of the left wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, "
+                           "which then stands for the Odometry of the wheels; empty: none")
+    right_joint: str = knob("", "name of the right one; radius and track are those of motor.drive")
     imu_topic: str = knob("", "topic of a log with sensor_msgs/msg/Imu; empty: the only one")
     imu_roll_deg: float = knob(0.0, "orientation of the IMU on the base: roll about x, deg", low=-360, high=360)
     imu_pitch_deg: float = knob(0.0, "... then pitch about y, deg", low=-360, high=360)

@@ -51,6 +51,7 @@ TOPICS = {
     "/omnid/cmd/navigation": "std_msgs/msg/String", "/omnid/cmd/route": "std_msgs/msg/String",
     "/omnid/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/imu": "sensor_msgs/msg/Imu",
     "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
+    "/omnid/cmd/joint_states": "sensor_msgs/msg/JointState",
 }
 COMMANDS = command_topics(("planner",))
 

@@ -6,11 +6,14 @@ import random
 
 import numpy as np
 import pytest
+from rosbags.typesys.stores import ros2_humble as ros
 
+from drivers.logs.joint_wheels import JointWheels
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
+from omnid.transport.codec import header_message, message_cdr
+from omnid.transport.motion_codec import JOINT_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.sensor_receiver import SensorReceiver
-from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM
+from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
 
 OFFSET_NS = 10**18
 WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5)
@@ -22,7 +25,8 @@ def lines() -> list[str]:
 
 
 def receiver(taken: list[MotionSample], lines: list[str], *topics: str) -> SensorReceiver:
-    return SensorReceiver(taken.append, OFFSET_NS, frozenset(topics or SENSOR_TOPICS), lines.append)
+    joints = JointWheels("left", "right", 0.1, 0.5)
+    return SensorReceiver(taken.append, OFFSET_NS, frozenset(topics or SENSOR_TOPICS), lines.append, joints)
 
 
 def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
@@ -32,6 +36,27 @@ def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
     sensors.receive(IMU, gyro_cdr(GYRO, GYRO.stamp_ns + OFFSET_NS))
     assert taken == [WHEELS, GYRO] and not lines and not sensors.refused
     assert sensors.handles(IMU) and not sensors.handles("cmd/twist")
+
+
+def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
+    message = ros.sensor_msgs__msg__JointState(header_message(stamp_ns, ""), names, np.zeros(len(names)),
+                                               np.array(velocities), np.zeros(0))
+    return message_cdr(message, JOINT_SCHEMA)
+
+
+def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
+    taken: list[MotionSample] = []
+    joints = JointWheels("left", "right", 0.1, 0.5)
+    sensors = SensorReceiver(taken.append, OFFSET_NS, frozenset([JOINT_STATES]), lines.append, joints)
+    sensors.receive(JOINT_STATES, joint_cdr(["arm", "right", "left"], [9.0, 6.0, 4.0]))
+    assert taken == [WheelSample(7, pytest.approx(0.5), pytest.approx(0.4))]
+    sensors.receive(JOINT_STATES, joint_cdr(["arm"], [9.0]))
+    assert len(taken) == 1 and not lines, "other joints have messages of their own"
+    for names, velocities in ((["left"], [1.0]), (["left", "right"], []), (["left", "right"], [1.0, np.nan])):
+        sensors.receive(JOINT_STATES, joint_cdr(names, velocities))
+    sensors.receive(JOINT_STATES, joint_cdr(["left", "right"], [1.0, 1.0], stamp_ns=0))
+    assert len(taken) == 1 and sensors.refused[JOINT_STATES] == 4
+    assert len(lines) == 1 and "no velocity of left or of right" in lines[0]
 
 
 def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
@@ -52,7 +77,8 @@ def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
 def test_damaged_bytes_never_raise_and_give_finite_samples(lines: list[str]) -> None:
     rng, taken = random.Random(3), list[MotionSample]()
     sensors = receiver(taken, lines)
-    for topic, payload in ((WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)), (IMU, gyro_cdr(GYRO, OFFSET_NS + 1))):
+    for topic, payload in ((WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)), (IMU, gyro_cdr(GYRO, OFFSET_NS + 1)),
+                           (JOINT_STATES, joint_cdr(["left", "right"], [1.0, 2.0]))):
         for _ in range(2000):
             damaged = bytearray(payload[:rng.randrange(len(payload) + 1)] if rng.random() < 0.3 else payload)
             for _ in range(rng.randrange(1, 6)):
