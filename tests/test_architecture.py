@@ -123,9 +123,10 @@ ARROWS: Mapping[str, str] = {
         "calib.errors calib.fit calib.rig calib.rig_covariance calib.rig_file calib.se3 omnid.calibration "
         "omnid.config omnid.core.rig omnid.errors omnid.messages omnid.stages omnid.tracking_state omnid.transport",
     "omnid.report":
-        "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 drivers.errors "
-        "drivers.frame drivers.logs omnid.config omnid.errors omnid.formats omnid.recordings omnid.settings_dump "
-        "omnid.stages omnid.tracking_state omnid.transport omnid.version",
+        "calib.bounded_toml calib.errors calib.models calib.panorama calib.rig calib.rig_file calib.se3 "
+        "drivers.errors drivers.frame drivers.logs omnid.config omnid.core.mapping omnid.core.places omnid.errors "
+        "omnid.formats omnid.recordings omnid.settings_dump omnid.stages omnid.tracking_state omnid.transport "
+        "omnid.version",
     "omnid.runs":
         "calib.rig calib.rig_file calib.se3 drivers.cameras drivers.errors drivers.events drivers.frame drivers.imu "
         "drivers.logs drivers.motion drivers.motor omnid.calibration omnid.config omnid.controller "

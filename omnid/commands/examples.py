@@ -55,6 +55,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "map build": ("map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
                   "map build wednesday.mcap -o place.omap --extend"),
     "map info": ("map info place.omap",),
+    "map show": ("map show place.omap -o place.html",),
     "map merge": ("map merge east.omap west.omap -o place.omap",),
     "map tags": ("map tags drive.mcap --tag 5=0.16 --tag 6=0.16 --map place.omap --localize-only",),
     "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),

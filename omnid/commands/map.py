@@ -33,6 +33,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     info.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap")
     add_json(info)
     info.set_defaults(run=run_info)
+    show = actions.add_parser("show", help="a page with keyframes, loops, and the paths with and without the loops")
+    show.add_argument("map", type=Path, metavar="FILE.omap")
+    show.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
+    show.set_defaults(run=run_show)
     merge = actions.add_parser("merge", help="join maps of one building, made by the same rig")
     merge.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first "
                        "stays")
@@ -133,6 +137,22 @@ def run_info(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found)
     return code
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Write the page."""
+    from calib.rig_file import write_file
+    from omnid.core.places.place_views import summary
+    from omnid.formats.place_file import read_places
+    from omnid.report.map_page import map_page
+    from omnid.sinks.files import check_outputs
+
+    check_outputs([("-o", args.output)], [("the map that is read", args.map)])
+    places, rig = read_places(args.map)
+    lines = [(line[:13].strip(), line[13:]) for line in _described(args.map, summary(places, rig), rig)]
+    html = map_page(args.map.name, lines, places, rig)
+    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    return 0
 
 
 def run_merge(args: argparse.Namespace) -> int:

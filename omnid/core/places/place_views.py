@@ -76,8 +76,43 @@ def keep_only(places: PlaceMap, ids: Set[int]) -> None:
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
     """Return the poses (K, 4, 4) of the base at the keyframes, in the base's axes at the start of the map."""
-    T = np.array([places.poses[id] for id in sorted(places.keyframes)]).reshape(-1, 4, 4)
-    return np.asarray(rig.T_base_rect @ T @ se3.inverse(rig.T_base_rect))
+    return _of_base(np.array([places.poses[id] for id in sorted(places.keyframes)]), rig)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedDrive:
+    """Keyframes in the order of a drive, with the poses (K, 4, 4) of the base in its axes at the start of the map."""
+
+    session: int
+    ids: list[int]
+    T_map_base: Array
+    T_by_odometry: Array  # the same, if odometry alone had gone on from the first keyframe
+
+
+def drives(places: PlaceMap, rig: PlaceRig) -> list[MappedDrive]:
+    """Return the drives of a map; one ends where the session does, or where odometry lost its pose."""
+    joined = {(min(link.a, link.b), max(link.a, link.b)) for link in places.links if not link.is_loop}
+    parts: list[list[int]] = []
+    for id in sorted(places.keyframes):
+        last = parts[-1][-1] if parts else -1
+        same = last >= 0 and places.keyframes[last].session == places.keyframes[id].session and (last, id) in joined
+        if same:
+            parts[-1].append(id)
+        else:
+            parts.append([id])
+    return [_drive(places, ids, rig) for ids in parts]
+
+
+def _drive(places: PlaceMap, ids: list[int], rig: PlaceRig) -> MappedDrive:
+    T_odom = np.array([places.keyframes[id].T_odom_rect for id in ids])
+    by_odometry = places.poses[ids[0]] @ se3.inverse(T_odom[0]) @ T_odom
+    corrected = np.array([places.poses[id] for id in ids])
+    return MappedDrive(places.keyframes[ids[0]].session, ids, _of_base(corrected, rig), _of_base(by_odometry, rig))
+
+
+def _of_base(T_map_rect: Array, rig: PlaceRig) -> Array:
+    """Return poses (K, 4, 4) of the base, in its axes at the start of the map."""
+    return np.asarray(rig.T_base_rect @ T_map_rect.reshape(-1, 4, 4) @ se3.inverse(rig.T_base_rect))
 
 
 def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:

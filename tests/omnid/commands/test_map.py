@@ -38,6 +38,19 @@ def test_info_as_json_and_of_a_file_that_is_no_map(omap: Path, capsys: pytest.Ca
     assert printed.err.count("\n") == 1 and "expected a map of places" in printed.err
 
 
+def test_show_writes_a_page_with_keyframes_loops_and_both_paths(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is one file, and nothing in it comes from elsewhere."""
+    page = omap.parent / "a.html"
+    assert main(["map", "show", str(omap), "-o", str(page)]) == 0 and not capsys.readouterr().err
+    html = page.read_text()
+    assert html.count("class='keyframe'") == 12 and html.count("<title>0 to 11: 77 features</title>") == 1
+    assert html.count("<path class='after'") == html.count("<path class='before'") == 3  # two sessions, and the keys
+    for text in ("session 0, keyframes 0 to 9", "session 1, keyframes 10 to 11", "12, with 240 features", "a.omap"):
+        assert text in html
+    assert "http" not in html.replace("http-equiv", "")
+    assert main(["map", "show", str(omap), "-o", str(omap)]) == 2 and capsys.readouterr().err.count("\n") == 1
+
+
 def test_export_writes_what_is_asked_for(omap: Path) -> None:
     out = omap.parent
     assert main(["map", "export", str(omap), "--ply", str(out / "a.ply"), "--plan", str(out / "a.png"), "--grid",
