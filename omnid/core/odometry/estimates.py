@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.tracking_state import TrackingState
 
@@ -35,12 +35,13 @@ class PoseEstimate:
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
+    assumed: AssumedMotion | None = None  # by which the disparities were corrected; None: exposed at once
 
     @property
     def without_landmarks(self) -> PoseEstimate:
         """The pose alone, where its landmarks are no longer in the map."""
         return replace(self, landmarks=self.landmarks[:0], views=self.views[:0], pixels=self.pixels[:0],
-                       variance=self.variance[:0])
+                       variance=self.variance[:0], assumed=None)
 
     @property
     def inlier_ratio(self) -> float:

@@ -8,6 +8,7 @@ so that all else works with views of one instant. Its error is that of V, which 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,13 @@ class RigVelocity:
 
     twist: Array  # (6,)
     covariance: Array
+
+
+class AssumedMotion(NamedTuple):
+    """The velocity for which views were corrected, and their derivatives by it."""
+
+    velocity: RigVelocity
+    derivatives: Array  # (N, 6) px of the disparities, or (N, 3, 6) px of the views
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +106,14 @@ class Exposure:
         turn = self.motion.twist[3:]
         rate, tau = self.motion.twist[:3] + np.cross(turn, points), times_s[:, None]
         return np.asarray(points - tau * rate + tau**2 / 2 * np.cross(turn, rate))
+
+    def derivatives(self, views: Array) -> Array:
+        """Return the derivatives (N, 3, 6) of corrected views (N, 3) by the velocity; 0 where they have no point."""
+        points = triangulate(views, self.model.cylinder, self.model.baseline_m)
+        known = np.isfinite(points).all(axis=1)
+        found = np.zeros((len(views), 3, 6))
+        found[known] = self.shift(points[known]).by_motion[:, :3]
+        return found
 
     def upper_columns(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
         """Return the columns (N,) in the upper panorama of pixels (N, 2) at about upper rows (N,), and their spread.

@@ -36,7 +36,8 @@ class ExposureVelocity:
         """Forget the means and errors, as after a break."""
         self._steps = 0
         self._mean, self._mean_squared, self._filter_squared = np.zeros(6), np.zeros(6), np.zeros(6)
-        self._previous: tuple[Array, Array, Array] | None = None  # rate, and what filter and mean predicted then
+        # Rate of the last step and its time, and what filter and mean predicted then.
+        self._previous: tuple[Array, float, Array, Array] | None = None
 
     def predicted(self, dt_s: float) -> RigVelocity:
         """Return the velocity dt_s after the last pair, whose step the filter has just predicted."""
@@ -47,18 +48,25 @@ class ExposureVelocity:
         mean = self._with(se3.log(T_prev_curr) / dt_s)
         return self._chosen(*self._filter.after(T_prev_curr, covariance, dt_s), mean)
 
-    def accept(self, T_prev_curr: Array, dt_s: float) -> None:
-        """Take note of the step that the filter was updated with; it shows the velocity at the pair before."""
-        rate = se3.log(T_prev_curr) / dt_s
+    def accept(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> RigVelocity | None:
+        """Take note of the step that the filter was updated with, and of its covariance (6, 6).
+
+        Returns the velocity at the pair before, which is between this step and the one before it; None after a break.
+        """
+        rate, found = se3.log(T_prev_curr) / dt_s, None
         if self._previous is not None:
-            before, of_filter, of_mean = self._previous
-            at_previous = (before + rate) / 2
+            before, before_s, of_filter, of_mean = self._previous
+            at_previous = (before_s * rate + dt_s * before) / (before_s + dt_s)
+            # A velocity that changes evenly is exact there; how far it changes unevenly in a step, no step shows.
+            uneven = np.diag(((rate - before) / 2) ** 2 + LEAST_SIGMA**2)
+            found = RigVelocity(at_previous, covariance / (2 * dt_s**2) + uneven)
             self._steps += 1
             gain = max(1 / MEMORY, 1 / self._steps)
             self._filter_squared += gain * ((at_previous - of_filter) ** 2 - self._filter_squared)
             self._mean_squared += gain * ((at_previous - of_mean) ** 2 - self._mean_squared)
         self._mean = self._with(rate)
-        self._previous = rate, self._filter.motion(dt_s)[0], self._mean
+        self._previous = rate, dt_s, self._filter.motion(dt_s)[0], self._mean
+        return found
 
     def _with(self, rate: Array) -> Array:
         """Return the mean with one more step."""

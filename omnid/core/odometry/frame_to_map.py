@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import pixels_in_upper
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure, ViewShift
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
@@ -33,6 +33,7 @@ MIN_LANDMARKS = 6  # below which six unknowns are no estimate
 OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
 # Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
 COARSE_STEPS, STEPS = (3,), (2, 4)
+FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
@@ -91,6 +92,15 @@ class FrameToMap:
         chosen = np.flatnonzero(is_inlier)[kept]
         return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
 
+    def again(self, frame: StereoFrame, coarse: CoarsePose, T_odom_rect: Array, exposure: Exposure) -> CoarsePose:
+        """Return the tracks' inliers at a refined pose whose velocity is known better, where few were inliers."""
+        found = None
+        if len(coarse.landmarks) < FEW_RATIO * len(coarse.tracks.landmarks):
+            found = self.estimate(frame, coarse.tracks, T_odom_rect, exposure)
+        if found is None or len(found.landmarks) <= len(coarse.landmarks):
+            return replace(coarse, T_curr_odom=se3.inverse(T_odom_rect))
+        return found
+
     def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None = None) -> PoseEstimate | None:
         """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
 
@@ -119,18 +129,19 @@ class FrameToMap:
             return None
         # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
-        variance = variance[landmarks]
+        variance, assumed = variance[landmarks], None
         if exposure and by_motion:
             # The velocity found here agrees with the depths in the map, so it must not correct them: a vertical one
-            # has the effect of another baseline, and the scale would drift. That of the filter is independent.
+            # has the effect of another baseline, and the scale would drift. That of the steps is independent.
             of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
-            variance += np.einsum("ni,ij,nj->n", of_depth, exposure.motion.covariance, of_depth)
+            assumed = AssumedMotion(exposure.motion, of_depth[kept])
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
         visible, tracked, supporting = (
             round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks)))
         return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, visible, tracked,
-                            min(supporting, len(landmarks)), landmarks, views, pixels, variance[kept], rejected)
+                            min(supporting, len(landmarks)), landmarks, views, pixels, variance[kept], rejected,
+                            assumed)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.

@@ -67,7 +67,8 @@ class Keyframes:
         points = corners(frame.lower, free, self._wanted() - len(request.pixels))
         new = located(frame, points, self._model, self._klt, request.exposure)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
-        self._map.add_keyframe(keyframe, new.views, new.slopes, new.noise, new.pixels)
+        ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
+        self._map.late_depths.added(ids, new)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)
         self._most_inliers = self._frames = 0

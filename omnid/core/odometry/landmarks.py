@@ -102,12 +102,13 @@ class LandmarkStore:
         return len(self.table.id)
 
     def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
-                     pixels: Array | None = None) -> None:
-        """Add a keyframe with new landmarks, observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
+                     pixels: Array | None = None) -> Indices:
+        """Add a keyframe with new landmarks; return their ids (N,), -1 for views that cannot be triangulated.
 
+        They are observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
         noise: covariance (N, 3, 3) [px^2] of the views beside that of the model; None: none. pixels (N, 2) in the
         keyframe's panorama; None: those of the views, which are the same unless it was exposed at several times.
-        Views that cannot be triangulated are left out. The oldest keyframe beyond the bound leaves.
+        Those views are left out. The oldest keyframe beyond the bound leaves.
         """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
@@ -127,6 +128,34 @@ class LandmarkStore:
         while len(self.keyframes) > self._max_keyframes:
             self.keyframes.pop(min(self.keyframes))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
+        given = np.full(finite.shape, -1)
+        given[finite] = ids
+        return given
+
+    def rows(self, ids: Indices) -> tuple[Indices, Flags]:
+        """Return the rows (M,) of those landmarks that are still kept, and which (N,) of the ids these are."""
+        rows = np.searchsorted(self.table.id, ids)
+        known = np.isin(ids, self.table.id)
+        return rows[known], known
+
+    def replace_views(self, ids: Indices, views: Array, noise: Array) -> None:
+        """Set the views (N, 3) [px] of landmarks (ids) in their anchors, and their noise as in `add_keyframe`.
+
+        Where a view cannot be triangulated the landmark stays as it is.
+        """
+        rows, known = self.rows(ids)
+        points = triangulate(views[known], self._model.cylinder, self._model.baseline_m)
+        finite = np.isfinite(points).all(axis=1)
+        rows, points, views, noise = rows[finite], points[finite], views[known][finite], noise[known][finite]
+        spread = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px, noise)
+        before = self.table
+        found = LandmarkTable(*(getattr(before, column.name).copy() for column in fields(before)))
+        found.anchor_points[rows], found.anchor_covariance[rows], found.views[rows] = points, spread, views
+        for seq in np.unique(before.anchor[rows]).tolist():
+            own = rows[before.anchor[rows] == seq]
+            found.points[own], found.covariance[own] = _in_odom(
+                self.keyframes[seq], found.anchor_points[own], found.anchor_covariance[own])
+        self.table = found
 
     def add_observations(self, seq: int, ids: Indices, views: Array) -> None:
         """Add observations (M, 3) [px] in a keyframe of landmarks (ids) that were known before.

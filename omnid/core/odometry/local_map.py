@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
+from omnid.core.odometry.late_depths import LateDepths
 from omnid.core.odometry.patch_alignment import AlignedPatches, align
 from omnid.core.odometry.plane_patches import moved_slopes, plane_templates
 from omnid.core.odometry.pose_estimation import StereoModel
@@ -43,6 +44,7 @@ class LocalMap:
         self._coarse_klt = replace(klt, iterations=min(klt.iterations, COARSE_ITERATIONS))
         self._near_klt = replace(self._coarse_klt, levels=0)
         self.store = LandmarkStore(model, max_keyframes, max_misses)
+        self.late_depths = LateDepths(self.store)
         self._last: PaddedPanorama | None = None
 
     def __len__(self) -> int:
@@ -51,13 +53,14 @@ class LocalMap:
     def clear(self) -> None:
         """Remove all landmarks and keyframes."""
         self.store.clear()
+        self.late_depths.clear()
         self._last = None
 
     def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
-                     pixels: Array | None = None) -> None:
+                     pixels: Array | None = None) -> Indices:
         """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
-        self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
         self._last = keyframe.lower
+        return self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
 
     def update_tracked(self, lower: PaddedPanorama, landmarks: Indices, pixels: Array) -> None:
         """Record the inliers (rows of the table) of an accepted panorama with their pixels (M, 2)."""

@@ -63,13 +63,18 @@ class MotionModel:
         """Return the velocity at the end of a step with its covariance (6, 6)."""
         return self._exposures.after(T_prev_curr, covariance, dt_s)
 
-    def accept(self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool) -> None:
-        """Update the filter with the step that the cameras found (eq. 11); after a sudden one begin from standstill."""
+    def accept(self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
+               ) -> RigVelocity | None:
+        """Update the filter with the step that the cameras found (eq. 11); after a sudden one begin from standstill.
+
+        Returns the velocity at the pair before the step, where the steps around it tell it.
+        """
         is_sudden = not exposed_at_once and self.is_sudden(T_prev_curr, dt_s)
         self._filter.update(T_prev_curr, covariance, dt_s)
-        self._exposures.accept(T_prev_curr, dt_s)
+        at_previous = self._exposures.accept(T_prev_curr, covariance, dt_s)
         if is_sudden:
             self.reset()
+        return None if is_sudden else at_previous
 
     def found(self) -> None:
         """Note that the cameras have found a pose: nothing is to be bridged."""

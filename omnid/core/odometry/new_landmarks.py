@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.corners import nearby_disparity, pixels_in_upper
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
 from omnid.core.odometry.pose_estimation import StereoModel
@@ -27,7 +27,16 @@ class NewLandmarks:
     pixels: Array  # (N, 2) px in the lower panorama
     views: Array  # (N, 3) px, at the stamp
     slopes: Array  # (N, 2) px/px of the disparity, at the stamp
-    noise: Array  # (N, 3, 3) px^2 of the views
+    noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
+    assumed: AssumedMotion | None = None  # by which the views were corrected; None: exposed at once
+
+    @property
+    def whole_noise(self) -> Array:
+        """Covariance (N, 3, 3) [px^2] of the views, also by the uncertain motion."""
+        if self.assumed is None:
+            return self.noise
+        velocity, J = self.assumed
+        return np.asarray(self.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
 
 
 def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure | None
@@ -52,8 +61,9 @@ def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSett
     noise = view_noise(np.zeros((2, 2)), variance[found])
     if exposure is None:
         return NewLandmarks(pixels, np.column_stack([pixels, rows]), slopes, noise)
-    views, by_motion = exposure.corrected(pixels, rows)
-    return NewLandmarks(pixels, views, _at_stamp(slopes, pixels, rows, exposure), noise + by_motion)
+    views, _ = exposure.corrected(pixels, rows)
+    assumed = AssumedMotion(exposure.motion, exposure.derivatives(views))
+    return NewLandmarks(pixels, views, _at_stamp(slopes, pixels, rows, exposure), noise, assumed)
 
 
 def _at_stamp(slopes: Array, pixels: Array, rows: Array, exposure: Exposure) -> Array:

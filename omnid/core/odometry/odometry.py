@@ -149,9 +149,9 @@ class VisualOdometry:
         T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
         is_sudden = self._motion.is_sudden(T_prev_curr, dt_s)
         motion = UNKNOWN_VELOCITY if is_sudden else self._motion.after(T_prev_curr, refined.covariance, dt_s)
-        exposure = self._exposure(frame, motion)
-        coarse = replace(coarse, T_curr_odom=se3.inverse(refined.T_odom_rect))
-        return self._frame_to_map.refine(frame, coarse, exposure)
+        settled = Exposure(exposure.times, motion, self._model)
+        coarse = self._frame_to_map.again(frame, coarse, refined.T_odom_rect, settled)
+        return self._frame_to_map.refine(frame, coarse, settled)
 
     def _start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float) -> PoseEstimate:
         """Start the map again at its first frame, whose motion the second one shows; return the second one's pose.
@@ -214,13 +214,16 @@ class VisualOdometry:
 
     def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float) -> None:
         """Update the filter and set the pose; after a break the filter starts from standstill."""
+        at_previous: RigVelocity | None = None
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            self._motion.accept(T_prev_curr, estimate.covariance, dt_s, exposed_at_once=frame.times is None)
+            at_previous = self._motion.accept(T_prev_curr, estimate.covariance, dt_s,
+                                              exposed_at_once=frame.times is None)
             if estimate.inliers >= self._limits.good_inliers:
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
             self._motion.reset()
+        self._map.late_depths.settle(at_previous)
         self._motion.found()
         self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
@@ -290,8 +293,7 @@ class VisualOdometry:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
         store = self._map.store
         ids = store.table.id[estimate.landmarks]
-        disparity = estimate.views[:, 2] - estimate.views[:, 1]
-        store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
+        self._map.late_depths.seen(ids, estimate)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if not self._keyframes.is_due(len(estimate.landmarks)):
             return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from calib import se3
 from omnid.core.odometry.exposure_velocity import ExposureVelocity
@@ -28,7 +29,7 @@ def driven(pairs: int, heave_m: float, tilt_rad: float) -> tuple[np.ndarray, np.
         motion_filter.predict(DT_S)
         found = velocity.after(step, NOISE, DT_S)
         motion_filter.update(step, NOISE, DT_S)
-        velocity.accept(step, DT_S)
+        velocity.accept(step, NOISE, DT_S)
         errors.append(found.twist - (se3.log(step) + se3.log(steps[k + 1])) / (2 * DT_S))
         sigmas.append(np.sqrt(np.diag(found.covariance)))
     return np.array(errors)[10:], np.array(sigmas)[10:]
@@ -54,7 +55,27 @@ def test_reset_forgets_the_mean() -> None:
         motion_filter.predict(DT_S)
         step = se3.exp([0.05, 0, 0, 0, 0, 0])
         motion_filter.update(step, NOISE, DT_S)
-        velocity.accept(step, DT_S)
+        velocity.accept(step, NOISE, DT_S)
     motion_filter.reset()
     velocity.reset()
     np.testing.assert_array_equal(velocity.predicted(DT_S).twist, 0)
+
+
+def test_the_step_after_a_pair_shows_its_velocity() -> None:
+    """A motion that changes evenly is exact there, also where the steps take different times."""
+    motion_filter = MotionFilter()
+    velocity, times_s = ExposureVelocity(motion_filter), np.array([0.0, 0.08, 0.16, 0.28])
+    x, shaken = 0.5 * times_s + 0.8 * times_s**2, np.array([0.0, 1e-3, -1e-3, 1e-3])
+    found = []
+    for k, dt_s in enumerate(np.diff(times_s)):
+        step = se3.exp([x[k + 1] - x[k], 0, shaken[k + 1] - shaken[k], 0, 0, 0])
+        motion_filter.predict(dt_s)
+        motion_filter.update(step, NOISE, dt_s)
+        found.append(velocity.accept(step, NOISE, dt_s))
+    assert found[0] is None
+    for at, time_s in zip(found[1:], times_s[1:-1], strict=True):
+        assert at is not None and at.twist[0] == pytest.approx(0.5 + 1.6 * time_s, abs=1e-9)
+        sigma = np.sqrt(np.diag(at.covariance))
+        assert 1e-3 < sigma[0] < 0.1 and sigma[2] > 0.01, "what shakes is known less well"
+    velocity.reset()
+    assert velocity.accept(step, NOISE, 0.08) is None, "after a break no step is before it"
