@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
 from omnid.core.odometry.frame_to_map import FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.local_map import LocalMap
@@ -66,6 +69,24 @@ def test_the_estimate_carries_the_views_of_its_inliers() -> None:
     disparity = estimate.views[:, 2] - estimate.views[:, 1]
     assert np.isfinite(disparity).mean() > 0.8
     np.testing.assert_allclose(disparity[np.isfinite(disparity)], DISPARITY_PX, atol=0.1)
+
+
+def test_tracks_that_a_wrong_velocity_made_outliers_are_inliers_again() -> None:
+    """The rig stands, but it is believed to pitch between the exposures of its cameras."""
+    local_map, frame = map_of(texture(1), texture(1)), replace(stereo_frame(texture(1)), times=ExposureTimes(0.03))
+    steps, still = FrameToMap(local_map, MODEL, KltSettings()), RigVelocity(np.zeros(6), 1e-4 * np.eye(6))
+    pitching = replace(still, twist=np.array([0, 0, 0, 0, 2.0, 0]))
+    assert frame.times is not None
+    believed, known = (Exposure(frame.times, motion, MODEL) for motion in (pitching, still))
+    tracks = local_map.track(frame.lower, np.eye(4))
+    coarse = steps.estimate(frame, tracks, np.eye(4), believed)
+    assert coarse is not None and len(coarse.landmarks) < 0.5 * len(tracks.landmarks)
+    again = steps.again(frame, coarse, np.eye(4), known)
+    assert len(again.landmarks) > 0.9 * len(tracks.landmarks)
+    T_turned = se3.exp([0.01, 0, 0, 0, 0, 0])
+    kept = steps.again(frame, again, T_turned, believed)
+    assert kept.landmarks is again.landmarks, "enough were inliers"
+    np.testing.assert_allclose(kept.T_curr_odom, se3.inverse(T_turned), atol=1e-12)
 
 
 def test_no_pose_without_tracks() -> None:
