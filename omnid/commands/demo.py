@@ -5,14 +5,9 @@ from __future__ import annotations
 import argparse
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.replay import replay_and_print
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.config import Config
-    from omnid.simulation.robot import SimulatedRobot
 
 DRIVE_S = 90.0  # of simulated time at most
 
@@ -83,8 +78,8 @@ def _drive(args: argparse.Namespace) -> int:
     _make_folder(args.output)
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
     config = load_config(args.config, [*args.overrides, f"places.map={place_map}", f"navigation.routes={routes}"])
+    place_map.unlink(missing_ok=True)  # of an earlier demonstration
     world, robot = load_world("room", args.seed), make_robot()
-    _begin_map(place_map, robot, config)
     script = TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
     run = simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
     first, second = both_paths(run, script.repeated_s)
@@ -98,13 +93,3 @@ def _drive(args: argparse.Namespace) -> int:
               f"{off_cm.max():.1f} cm, by the truth")
     print(f"picture of the taught path (black) and the repeated one (red): {image}; map: {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1
-
-
-def _begin_map(path: Path, robot: SimulatedRobot, config: Config) -> None:
-    """Write an empty map of places, in the place of one of an earlier demonstration."""
-    from omnid.formats.place_file import write_places
-    from omnid.runs.place_maps import new_places, place_rig
-    from omnid.simulation.lockstep import with_masks
-    from omnid.stages.geometry import geometry
-
-    write_places(path, new_places(config.places), place_rig(geometry(with_masks(robot.rig), config.panorama)))

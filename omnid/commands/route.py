@@ -31,6 +31,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     repeat.add_argument("--reverse", action="store_true", help="from its end to its start")
     repeat.add_argument("--loops", type=int, default=1, metavar="N", help="a closed route is driven in rounds, another "
                         "there and back, N times in all; default %(default)s")
+    repeat.add_argument("--from", choices=("here", "start"), default="here", dest="begin", help="here: from where the "
+                        "robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
+                        "elsewhere; default %(default)s")
     repeat.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
     _add(actions, "stop", run_text, "end the repetition, or the recording without a file", on_robot=False, named=False)
     add_json(_add(actions, "list", run_list, "the routes in navigation.routes, here", named=False))
@@ -76,7 +79,8 @@ def run_repeat(args: argparse.Namespace) -> int:
 
     if not 1 <= args.loops <= MAX_LOOPS:
         raise OmnidError(f"--loops {args.loops}: expected 1 to {MAX_LOOPS}")
-    text = f"repeat {route_name(args.name)}{' reverse' if args.reverse else ''} loops={args.loops}"
+    words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
+    text = " ".join([*words, f"loops={args.loops}", f"from={args.begin}"])
     with NavigationClient(config_of(args).bus) as client:
         client.route(text)
         return 0 if args.no_wait else drive_to_end(client)

@@ -119,7 +119,8 @@ class Routes:
         if not route.fits(places.keyframe):
             raise OmnidError(f"the route {route.name} was taught in another map ({route.map_name}) than "
                              f"{places.name}: start with that map (`omnid run --map`), or teach it again")
-        return repeated_paths(route, places.keyframe, now.map_pose(), loops=request.loops, reverse=request.reverse)
+        return repeated_paths(route, places.keyframe, now.map_pose(), loops=request.loops, reverse=request.reverse,
+                              from_start=request.from_start)
 
     def _map(self) -> RouteMap:
         if self._places is None or not self._places.name:

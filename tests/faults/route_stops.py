@@ -17,13 +17,10 @@ from pathlib import Path
 from typing import Final
 
 from omnid.config import load_config
-from omnid.formats.place_file import write_places
-from omnid.runs.place_maps import new_places, place_rig
 from omnid.simulation.demonstration import ROUTE, TeachAndRepeat
-from omnid.simulation.lockstep import simulate, with_masks
+from omnid.simulation.lockstep import simulate
 from omnid.simulation.robot import make_robot, traction
 from omnid.simulation.world_file import load_world
-from omnid.stages.geometry import geometry
 from omnid.transport import topics
 from omnid.transport.navigation_codec import string_cdr
 from omnid.transport.status_names import Key
@@ -50,11 +47,8 @@ RENAMED: Final = {"cmd/stop, the operator goes on sending": "cmd/stop"}
 def teach(folder: Path) -> None:
     """Write a map and a route in it into a folder."""
     config = load_config(None, [f"places.map={folder / 'site.omap'}", f"navigation.routes={folder / 'routes'}"])
-    robot = make_robot(SIZE_PX)
-    write_places(folder / "site.omap", new_places(config.places), place_rig(geometry(with_masks(robot.rig),
-                                                                                    config.panorama)))
     script = TeachAndRepeat(lambda line: None)
-    simulate(load_world(WORLD, SEED), robot, script, seconds=TEACH_S, seed=SEED, config=config)
+    simulate(load_world(WORLD, SEED), make_robot(SIZE_PX), script, seconds=TEACH_S, seed=SEED, config=config)
     assert script.end == "reached", script.end
 
 

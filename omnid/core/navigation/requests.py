@@ -17,7 +17,7 @@ LONGEST_TEXT: Final = 200  # characters of a request
 LONGEST_NAME: Final = 64
 _NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 _LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
-ROUTE_USAGE: Final = '"teach NAME", "finish", "repeat NAME [reverse] [loops=N]" or "stop"'
+ROUTE_USAGE: Final = '"teach NAME", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'
 
 
 class NavigationFrame(StrEnum):
@@ -71,6 +71,7 @@ class RouteRequest:
     name: str = ""
     reverse: bool = False
     loops: int = 1
+    from_start: bool = False  # the whole route; else from where the robot is on it
 
 
 Request: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
@@ -101,8 +102,7 @@ def route_name(text: str) -> str:
 
 
 def route_request(text: str) -> RouteRequest:
-    """Parse "teach NAME", "finish", "repeat NAME [reverse] [loops=N]" or "stop". Raise OmnidError for any other text.
-    """
+    """Parse a text as ROUTE_USAGE says. Raise OmnidError for any other text."""
     words = text.split() if len(text) <= LONGEST_TEXT else []
     match words:
         case ["finish" | "stop" as action]:
@@ -120,9 +120,9 @@ def _repeat(name: str, options: list[str], text: str) -> RouteRequest:
         found = _LOOPS.fullmatch(option)
         if found and int(found[1]) <= MAX_LOOPS:
             loops = int(found[1])
-        elif option != "reverse":
+        elif option not in ("reverse", "from=here", "from=start"):
             raise OmnidError(f"{_shown(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
-    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops)
+    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops, "from=start" in options)
 
 
 def _shown(text: str) -> str:

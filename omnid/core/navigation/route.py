@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.navigation.path import MAX_LENGTH_M, DrivePath, drive_path
+from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
 from omnid.core.places.planar import composed, relative, wrapped
 from omnid.errors import OmnidError
 
@@ -29,6 +29,8 @@ SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be 
 CLOSED_M: Final = 1.0  # from the end to the start of a route that is driven in rounds
 ENTRY_M: Final = 1.5  # from the robot to the route
 ENTRY_M_PER_RAD: Final = 0.5  # of heading, where several pieces of a route are near
+BESIDE_M: Final = 0.25  # from the robot to the route, beyond which it drives to a point ahead on it
+JOIN: Final = 2.5  # way along the route to that point, per distance beside it: at 22 degrees, which is no corner
 FarKeyframe = Callable[[int], "KeyframePose | None"]
 
 
@@ -136,15 +138,16 @@ class RouteRecorder:
         return replace(route, poses=route.in_map(keyframe))
 
 
-def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool) -> list[DrivePath]:
+def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool,
+                   from_start: bool = False) -> list[DrivePath]:
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
-    A closed route is driven in rounds, any other there and back, `loops` times in all. Raise OmnidError where the
-    robot is not near it.
+    A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
+    Raise OmnidError where the robot is not near it, or not near its start.
     """
     there = route.reversed() if reverse else route
     poses = there.in_map(keyframe)
-    first = _entry(poses, pose)
+    first = _start(poses, pose) if from_start else _joined(poses, there.speeds, _entry(poses, pose), pose)
     paths = [_path(there, poses, first, pose)]
     if loops == 1:
         return paths
@@ -166,12 +169,32 @@ def _entry(poses: Array, pose: Array) -> int:
     return int(np.argmin(np.where(near, cost, np.inf)))
 
 
+def _start(poses: Array, pose: Array) -> int:
+    """Return the first point of a route. Raise OmnidError where the robot is not near it."""
+    away_m = math.dist(poses[0, :2], pose[:2])
+    if away_m > ENTRY_M:
+        raise OmnidError(f"the robot is {away_m:.1f} m away from the start of the route: drive it there, to within "
+                         f"{ENTRY_M:g} m, or begin where it is on the route (from=here)")
+    return 0
+
+
+def _joined(poses: Array, speeds: Array, first: int, pose: Array) -> int:
+    """Return the point ahead of the nearest one to which a robot beside the route drives, before the next corner."""
+    away_m = math.dist(poses[first, :2], pose[:2])
+    if away_m <= BESIDE_M:
+        return first
+    ways_m = np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T))
+    goes_on = ((ways_m <= JOIN * away_m) & (np.abs(wrapped(poses[first + 1:, 2] - poses[first, 2])) < CORNER_RAD)
+               & (speeds[first + 1:] * speeds[first] > 0))
+    return first + int(np.argmin(np.append(goes_on, False)))
+
+
 def _path(route: Route, poses: Array, first: int, pose: Array | None) -> DrivePath:
     """Return the path from a point of the route on, from the pose of the robot if one is given."""
     first = min(first, len(poses) - 2)
     xy, speeds = poses[first:, :2], np.maximum(np.abs(route.speeds[first:]), LEAST_MPS)
     backwards = route.speeds[first:] < 0
-    if pose is not None and math.dist(pose[:2], xy[0]) > CLOSED_M / 4:
+    if pose is not None and math.dist(pose[:2], xy[0]) > BESIDE_M:
         xy = np.vstack([pose[None, :2], xy])
         speeds, backwards = np.append(speeds[:1], speeds), np.append(backwards[:1], backwards)
         backwards[:2] = False

@@ -24,13 +24,15 @@ from omnid.errors import OmnidError
     ("stop", RouteRequest(RouteAction.STOP)),
     ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
     ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
-    ("repeat hall loops=3", RouteRequest(RouteAction.REPEAT, "hall", False, 3))])
+    ("repeat hall loops=3", RouteRequest(RouteAction.REPEAT, "hall", False, 3)),
+    ("repeat hall from=here", RouteRequest(RouteAction.REPEAT, "hall")),
+    ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True))])
 def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
     assert route_request(text) == expected
 
 
 @pytest.mark.parametrize("text", [
-    "", "teach",
+    "", "teach", "repeat a from=", "repeat a from=here from=start", "repeat a from=end",
     "teach a b", "teach ../etc", "teach /x", "teach .hidden", "repeat", "repeat a loops=0", "repeat a loops=",
     "repeat a loops=10001", "repeat a loops=1 loops=2", "repeat a reverse reverse", "repeat a backwards", "finish now",
     "stop all", "TEACH a", "teach \N{SNOWMAN}", "teach " + "a" * 65, "repeat a" + " " * 500, "delete a", "repeat a\0"])

@@ -128,6 +128,30 @@ def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> N
     assert np.percentile(on_way[joined:], 95) < 0.05
 
 
+def test_a_robot_beside_the_route_joins_it_ahead_without_a_corner_and_not_past_one() -> None:
+    straight = np.column_stack([np.arange(0, 6, 0.02), np.zeros(300), np.zeros(300)])
+    corner = straight[-1] + np.column_stack([np.zeros(100), np.arange(0.02, 2.02, 0.02), np.full(100, math.pi / 2)])
+    route = taught(np.vstack([straight, corner]), places := Map(straight))
+    for y_m in (0.8, -0.8):
+        (path,) = repeated_paths(route, places, np.array([2.0, y_m, 0.0]), loops=1, reverse=False)
+        assert len(path.legs) == 2, "no corner but that of the route"
+        on_route = path.legs[0].xy[np.abs(path.legs[0].xy[:, 1]) < 0.01]
+        assert on_route[0, 0] == pytest.approx(2.0 + 2.5 * 0.8, abs=0.2)
+    (path,) = repeated_paths(route, places, np.array([5.6, 0.9, 0.0]), loops=1, reverse=False)
+    assert any(math.dist(xy, (6.0, 0.0)) < 0.15 for leg in path.legs for xy in leg.xy), "its corner is not cut"
+
+
+def test_the_whole_route_is_driven_from_its_start_only() -> None:
+    poses = way()
+    route, places = taught(poses, Map(poses)), Map(poses)
+    near, far = np.array([0.2, 0.4, 0.0]), poses[200]
+    (path,) = repeated_paths(route, places, near, loops=1, reverse=False, from_start=True)
+    assert path.length_m > route.length_m and np.hypot(*(path.legs[0].xy - poses[0, :2]).T).min() < 0.1
+    with pytest.raises(OmnidError, match=r"3\.\d m away from the start of the route: .*from=here"):
+        repeated_paths(route, places, far, loops=1, reverse=False, from_start=True)
+    repeated_paths(route, places, poses[-10], loops=1, reverse=True, from_start=True)
+
+
 def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     poses = way(4.0)
     places = Map(poses)
