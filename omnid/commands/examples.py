@@ -59,6 +59,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "map merge": ("map merge east.omap west.omap -o place.omap",),
     "map tags": ("map tags drive.mcap --tag 5=0.16 --tag 6=0.16 --map place.omap --localize-only",),
     "map export": ("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
+    "map save": ("map save", "map save --robot rover --connect tcp/robot:7447"),
     "diff": ("diff yesterday.mcap today.mcap",),
     "doctor": ("doctor --config /etc/omnid/omnid.toml",),
     "motor test": ("motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",

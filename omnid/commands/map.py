@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
+from omnid.commands.listen import add_robot, config_of
 from omnid.commands.map_option import add_map, map_settings
 
 if TYPE_CHECKING:
@@ -44,6 +45,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     merge.set_defaults(run=run_merge)
     _add_tags(actions)
     _add_export(actions)
+    save = actions.add_parser("save", help="ask a robot to save its map now, before it is switched off")
+    add_robot(save)
+    add_settings(save)
+    save.set_defaults(run=run_save)
 
 
 def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -152,6 +157,14 @@ def run_show(args: argparse.Namespace) -> int:
     lines = [(line[:13].strip(), line[13:]) for line in _described(args.map, summary(places, rig), rig)]
     html = map_page(args.map.name, lines, places, rig)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    return 0
+
+
+def run_save(args: argparse.Namespace) -> int:
+    """Ask the robot to save its map, and print what became of it."""
+    from omnid.monitor.map_saving import save_map
+
+    print(save_map(config_of(args).bus))
     return 0
 
 

@@ -62,7 +62,7 @@ from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
 from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
-from omnid.transport.topics import SENSOR_TOPICS, command_topics
+from omnid.transport.topics import MAP, MAP_TOPICS, SENSOR_TOPICS, command_topics
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
@@ -183,7 +183,7 @@ class LiveRun:
         saver = self._saver(run_places, stages.places)
         commands = self._command_receiver(controller) if controller else None
         receiver = self._navigation_receiver(requests)
-        self._subscribe(session, bus, recorder, commands, receiver, sensors)
+        self._subscribe(session, bus, recorder, commands, receiver, sensors, saver)
         status = [ladder.status, exposure.status, partial(start_status, stages.rig_gate),
                   *([receiver.status] if controller else ()),
                   motion_status(stages.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
@@ -266,16 +266,19 @@ class LiveRun:
                                report=partial(self._report, logging.WARNING))
 
     def _subscribe(self, session: Session, bus: Bus, recorder: Recorder | None, commands: CommandReceiver | None,
-                   navigation: NavigationReceiver, sensors: SensorSources) -> None:
-        """Take commands, requests and samples from the bus; without a motor samples only."""
-        topics = SENSOR_TOPICS if commands is None else command_topics(self._config.controller.sources.names)
+                   navigation: NavigationReceiver, sensors: SensorSources, saver: MapSaver | None) -> None:
+        """Take commands, requests and samples from the bus; without a motor samples and requests to save the map."""
+        topics = {**SENSOR_TOPICS, **MAP_TOPICS} if commands is None else \
+            command_topics(self._config.controller.sources.names)
         record = nothing if recorder is None else command_recorder(recorder, session.offset_ns, topics)
 
         def receive(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
             if sensors.receiver.handles(key):
                 sensors.receiver.receive(key, payload)
                 return  # samples are recorded with the poses
-            if commands is None:
+            if key == MAP and saver is not None:
+                saver.receive(payload)
+            if key == MAP or commands is None:
                 return
             if navigation.handles(key):
                 navigation.receive(key, payload, sent_ns)

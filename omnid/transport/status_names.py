@@ -86,6 +86,9 @@ class Key(StrEnum):
     OBSTACLE_STOPS = "obstacle_stops"
     ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
     ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
+    # Map file
+    SAVES = "saves"
+    ANSWERED = "answered"  # requests to save it
     # Navigation, on its own topic
     TASK = "task"  # such as "goal" or "route NAME"; no key without one
     REASON = "reason"  # of a halt or an end

@@ -48,6 +48,9 @@ NAVIGATION: Final = "cmd/navigation"
 ROUTE: Final = "cmd/route"
 NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH_SCHEMA,
                             NAVIGATION: navigation_codec.STRING_SCHEMA, ROUTE: navigation_codec.STRING_SCHEMA}
+MAP: Final = "cmd/map"
+SAVE_MAP: Final = "save"  # the request on it
+MAP_TOPICS: Final = {MAP: navigation_codec.STRING_SCHEMA}
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
@@ -62,7 +65,8 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
     setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **SENSOR_TOPICS, **named}
+    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **MAP_TOPICS,
+            **SENSOR_TOPICS, **named}
 
 
 def ros_name(robot: str, topic: str) -> str:

@@ -24,7 +24,7 @@ class RobotPage:
         """Return the addresses."""
         return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
                 Route("/arm", self._arm, methods=["POST"]), Route("/route", self._route, methods=["POST"]),
-                Route("/navigation", self._navigation, methods=["POST"])]
+                Route("/navigation", self._navigation, methods=["POST"]), Route("/map", self._map, methods=["POST"])]
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of the robot and of this server."""
@@ -45,6 +45,9 @@ class RobotPage:
 
     async def _navigation(self, request: Request) -> Response:
         return answered(await self._routes.navigation(request))
+
+    async def _map(self, _: Request) -> Response:
+        return answered(await self._routes.save_map())
 
 
 def answered(answer: Answer) -> Response:

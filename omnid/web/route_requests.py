@@ -1,8 +1,9 @@
-"""Routes from the page: the same requests with the same answers as `omnid route`."""
+"""Routes and the map from the page: the same requests with the same answers as `omnid route` and `omnid map save`."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from typing import Final
 
@@ -10,6 +11,7 @@ from starlette.requests import Request
 
 from omnid.core.navigation.requests import navigation_verb, route_request
 from omnid.errors import OmnidError
+from omnid.monitor.map_saving import save_map
 from omnid.monitor.navigation import NavigationClient
 from omnid.transport.bus_config import BusConfig
 from omnid.web.wheel_commands import Answer
@@ -34,16 +36,27 @@ class RouteRequests:
         """Pass on cancel, pause or resume."""
         return await self._asked(request, "navigation")
 
+    async def save_map(self) -> Answer:
+        """Ask the robot to save its map now."""
+        return await self._alone(lambda: Answer(True, save_map(self._bus)))
+
     async def _asked(self, request: Request, kind: str) -> Answer:
         try:
             text = await _text_of(request)
             (route_request if kind == "route" else navigation_verb)(text)
-            if self._busy.locked():
-                return Answer(False, "another request has no answer yet")
-            async with self._busy:
-                return await asyncio.to_thread(partial(_answer, self._bus, kind, text))
         except OmnidError as error:
             return Answer(False, str(error))
+        return await self._alone(partial(_answer, self._bus, kind, text))
+
+    async def _alone(self, ask: Callable[[], Answer]) -> Answer:
+        """Ask the robot in a thread, unless another request waits for its answer."""
+        if self._busy.locked():
+            return Answer(False, "another request has no answer yet")
+        async with self._busy:
+            try:
+                return await asyncio.to_thread(ask)
+            except OmnidError as error:
+                return Answer(False, str(error))
 
 
 def _answer(bus: BusConfig, kind: str, text: str) -> Answer:

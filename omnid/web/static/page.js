@@ -4,6 +4,7 @@ import { Plan } from "./plan.js";
 import { wireCommands } from "./commands.js";
 import { showCalibration } from "./calibration.js";
 import { showNavigation, wireRoutes } from "./routes.js";
+import { showMapFile, wireMap } from "./map.js";
 import { wireRecordings } from "./recordings.js";
 import { byId, element, fixed } from "./elements.js";
 
@@ -26,6 +27,7 @@ function onMessage(message, body) {
       return plan.setMap(message, body);
     case "parts":
       showCalibration(message.parts.find((part) => part.name === "calibration"));
+      showMapFile(message.parts.find((part) => part.name === "map file"));
       return showParts(message.parts);
     case "navigation": return showNavigation(message);
     case "scan":
@@ -141,4 +143,5 @@ if (location.pathname.startsWith("/robot/")) { // one of several: recordings of 
   wireRecordings();
 }
 wireRoutes();
+wireMap();
 connection.open();

@@ -15,7 +15,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.navigation_codec import string_from_cdr
-from omnid.transport.status_names import NAVIGATION, Key
+from omnid.transport.status_names import MAP_FILE, NAVIGATION, Key
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served
 
@@ -28,10 +28,15 @@ class Navigator:
         bus.subscribe_commands(self._take, {})
 
     def _take(self, key: str, payload: bytes, *_: object) -> None:
-        if key in ("cmd/route", "cmd/navigation"):
+        if key in ("cmd/route", "cmd/navigation", "cmd/map"):
             self.asked.append(string_from_cdr(payload))
 
     def publish(self) -> None:
+        """Report the navigation, and the map's file: the second save finds nothing new, the third a full disk."""
+        saves = self.asked.count("save")
+        entry = DiagnosticStatus(MAP_FILE, 2 if saves == 3 else 0, "cannot write the map", {
+            Key.SAVES: str(min(saves, 1)), Key.ANSWERED: str(saves)})
+        self._bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [entry]))
         newest = self.asked[-1] if self.asked else ""
         values = {Key.STATE: "driving", Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5",
                   Key.REQUEST_NUMBER: str(len(self.asked)), Key.REQUEST: newest,
@@ -71,6 +76,16 @@ def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer
     with server.live(server.bearer) as live:
         shown = Shown(live).until("navigation", navigator.publish)
     assert (shown["state"], shown["task"], shown["left_m"]) == ("driving", "route dock", 3.5)
+
+
+def test_the_map_is_saved_when_it_is_asked_for(robot: tuple[WebServer, Navigator]) -> None:
+    server, _ = robot
+    assert answer(robot, "/map", "") == {"done": True, "text": "the map is saved"}
+    assert answer(robot, "/map", "")["text"] == "the map in the file has all that is known already"
+    refused = answer(robot, "/map", "x" * 100_000)
+    assert not refused["done"] and refused["text"].endswith("cannot save its map: cannot write the map")
+    assert server.request("/map", "POST").status == 403 and server.request("/map", headers=server.bearer).status == 405
+    assert server.request("/map", "POST", {**server.bearer, "Origin": "http://evil.example"}).status == 403
 
 
 @pytest.mark.parametrize(("path", "text"), [
