@@ -107,7 +107,9 @@ ARROWS: Mapping[str, str] = {
     "omnid.engine": "omnid.core omnid.errors omnid.settings",
     "omnid.errors": "",
     "omnid.examples": "calib.panorama calib.rig_file calib.se3 omnid",
-    "omnid.formats": "calib.panorama calib.se3 omnid.core.mapping omnid.core.navigation omnid.core.places omnid.errors",
+    "omnid.formats":
+        "calib.errors calib.panorama calib.se3 calib.validation omnid.core.mapping omnid.core.navigation "
+        "omnid.core.places omnid.errors",
     "omnid.light": "calib.panorama calib.rig drivers.cameras drivers.frame omnid.config omnid.messages omnid.transport",
     "omnid.messages":
         "drivers.motion omnid.core.control omnid.core.mapping omnid.core.obstacles omnid.core.odometry "

@@ -7,22 +7,18 @@ import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
-from omnid.commands.map_option import add_map, map_settings
+from omnid.commands.map_tags import add_align, add_tags
 
 if TYPE_CHECKING:
     from omnid.core.places.place_rig import PlaceRig
     from omnid.core.places.place_views import PlaceSummary
-    from omnid.engine.telemetry import Telemetry
-    from omnid.sinks.tag_collector import TagCollector
-    from omnid.stages.geometry import Geometry
 
 CELL_M = 0.05
-MAX_TAG = 586  # of the family 36h11
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,7 +39,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                        "stays")
     merge.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
     merge.set_defaults(run=run_merge)
-    _add_tags(actions)
+    add_tags(actions)
+    add_align(actions)
     _add_export(actions)
     save = actions.add_parser("save", help="ask a robot to save its map now, before it is switched off")
     add_robot(save)
@@ -60,18 +57,6 @@ def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     build.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(build)
     build.set_defaults(run=run_build)
-
-
-def _add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    tags = actions.add_parser("tags", help="the poses of AprilTags (36h11) that a log shows, as landmarks with names")
-    tags.add_argument("log", type=Path, metavar="LOG", help="as of `omnid replay`")
-    tags.add_argument("--tag", action="append", required=True, metavar="ID=SIZE", help="number of a tag and the edge "
-                      "of its black square, m; may be repeated")
-    tags.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_map(tags)
-    add_settings(tags)
-    add_json(tags)
-    tags.set_defaults(run=run_tags)
 
 
 def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -195,43 +180,6 @@ def run_merge(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_tags(args: argparse.Namespace) -> int:
-    """Print the poses of the tags; return 1 if one was not found."""
-    import numpy as np
-
-    from calib import se3
-    from omnid.config import load_config
-    from omnid.engine.flow import Slot
-    from omnid.runs.replay import ReplayOptions, run_log
-    from omnid.sinks.tag_collector import TagCollector
-
-    sizes_m = _sizes_m(args.tag)
-    config = load_config(args.config, [*args.overrides, *map_settings(args)])
-    collector: Slot[TagCollector] = Slot()
-
-    def observer(geometry: Geometry, _: Telemetry) -> TagCollector:
-        collector.put(TagCollector(geometry, sizes_m))
-        return cast("TagCollector", collector.get())
-
-    result = run_log(args.log, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))
-    for warning in result.warnings:
-        print(f"omnid: warning: {warning}", file=sys.stderr)
-    found = cast("TagCollector", collector.get())
-    rows = [{"id": id, "xyz_m": tag.T[:3, 3].tolist(), "quaternion_xyzw": se3.quaternion(tag.T[:3, :3]).tolist(),
-             "sigma_m": float(np.sqrt(np.trace(tag.covariance[:3, :3]) / 3)),
-             "sigma_deg": float(np.degrees(np.sqrt(np.trace(tag.covariance[3:, 3:]) / 3))),
-             "views": tag.views, "rejected": tag.rejected} for id, tag in found.tags().items()]
-    if args.json:
-        print_json({"tags": rows, "refused": found.refused})
-    else:
-        print(*_tag_lines(rows), sep="\n")
-    missing = sizes_m.keys() - {row["id"] for row in rows}
-    if missing:
-        print(f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {found.refused} views were of another size",
-              file=sys.stderr)
-    return int(bool(missing))
-
-
 def run_export(args: argparse.Namespace) -> int:
     """Write the files that are asked for."""
     from omnid.core.places import place_views
@@ -259,30 +207,6 @@ def run_export(args: argparse.Namespace) -> int:
         if args.plan:
             write_plan(args.plan, points, place_views.base_poses(places, rig)[:, :2, 3])
     return 0
-
-
-def _sizes_m(words: list[str]) -> dict[int, float]:
-    """Return the sizes of "5=0.2" by their tags. Raises OmnidError."""
-    from omnid.errors import OmnidError
-
-    sizes: dict[int, float] = {}
-    for word in words:
-        id, _, size = word.partition("=")
-        try:
-            sizes[int(id)] = float(size)
-        except ValueError:
-            raise OmnidError(f"--tag {word}: expected ID=SIZE, such as 5=0.16") from None
-        if not (0 <= int(id) <= MAX_TAG and 0.005 <= sizes[int(id)] <= 10):
-            raise OmnidError(f"--tag {word}: expected a number of 0 to {MAX_TAG} and an edge of 0.005 to 10 m")
-    return sizes
-
-
-def _tag_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    yield f"{'tag':>4}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}{'rejected':>10}"
-    for row in rows:
-        x, y, z = row["xyz_m"]
-        yield (f"{row['id']:>4}{x:>10.3f}{y:>10.3f}{z:>10.3f}{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}"
-               f"{row['views']:>7}{row['rejected']:>10}")
 
 
 def _plain(sizes: PlaceSummary) -> dict[str, object]:

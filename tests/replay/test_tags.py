@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from omnid.formats.landmark_file import read_landmarks
 from omnid.simulation.rendering.surfaces import Rectangle
 from tests.replay.command import Command
 from tests.simulation import Scene, build, write_log
@@ -33,14 +34,18 @@ def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_tag_is_located_in_the_map(omnid: Command, tagged: Path) -> None:
+def test_a_tag_is_located_in_the_map(omnid: Command, tagged: Path, tmp_path: Path) -> None:
     code, out, err = omnid("map", "tags", tagged / "log.mcap", "--rig", tagged / "rig.toml", "--tag", f"5={EDGE_M}",
-                           "--tag", "6=0.2", "--json")
+                           "--tag", "6=0.2", "--json", "--write", tmp_path / "tags.toml")
     assert code == 1 and "not found: 6;" in err
     [found] = json.loads(out)["tags"]
     assert found["id"] == 5 and found["views"] >= 2 and found["rejected"] == 0
     error = np.linalg.norm(np.array(found["xyz_m"]) - AT_START)
     assert error < 0.02 and error < 5 * found["sigma_m"]
+    # The rig sees it from the side that it faces: it hangs to the left.
+    [mark] = read_landmarks(tmp_path / "tags.toml").values()
+    np.testing.assert_allclose(mark.xyz_m, found["xyz_m"], atol=1e-4)
+    assert mark.size_m == EDGE_M and mark.facing_rad is not None and abs(mark.facing_rad + np.pi / 2) < 0.1
 
 
 def test_wrong_sizes_are_one_line(omnid: Command, tagged: Path) -> None:

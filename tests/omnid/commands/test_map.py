@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from omnid.cli import main
-from omnid.formats.place_file import write_places
+from omnid.core.places.place_views import base_poses
+from omnid.formats.place_file import read_places, write_places
 from omnid.formats.ply import read_ply
 from tests.omnid.formats.place_maps import RIG, some_places
 
@@ -49,6 +51,29 @@ def test_show_writes_a_page_with_keyframes_loops_and_both_paths(omap: Path, caps
         assert text in html
     assert "http" not in html.replace("http-equiv", "")
     assert main(["map", "show", str(omap), "-o", str(omap)]) == 2 and capsys.readouterr().err.count("\n") == 1
+
+
+SEEN = "schema = 1\n[tag.5]\nid = 5\nsize_m = 0.2\nxyz_m = [1, 2, 0.5]\nfacing_deg = 0\n"
+
+
+def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is turned by 90 degrees; a plan that does not fit, or does not tell, is refused."""
+    seen, plan, out = (omap.parent / name for name in ("seen.toml", "plan.toml", "out.omap"))
+    words = ["map", "align", str(omap), "--seen", str(seen), "--known", str(plan), "-o", str(out)]
+    seen.write_text(SEEN)
+    plan.write_text(SEEN.replace("tag.5", "tag.dock").replace("[1, 2,", "[11, 2,").replace("= 0\n", "= 90\n"))
+    assert main(words) == 0 and "tag 5 (dock): 0 mm from its place on the plan" in capsys.readouterr().out
+    before, after = (base_poses(*read_places(path)) for path in (omap, out))
+    np.testing.assert_allclose(after[:, 0, 3], 11 - (before[:, 1, 3] - 2), atol=1e-9)
+    np.testing.assert_allclose(after[:, 1, 3], 2 + before[:, 0, 3] - 1, atol=1e-9)
+    two = SEEN + SEEN[11:].replace("5", "6").replace("[1, 2,", "[4, 2,")
+    for text, message in ((SEEN.replace("facing_deg = 0\n", ""), "1 tags in common: two landmarks"),
+                          (two, "from its place on the plan")):
+        seen.write_text(text)
+        plan.write_text(text.replace("[4, 2,", "[6, 2,"))
+        assert main(words) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
 
 
 def test_export_writes_what_is_asked_for(omap: Path) -> None:

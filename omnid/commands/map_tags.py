@@ -1,0 +1,143 @@
+"""`omnid map tags|align`: AprilTags as landmarks, and the alignment of a map with a plan of the building by them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from omnid.commands.config import add_settings
+from omnid.commands.json_output import add_json, print_json
+from omnid.commands.map_option import add_map, map_settings
+
+if TYPE_CHECKING:
+    from omnid.engine.telemetry import Telemetry
+    from omnid.sinks.tag_collector import TagCollector
+    from omnid.stages.geometry import Geometry
+
+LARGEST_M = 0.3  # that may be left at a landmark: beyond it, a number was mistaken
+
+
+def add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `map tags`."""
+    tags = actions.add_parser("tags", help="the poses of AprilTags (36h11) that a log shows, as landmarks with names")
+    tags.add_argument("log", type=Path, metavar="LOG", help="as of `omnid replay`")
+    tags.add_argument("--tag", action="append", required=True, metavar="ID=SIZE", help="number of a tag and the edge "
+                      "of its black square, m; may be repeated")
+    tags.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+    tags.add_argument("--write", type=Path, metavar="TAGS.toml", help="write them as landmarks, for `omnid map align`")
+    add_map(tags)
+    add_settings(tags)
+    add_json(tags)
+    tags.set_defaults(run=run_tags)
+
+
+def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `map align`."""
+    parser = actions.add_parser("align", help="move a map into the axes of a plan of the building, by known AprilTags")
+    parser.add_argument("map", type=Path, metavar="FILE.omap")
+    parser.add_argument("--seen", type=Path, required=True, metavar="TAGS.toml", help="the tags in the map, as written "
+                        "by `omnid map tags LOG --map FILE.omap --localize-only --write TAGS.toml`")
+    parser.add_argument("--known", type=Path, required=True, metavar="PLAN.toml", help="the same tags on the plan: x, "
+                        "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
+    parser.set_defaults(run=run_align)
+
+
+def run_tags(args: argparse.Namespace) -> int:
+    """Print the poses of the tags; return 1 if one was not found."""
+    import numpy as np
+
+    from calib import se3
+    from omnid.config import load_config
+    from omnid.core.places.alignment import landmark
+    from omnid.engine.flow import Slot
+    from omnid.formats.landmark_file import write_landmarks
+    from omnid.runs.replay import ReplayOptions, run_log
+    from omnid.sinks.files import check_outputs
+    from omnid.sinks.tag_collector import TagCollector
+
+    sizes_m = _sizes_m(args.tag)
+    if args.write is not None:
+        check_outputs([("--write", args.write)], [("the log that is read", args.log)])
+    config = load_config(args.config, [*args.overrides, *map_settings(args)])
+    collector: Slot[TagCollector] = Slot()
+
+    def observer(geometry: Geometry, _: Telemetry) -> TagCollector:
+        collector.put(TagCollector(geometry, sizes_m))
+        return cast("TagCollector", collector.get())
+
+    result = run_log(args.log, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))
+    for warning in result.warnings:
+        print(f"omnid: warning: {warning}", file=sys.stderr)
+    found = cast("TagCollector", collector.get())
+    rows = [{"id": id, "xyz_m": tag.T[:3, 3].tolist(), "quaternion_xyzw": se3.quaternion(tag.T[:3, :3]).tolist(),
+             "sigma_m": float(np.sqrt(np.trace(tag.covariance[:3, :3]) / 3)),
+             "sigma_deg": float(np.degrees(np.sqrt(np.trace(tag.covariance[3:, 3:]) / 3))),
+             "views": tag.views, "rejected": tag.rejected} for id, tag in found.tags().items()]
+    if args.json:
+        print_json({"tags": rows, "refused": found.refused})
+    else:
+        print(*_tag_lines(rows), sep="\n")
+    if args.write is not None:
+        write_landmarks(args.write, [landmark(id, sizes_m[id], tag.T) for id, tag in found.tags().items()])
+    missing = sizes_m.keys() - {row["id"] for row in rows}
+    if missing:
+        print(f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {found.refused} views were of another size",
+              file=sys.stderr)
+    return int(bool(missing))
+
+
+def run_align(args: argparse.Namespace) -> int:
+    """Write the map in the axes of the plan."""
+    from omnid.core.places.alignment import align, fit
+    from omnid.errors import OmnidError
+    from omnid.formats.landmark_file import read_landmarks
+    from omnid.formats.place_file import read_places, write_places
+    from omnid.sinks.files import check_outputs
+
+    check_outputs([("-o", args.output)], [("--seen", args.seen), ("--known", args.known)])
+    seen, known = read_landmarks(args.seen), read_landmarks(args.known)
+    places, rig = read_places(args.map)
+    try:
+        T_plan_map, left_m = fit(seen, known)
+    except ValueError as error:
+        raise OmnidError(f"map align: {args.seen} and {args.known} have {len(seen.keys() & known.keys())} tags in "
+                         f"common: {error}") from None
+    worst = max(left_m, key=lambda id: left_m[id])
+    if left_m[worst] > LARGEST_M:
+        raise OmnidError(f"map align: tag {worst} ({known[worst].name}) is {left_m[worst]:.2f} m from its place on the "
+                         f"plan, expected at most {LARGEST_M} m: correct its place in {args.known}, or leave it out")
+    align(places, rig, T_plan_map)
+    write_places(args.output, places, rig)
+    for id, metres in left_m.items():
+        print(f"tag {id} ({known[id].name}): {1e3 * metres:.0f} mm from its place on the plan")
+    return 0
+
+
+def _sizes_m(words: list[str]) -> dict[int, float]:
+    """Return the sizes of "5=0.2" by their tags. Raises OmnidError."""
+    from omnid.errors import OmnidError
+    from omnid.formats.landmark_file import MAX_TAG, SIZES_M
+
+    sizes: dict[int, float] = {}
+    for word in words:
+        id, _, size = word.partition("=")
+        try:
+            sizes[int(id)] = float(size)
+        except ValueError:
+            raise OmnidError(f"--tag {word}: expected ID=SIZE, such as 5=0.16") from None
+        if not (0 <= int(id) <= MAX_TAG and SIZES_M[0] <= sizes[int(id)] <= SIZES_M[1]):
+            raise OmnidError(f"--tag {word}: expected a number of 0 to {MAX_TAG} and an edge of "
+                             f"{SIZES_M[0]:g} to {SIZES_M[1]:g} m")
+    return sizes
+
+
+def _tag_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield f"{'tag':>4}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}{'rejected':>10}"
+    for row in rows:
+        x, y, z = row["xyz_m"]
+        yield (f"{row['id']:>4}{x:>10.3f}{y:>10.3f}{z:>10.3f}{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}"
+               f"{row['views']:>7}{row['rejected']:>10}")
