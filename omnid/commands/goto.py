@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.verb and args.pose:
         raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
     if not args.verb and len(args.pose) not in (2, 3):
-        raise OmnidError(f"goto: expected X Y [YAW], found {len(args.pose)} numbers")
+        raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
     if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for value in args.pose):
         raise OmnidError(f"goto: expected finite numbers of at most {FARTHEST_M:g}")
     with NavigationClient(config_of(args).bus) as client:

@@ -171,8 +171,9 @@ class NavigationStage:
             case RouteAction.REPEAT:
                 if routes.teaching:
                     raise OmnidError(f"the route {routes.teaching} is being taught: finish or stop it first")
+                route = routes.read(request.name)  # first: who asks for another one need not arm it
                 self._require_ready(NavigationFrame.MAP)
-                paths = routes.paths(request, self._situation())
+                paths = routes.paths(route, request, self._situation())
                 self._start(f"route {request.name}", NavigationFrame.MAP, paths, command)
 
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:

@@ -112,13 +112,18 @@ class Routes:
         dropped, self._recorder = self._recorder is not None, None
         return dropped
 
-    def paths(self, request: RouteRequest, now: Situation) -> list[DrivePath]:
-        """Return the paths of a repetition. Raise OmnidError where it is impossible."""
+    def read(self, name: str) -> Route:
+        """Return a route of this map. Raise OmnidError where there is none of that name."""
         places = self._map()
-        route = self._store.read(request.name)
+        route = self._store.read(name)
         if not route.fits(places.keyframe):
             raise OmnidError(f"the route {route.name} was taught in another map ({route.map_name}) than "
                              f"{places.name}: start with that map (`omnid run --map`), or teach it again")
+        return route
+
+    def paths(self, route: Route, request: RouteRequest, now: Situation) -> list[DrivePath]:
+        """Return the paths of a repetition. Raise OmnidError where it is impossible."""
+        places = self._map()
         return repeated_paths(route, places.keyframe, now.map_pose(), loops=request.loops, reverse=request.reverse,
                               from_start=request.from_start)
 

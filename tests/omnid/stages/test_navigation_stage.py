@@ -155,7 +155,8 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
     robot.wheels = WheelState(False, True, "a stop was asked for")
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
-    assert [u.answer.number for u in robot.updates if u.answer is not None][-1] == 8
+    assert "no route nowhere in" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
+    assert [u.answer.number for u in robot.updates if u.answer is not None][-1] == 9
 
 
 def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
