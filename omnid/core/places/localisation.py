@@ -24,7 +24,7 @@ from omnid.core.places.hypotheses import Hypotheses, Hypothesis, angle_rad, leng
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_search import Expected, PlaceSearch
-from omnid.core.places.recognition import Recognition
+from omnid.core.places.recognition import MIN_MATCHES, Recognition
 from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.core.places.signature import Thumbnail, thumbnail
 from omnid.tracking_state import MapState
@@ -196,7 +196,10 @@ class MapLocaliser:
         if found is None and (far := self._elsewhere()):
             by_scan = None if self._by_scan is None else self._by_scan.T_map_rect(frame.T_odom_rect)
             found = self.search.far(small, features, self.places, far, by_scan)
-        self._failed = 0 if found is not None else self._failed + 1
+        if found is not None:
+            self._failed = 0
+        elif len(features.views) >= MIN_MATCHES:  # in the dark there is nothing to fail
+            self._failed += 1
         return found
 
     def _proposed(self, frame: OdometryFrame) -> list[Array]:

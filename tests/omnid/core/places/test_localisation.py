@@ -13,7 +13,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import range_scan
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
+from omnid.core.places.localisation import SEARCHES, MapLocaliser, MapPose, OdometryFrame
 from omnid.tracking_state import MapState
 from tests.omnid.core.scenery import Array, RenderedCameras, motion_errors
 from tests.simulation import corridor
@@ -114,6 +114,20 @@ def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame]
     error_m, error_rad = motion_errors(found[-1].T_map_odom @ again[-1].T_odom_rect,
                                        se3.inverse(POSES[0]) @ POSES[there[-1]])
     assert error_m < 0.25 and error_rad < 0.05  # the drift of the drive there
+
+
+def test_a_robot_that_stands_in_the_dark_knows_where_it_is_when_there_is_light(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    """However long it was dark."""
+    at, dark, light = len(OUT) + 8, SEARCHES + 2, 4
+    localiser = MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places)
+    seen = [cameras.darkness(400)] * dark + [frames[at]] * light
+    standing = [replace(odometry([stereo])[0], stamp_ns=k * 200_000_000) for k, stereo in enumerate(seen)]
+    found = run(localiser, standing)
+    assert {pose.state for pose in found[: dark + 1]} == {MapState.ODOMETRY_ONLY}
+    assert found[-1].state is MapState.LOCALIZED
+    assert motion_errors(found[-1].T_map_odom, se3.inverse(POSES[0]) @ POSES[at])[0] < 0.25
 
 
 def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
