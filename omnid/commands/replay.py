@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
@@ -103,7 +104,8 @@ def _print_result(result: RunResult, options: ReplayOptions, as_json: bool) -> N
         print_json({"counters": result.counters, "timings": dict(result.timings), "warnings": result.warnings,
                     "signal": result.signal}, stream)
         return
-    print(run_summary(result.counters, result.timings.values()), file=stream)
+    columns = get_terminal_size().columns if stream.isatty() else 0
+    print(run_summary(result.counters, result.timings.values(), columns), file=stream)
 
 
 def _span_of(args: argparse.Namespace) -> tuple[float, float]:

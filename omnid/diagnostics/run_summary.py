@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from textwrap import wrap
+from typing import Final
 
 from omnid.diagnostics.run_statistics import RunCounters
 from omnid.engine.telemetry import SummaryRow
+
+_NAME_COLUMNS: Final = 9
 
 
 def summary_entries(counters: RunCounters) -> dict[str, str]:
@@ -23,13 +27,24 @@ def summary_entries(counters: RunCounters) -> dict[str, str]:
     return entries
 
 
-def run_summary(counters: RunCounters, timings: Iterable[SummaryRow]) -> str:
-    """Return the counters, one a line, and a table with one row for each stage that processed messages."""
-    lines = [f"{name:<9} {text}" for name, text in summary_entries(counters).items()]
+def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], columns: int = 0) -> str:
+    """Return the counters, one a line, and a table with one row for each stage that processed messages.
+
+    columns: of the terminal, whose width no line exceeds; 0: each counter has one line, as programs read it.
+    """
+    lines = [line for name, text in summary_entries(counters).items()
+             for line in _folded(f"{name:<{_NAME_COLUMNS}} {text}", columns)]
     lines += ["", f"{'stage':<11}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
     lines += [f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}"
               for r in timings if r.n]
     return "\n".join(lines)
+
+
+def _folded(line: str, columns: int) -> list[str]:
+    """Return a line as lines of at most so many columns; the texts stay below each other."""
+    if columns <= 2 * _NAME_COLUMNS:
+        return [line]
+    return wrap(line, columns, subsequent_indent=" " * (_NAME_COLUMNS + 1), break_long_words=False)
 
 
 def _listed(counts: Mapping[str, int]) -> str:

@@ -88,7 +88,7 @@ class StderrHandler(logging.Handler):
             stream = self._stream or sys.stderr
             with suppress(OSError, ValueError):
                 columns = os.get_terminal_size(stream.fileno()).columns or _COLUMNS
-                self._shown = _single_line(line)[: max(0, columns - 1)]  # a wrapped line could not be erased
+                self._shown = _fitting(_single_line(line), max(0, columns - 1))  # a wrapped line could not be erased
                 stream.write(f"{_ERASE}{self._shown}")
                 stream.flush()
         finally:
@@ -135,6 +135,13 @@ class StderrHandler(logging.Handler):
 def priority(level: int) -> int:
     """Return the priority of syslog and journald for a level of `logging`."""
     return next((number for least, number in _PRIORITIES if level >= least), _DEBUG_PRIORITY)
+
+
+def _fitting(line: str, columns: int) -> str:
+    """Return a line, without its last parts where they do not fit."""
+    if len(line) <= columns:
+        return line
+    return line[: columns + 1].rpartition(", ")[0] or line[:columns]
 
 
 def _single_line(text: str) -> str:

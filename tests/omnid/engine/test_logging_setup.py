@@ -188,6 +188,7 @@ def test_a_line_of_the_terminal_stays_below_the_others() -> None:
         handler = StderrHandler(stream)
         handler.show("one\nof " + 100 * "x")
         handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": "hello"}))
+        handler.show(f"{'1 m, ' * 15}55 messages dropped")
         handler.show("two")
         handler.show("")
         handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": "end"}))
@@ -196,7 +197,8 @@ def test_a_line_of_the_terminal_stays_below_the_others() -> None:
             shown += os.read(master, 4096).decode()
     os.close(master)
     first = ("one of " + 100 * "x")[:79]  # of 80 columns: a wrapped line could not be erased
-    assert shown == (f"\r\x1b[K{first}\r\x1b[Komnid: hello\r\n{first}\r\x1b[Ktwo\r\x1b[Komnid: end\r\n")
+    assert shown == (f"\r\x1b[K{first}\r\x1b[Komnid: hello\r\n{first}\r\x1b[K"
+                     f"{'1 m, ' * 14}1 m\r\x1b[Ktwo\r\x1b[Komnid: end\r\n")
 
 
 def test_nothing_is_shown_where_there_is_no_terminal() -> None:
