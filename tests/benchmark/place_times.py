@@ -10,7 +10,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from omnid.core.mapping.scan_grid import scan_grid
+from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.places.particle_filter import ParticleFilter
+from omnid.core.places.place_search import PlaceSearch
 from omnid.core.places.pose_graph import optimise
 from omnid.formats.place_file import read_places, write_places
 from tests.omnid.core.mapping.rooms import pose, scan_of
@@ -46,6 +48,8 @@ def main() -> None:
         path_of_map, places = Path(folder) / "a.omap", some_places(999)
         write_places(path_of_map, places, RIG)
         size = path_of_map.stat().st_size
+        search, queries = PlaceSearch(StereoModel(RIG.cylinder, RIG.baseline_m)), some_places(3, 200, seed=7)
+        query, ids = queries.keyframes[1], sorted(places.keyframes)
         rows = (
             ("pose graph: 2,000 nodes, 200 loops, 10 % of them wrong",
              seconds(lambda: optimise(graph.start, graph.edges)),
@@ -54,6 +58,9 @@ def main() -> None:
             ("map of 999 keyframes: read", seconds(lambda: read_places(path_of_map)),
              f"{size / 999 / 1e3:.1f} kB each"),
             ("the same: written, synced, read again", seconds(lambda: write_places(path_of_map, places, RIG)), ""),
+            ("search of a frame in all of it, which shows no place of it",
+             seconds(lambda: search.far(query.thumbnail, query.features, places, ids), 5),
+             f"{places.nbytes / 1e6:.0f} MB in memory"),
             ("grid of 1,000 range scans, 0.05 m", seconds(lambda: scan_grid(scans, poses, 0.05)), ""),
             ("particle filter: one update, 1,000 particles", seconds(lambda: particles.update(scans[0]), 25), ""),
         )
