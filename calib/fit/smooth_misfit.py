@@ -2,8 +2,12 @@
 
 The error of a camera model is a smooth function of the image position, the same in all views. Most of it is absorbed
 by the parameters, which it shifts, so residuals do not show it directly; but their remaining correlation shows its
-size. So residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields (Gaussian
-functions on a grid). tau is estimated by restricted maximum likelihood (Patterson and Thompson 1971).
+size. So residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields: gradients of
+Gaussian functions on a grid. A mirror or lens whose surface is not the model's deflects rays by the gradient of the
+difference of the surfaces, so such fields have no swirl: they move elevations, and hardly turn a camera about its axis.
+
+tau^2 is the mean of its posterior distribution by the restricted likelihood (Patterson and Thompson 1971) with a flat
+prior of tau / sigma (Gelman 2006): the most likely value of few data is often 0.
 """
 
 from __future__ import annotations
@@ -17,8 +21,8 @@ from calib.models.camera import Array
 NODES, WIDTH = 5, 1.0
 # Nodes farther from the centre, in parts of the largest radius, tell nothing.
 MAX_RADIUS = 1.3
-# Values of tau / sigma that are compared.
-RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 120)])
+# Values of tau / sigma over which the posterior is summed.
+RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
 # Least part of the largest eigenvalue of what the fields explain beyond the parameters: less is rounding.
 LEAST_PART = 1e-3
 
@@ -29,7 +33,7 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
     Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
     """
     K, N, _ = pixels.shape
-    own = []
+    own, width = [], WIDTH * 2 / (NODES - 1)
     for part in np.split(pixels, cameras, axis=1):
         known = part[np.isfinite(part).all(axis=2)]
         center = known.mean(axis=0)
@@ -37,16 +41,15 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
         line = np.linspace(-1, 1, NODES)
         nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         nodes = nodes[np.linalg.norm(nodes, axis=1) <= MAX_RADIUS]
-        away = np.linalg.norm((part[:, :, None] - center) / radius - nodes, axis=3)
-        own.append(np.nan_to_num(np.exp(-0.5 * (away / (WIDTH * 2 / (NODES - 1))) ** 2)))
-    counts = [each.shape[2] for each in own]
-    fields = np.zeros((K, N, 2, 2 * sum(counts)))
+        away = ((part[:, :, None] - center) / radius - nodes) / width
+        gaussian = np.exp(-0.5 * (away**2).sum(axis=3, keepdims=True))
+        own.append(np.nan_to_num(-away * gaussian).swapaxes(2, 3))
+    counts = [each.shape[3] for each in own]
+    fields = np.zeros((K, N, 2, sum(counts)))
     first, size = 0, N // cameras
     for camera, values in enumerate(own):
-        rows = slice(camera * size, (camera + 1) * size)
-        for axis in range(2):
-            fields[:, rows, axis, first:first + counts[camera]] = values
-            first += counts[camera]
+        fields[:, camera * size:(camera + 1) * size, :, first:first + counts[camera]] = values
+        first += counts[camera]
     return fields
 
 
@@ -64,8 +67,15 @@ def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, vari
     d, axes = np.linalg.eigh((left + left.T) / 2)
     known = d > LEAST_PART * max(float(d[-1]), 1.0)
     d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
-    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
-    ratio = float(RATIOS[int(np.argmin((np.log(spread) + y**2 / spread).sum(axis=1)))])
+    ratio2 = _mean_ratio2(d, y**2, variance) if len(d) else 0.0
     # The fit does not know the fields: each shifts the parameters by its row of by_field, which has the prior tau.
-    covariance = variance * (inverse + ratio**2 * by_field.T @ by_field)
-    return np.asarray(covariance), ratio * float(np.sqrt(variance))
+    covariance = variance * (inverse + ratio2 * by_field.T @ by_field)
+    return np.asarray(covariance), float(np.sqrt(ratio2 * variance))
+
+
+def _mean_ratio2(d: Array, squares: Array, variance: float) -> float:
+    """Return the posterior mean of (tau / sigma)^2 by squares (N,) with the variances sigma^2 d + tau^2 d^2, N > 0."""
+    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
+    cost = (np.log(spread) + squares / spread).sum(axis=1)
+    weight = np.exp(-0.5 * (cost - cost.min())) * np.gradient(RATIOS)
+    return float(weight @ RATIOS**2 / weight.sum())
