@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import termios
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -26,3 +28,15 @@ def test_shows_nothing_before_the_first_pose() -> None:
     stream = io.StringIO()
     Progress(RunStatistics(), 99, stream)()
     assert stream.getvalue() == ""
+
+
+def test_fits_a_narrow_terminal() -> None:
+    screen, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (24, 30))
+    statistics = RunStatistics()
+    statistics.newest, statistics.poses = cast("Any", SimpleNamespace(seq=49, state="tracking")), 50
+    with os.fdopen(terminal, "w") as stream:
+        Progress(statistics, 99, stream)()
+        drawn = os.read(screen, 1000).decode()
+    os.close(screen)
+    assert "[##" in drawn and max(map(len, drawn.split("\r"))) < 30
