@@ -1,7 +1,8 @@
 """Memory of the floor that was seen to be free, in odom, for what is too near to be seen or shows nothing now.
 
 Near the robot the cameras see no floor, and a plain wall shows nothing at all: what is known there is where the free
-floor ended when it was seen from farther away.
+floor ended when it was seen from farther away. Where a wide piece of floor is missing that was seen before, something
+has come that hides it, though stereo sees nothing on it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ CELL_M: Final = 0.05
 CELLS: Final = 256  # on each side of the square; it follows the robot
 MARGIN_CELLS: Final = 90  # nearer to the border than this, the square is moved; no direction is looked up farther
 STEP_M: Final = 0.05  # along a direction that is looked up
+HIDDEN_M: Final = 0.3  # of floor that is missing, beyond the nearest that the cameras see
+HIDDEN_SECTORS: Final = 8  # side by side; floor of few edges is missed in up to 4, by chance
 SHIFT: Final = 4  # fractional bits of the corners that are drawn
 
 
@@ -40,10 +43,13 @@ class FreeSpace:
         """Forget everything."""
         self._seen_ns[:] = np.iinfo(np.int64).min
 
-    def update(self, stamp_ns: int, T_odom_base: Array, free_m: Array) -> Array:
-        """Add the free ranges (SECTORS,) of a pair, 0 where nothing was seen, and return those that are known now.
+    def update(self, stamp_ns: int, T_odom_base: Array, free_m: Array, floor_from_m: float = math.inf
+               ) -> tuple[Array, NDArray[np.bool_]]:
+        """Add the free ranges (SECTORS,) of a pair, 0 where nothing was seen; return those that are known now.
 
-        A direction in which some floor is seen now says all there is; only where none is seen, memory counts.
+        A direction in which some floor is seen now says all there is; only where none is seen, memory counts. Returned
+        beside it is where something new hides the floor: where nothing is seen in HIDDEN_SECTORS, and memory knows
+        floor at least HIDDEN_M beyond floor_from_m, from which on the cameras see floor elsewhere.
         """
         centre = T_odom_base[:2, 3] / CELL_M
         self._follow(centre)
@@ -60,7 +66,8 @@ class FreeSpace:
         x, y = np.floor(centre).astype(np.int64) - self._corner
         drawn[y, x] = 1  # the robot stands there
         self._seen_ns[drawn > 0] = stamp_ns
-        return np.where(free_m > 0, free_m, remembered)
+        is_hidden = _wide((free_m <= 0) & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
+        return np.where(is_hidden, 0.0, np.where(free_m > 0, free_m, remembered)), is_hidden
 
     def _remembered(self, stamp_ns: int, centre: Array, direction: Array) -> Array:
         """Return how far (SECTORS,) all cells along the directions (SECTORS, 2) were free."""
@@ -84,3 +91,11 @@ class FreeSpace:
             moved[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = kept
         self._seen_ns = moved
         self._corner += shift
+
+
+def _wide(marked: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
+    """Return the marked sectors that stand in a run of at least so many, around the full turn."""
+    begins = marked.copy()
+    for shift in range(1, least):
+        begins &= np.roll(marked, -shift)
+    return np.asarray(np.logical_or.reduce([np.roll(begins, shift) for shift in range(least)]))

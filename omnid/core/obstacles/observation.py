@@ -33,6 +33,7 @@ class Observation(NamedTuple):
     ranges_m: RangeScan  # (SECTORS,) nearest obstacle; inf: something beyond the longest range was seen; NaN: unknown
     sigma_m: RangeScan  # (SECTORS,) of the ranges; NaN without one
     free_m: RangeScan  # (SECTORS,) up to which the way was seen to be free; 0 where nothing was seen
+    floor_from_m: float = math.inf  # nearest floor that the cameras see in most directions; inf: they see none
 
 
 class HeightBand(NamedTuple):
@@ -57,11 +58,11 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings) 
     found = fill_gaps(found)
     sigma = np.where(np.isfinite(found) & ~np.isfinite(sigma), _carried(sigma), sigma)
     chosen = band.is_floor & usable
-    free = _floor_reach(sector[chosen], ranges[chosen], settings.max_range_m)
+    free, floor_from_m = _floor_reach(sector[chosen], ranges[chosen], settings.max_range_m)
     is_open = ~np.isfinite(found) & seen_beyond
     result = np.where(is_open, np.inf, found).astype(np.float32)
     free = np.where(is_open, settings.max_range_m, np.where(np.isfinite(found), found, free))
-    return Observation(result, sigma.astype(np.float32), free.astype(np.float32))
+    return Observation(result, sigma.astype(np.float32), free.astype(np.float32), floor_from_m)
 
 
 def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> HeightBand:
@@ -111,8 +112,10 @@ def _of_neighbours(sums: Array) -> Array:
     return np.asarray(sums + np.roll(sums, 1, axis=0) + np.roll(sums, -1, axis=0))
 
 
-def _floor_reach(sector: Counts, ranges: Array, max_range_m: float) -> Array:
-    """Return the ranges (SECTORS,) up to which the floor was seen without a longer gap; 0 where it was not."""
+def _floor_reach(sector: Counts, ranges: Array, max_range_m: float) -> tuple[Array, float]:
+    """Return the ranges (SECTORS,) up to which the floor was seen without a longer gap, 0 where it was not; and from
+    which on most directions see it.
+    """
     bins = math.ceil(max_range_m / FLOOR_STEP_M)
     inside = ranges < bins * FLOOR_STEP_M
     index = sector[inside] * bins + np.floor(ranges[inside] / FLOOR_STEP_M).astype(np.intp)
@@ -124,7 +127,9 @@ def _floor_reach(sector: Counts, ranges: Array, max_range_m: float) -> Array:
     gap = (position - last > FLOOR_GAP) & (position >= first[:, None])
     # The first bin of the gap that is too long is FLOOR_GAP + 1 bins behind the last one that shows the floor.
     end = np.where(gap.any(axis=1), last[np.arange(SECTORS), np.argmax(gap, axis=1)], last[:, -1])
-    return np.where(seen.any(axis=1), (end + 0.5) * FLOOR_STEP_M, 0.0)
+    sees = seen.any(axis=1)
+    floor_from_m = float(np.median(first[sees]) + 0.5) * FLOOR_STEP_M if sees.any() else math.inf
+    return np.where(sees, (end + 0.5) * FLOOR_STEP_M, 0.0), floor_from_m
 
 
 def _carried(sigma: RangeScan) -> RangeScan:

@@ -22,6 +22,7 @@ VOTE_NS: Final = 1_500_000_000  # older pairs do not vote
 SAME_SECTORS: Final = 2  # difference in direction at which two ranges may be of one obstacle
 SAME_M: Final = 0.12  # and difference in range, beside the noise
 SAME_SIGMAS: Final = 3.0
+HIDING_M: Final = 0.35  # range of what hides the floor and shows stereo nothing: how near it is, is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +37,9 @@ class RingPoints:
 class RingFilter:
     """Confirms obstacles by votes, and remembers those whose direction is unknown now.
 
-    An obstacle that too few pairs have seen makes its direction unknown, not free. All memory is bounded: PAIRS
-    observations, one remembered obstacle a sector.
+    An obstacle that too few pairs have seen makes its direction unknown, not free. Something that stereo does not see,
+    but that hides floor which was seen before, counts as an obstacle at HIDING_M until the floor is seen again. All
+    memory is bounded: PAIRS observations, one remembered obstacle a sector.
     """
 
     def __init__(self, settings: RingSettings) -> None:
@@ -71,8 +73,11 @@ class RingFilter:
         known = np.isfinite(accepted)
         result = np.where(known, accepted, np.where(np.isposinf(seen.ranges_m), np.inf, np.nan)).astype(np.float32)
         # An obstacle ends what is known to be free, one that is not confirmed as well.
-        free = self._free.update(stamp_ns, T_odom_base, np.minimum(seen.free_m, np.where(known, accepted, np.inf)))
+        free, is_hidden = self._free.update(stamp_ns, T_odom_base,
+                                            np.minimum(seen.free_m, np.where(known, accepted, np.inf)),
+                                            seen.floor_from_m)
         free = np.where(known, np.minimum(free, accepted), free)
+        result[is_hidden & ~known] = HIDING_M
         is_seen = np.isfinite(seen.ranges_m)
         self._history.append((stamp_ns, self._points(T_odom_base, np.where(is_seen, seen.ranges_m, np.nan),
                                                      sigmas[0], np.full(SECTORS, stamp_ns))))

@@ -9,7 +9,7 @@ import numpy as np
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.observation import Observation
-from omnid.core.obstacles.ring_filter import RingFilter
+from omnid.core.obstacles.ring_filter import HIDING_M, RingFilter
 from omnid.core.obstacles.settings import RingSettings
 
 S = 1_000_000_000
@@ -143,3 +143,31 @@ def test_a_direction_in_which_no_floor_was_ever_seen_is_not_free_by_its_neighbou
     for i in range(4):
         result = ring.update(i * S // 5, pose(), Observation(unknown, unknown, floor))
     assert result.free_m[175:185].max() <= 0.15
+
+
+def floor_beside(degrees: float) -> Observation:
+    """Return an observation of floor from 1.2 to 3 m all around, and of nothing in a sector ahead."""
+    unknown = np.full(SECTORS, np.nan, np.float32)
+    free = np.where(np.abs(azimuths()) < np.deg2rad(degrees / 2), 0.0, 3.0).astype(np.float32)
+    return Observation(unknown, unknown, free, floor_from_m=1.2)
+
+
+def test_what_hides_the_floor_and_shows_nothing_else_is_an_obstacle_until_the_floor_is_seen_again() -> None:
+    ring = RingFilter(SETTINGS)
+    assert np.isnan(ring.update(0, pose(), floor_beside(0)).ranges_m).all()
+    someone = ring.update(S // 5, pose(0.05), floor_beside(20))
+    np.testing.assert_allclose(someone.ranges_m[171:189], HIDING_M)
+    assert np.isnan(someone.ranges_m[:170]).all() and (someone.free_m[171:189] == 0).all()
+    assert np.isnan(ring.update(2 * S // 5, pose(0.1), floor_beside(0)).ranges_m).all()
+
+
+def test_a_few_directions_without_floor_and_what_ended_the_floor_before_hide_nothing() -> None:
+    ring = RingFilter(SETTINGS)
+    ring.update(0, pose(), floor_beside(0))
+    assert np.isnan(ring.update(S // 5, pose(0.05), floor_beside(5)).ranges_m).all()
+    wall = RingFilter(SETTINGS)
+    for x_m in np.arange(0.0, 2.5, 0.1):  # to a plain wall at 2.5 m; nearer than 1.2 m no floor is seen before it
+        left_m = 2.5 - x_m
+        seen = floor_beside(0)
+        free = np.where(AHEAD, left_m if left_m > 1.2 else 0.0, seen.free_m).astype(np.float32)
+        assert np.isnan(wall.update(round(x_m * 5 * S), pose(x_m), seen._replace(free_m=free)).ranges_m).all()
