@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 WAIT_FACTOR: Final = 2.0  # of the distance between keyframes: then one is added where odometry adds none
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
 SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
+JITTER_NS: Final = 5_000_000  # of stamps, so that a rate that divides that of the cameras is reached
 SEARCHES: Final = 10  # after which only new keyframes are searched for
 LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
 NO_KEYFRAME: Final = -1  # in place of an id
@@ -162,7 +163,7 @@ class MapLocaliser:
         """True if the view has changed enough; better at a keyframe of odometry, whose depth is known already."""
         if self._newest is None:
             return True
-        if frame.stamp_ns - self._newest.stamp_ns < 1e9 / self._limits.rate_hz:
+        if frame.stamp_ns - self._newest.stamp_ns < 1e9 / self._limits.rate_hz - JITTER_NS:
             return False
         moved = se3.inverse(self._newest.T_odom_rect) @ frame.T_odom_rect
         change = max(length_m(moved) / self._limits.keyframe_m,
