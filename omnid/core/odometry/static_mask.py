@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-MIN_FLOW_RAD = 0.04  # columns in which the world should have moved less are not compared
+# Columns in which the world should have moved less are not compared: by an angle, and in pixels at half resolution. In
+# a small panorama the angle alone is a pixel, and much of a view that moved so little looks as if it had not.
+MIN_FLOW_RAD, MIN_FLOW_PX = 0.04, 2.0
 MOVED_RATIO = 0.5  # share of the columns that must have moved before a comparison is made
 USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle
 SAME_LEVEL = 6  # grey levels: largest difference that counts as unchanged
@@ -42,11 +44,13 @@ class StaticMask:
             half = _half(panorama)
             self._reference = (half, _structured(half), T_odom_rect)
             return
-        flow = expected_flow(se3.inverse(self._reference[2]) @ T_odom_rect, self._reference[0].shape[1])
-        if np.mean(flow > MIN_FLOW_RAD) > MOVED_RATIO:
+        columns = self._reference[0].shape[1]
+        flow = expected_flow(se3.inverse(self._reference[2]) @ T_odom_rect, columns)
+        moving = flow > max(MIN_FLOW_RAD, MIN_FLOW_PX * 2 * math.pi / columns)
+        if np.mean(moving) > MOVED_RATIO:
             half = _half(panorama)
             structured = _structured(half)
-            self._compare(half, structured, flow > MIN_FLOW_RAD, panorama.shape)
+            self._compare(half, structured, moving, panorama.shape)
             self._reference = (half, structured, T_odom_rect)
 
     def without(self, usable: Flags) -> Flags:
