@@ -71,7 +71,7 @@ def read_kept_kernels() -> None:
 
 
 class KeptKernels(NamedTuple):
-    """What is on the disk, as the next start finds it."""
+    """Content of the disk, as the next start finds it."""
 
     folder: Path
     unusable: str  # why nothing can be kept there; empty if it can

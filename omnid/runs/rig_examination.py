@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
-from omnid.refinement.rig_verdict import is_suspicious, other_rig
+from omnid.refinement.foreign_rig import is_suspicious, other_rig
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.rig_gate import RigContradictedError, RigGate

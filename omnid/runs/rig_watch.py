@@ -1,4 +1,4 @@
-"""What watches the rig of a live run: the monitor of its calibration, and the refinement."""
+"""Watch over the rig of a live run: the monitor of its calibration, and the refinement."""
 
 from __future__ import annotations
 

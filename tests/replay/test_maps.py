@@ -57,7 +57,7 @@ def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     np.testing.assert_allclose(in_map.T[-1][:3, 3], T[:3, 3], atol=0.02)
 
 
-def test_a_map_that_does_not_exist_is_made_and_told(omnid: Command, scene: Path, built: Path, tmp_path: Path) -> None:
+def test_a_map_that_does_not_exist_is_made(omnid: Command, scene: Path, built: Path, tmp_path: Path) -> None:
     new = tmp_path / "new.omap"
     result = omnid.replay(scene / "log.mcap", "--map", new, rig=scene / "rig.toml")
     assert result.code == 0 and f"{new}: there is no such map: this run begins a new one" in result.err

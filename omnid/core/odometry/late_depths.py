@@ -19,7 +19,7 @@ Indices = NDArray[np.intp]
 
 
 class LateDepths:
-    """What the last frame measured of the landmarks in a store; at most one frame waits."""
+    """Measurements of the last frame of the landmarks in a store; at most one frame waits."""
 
     def __init__(self, store: LandmarkStore) -> None:
         self._store = store

@@ -347,7 +347,7 @@ def test_tells_whether_functions_are_compiled(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")
-def test_root_is_told_of_the_services_functions(tmp_path: Path) -> None:
+def test_root_learns_of_the_services_functions(tmp_path: Path) -> None:
     service = tmp_path / "service"
     shutil.copytree(cache_folder(), service, ignore=shutil.ignore_patterns("making-*"))
     for path in (service, *service.rglob("*")):

@@ -596,7 +596,7 @@ def test_a_bound_head_works_only_for_what_the_tail_will_take(bound: bool) -> Non
 
 
 def test_after_long_work_that_follows_a_result_the_tail_takes_the_newest() -> None:
-    """What was prepared for it during its own work has become old meanwhile."""
+    """A message prepared for it during its own work has become old meanwhile."""
     made: list[int] = []  # numbers so far, of which the last one is the newest
     ages: list[int] = []  # how many newer ones there were when the tail took one after its long work
     during: list[int] = []  # how many were made during that

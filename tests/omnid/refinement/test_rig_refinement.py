@@ -22,9 +22,9 @@ from omnid.engine.graph import Graph
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.refinement.estimate import RefinementRequest, RigChange, estimate
+from omnid.refinement.foreign_rig import other_rig
 from omnid.refinement.rig_application import MARK, RigApplication
 from omnid.refinement.rig_refinement import RigRefinement
-from omnid.refinement.rig_verdict import other_rig
 from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.simulation.rendering.ray_caster import render_grey

@@ -40,7 +40,7 @@ def test_one_without_facing_does_not(ids: tuple[int, ...]) -> None:
         fit({id: SEEN[id] for id in ids}, KNOWN)
 
 
-def test_what_does_not_fit_is_told() -> None:
+def test_what_does_not_fit_is_reported() -> None:
     wrong = replace(KNOWN[6], xyz_m=(KNOWN[6].xyz_m[0] + 1.0, *KNOWN[6].xyz_m[1:]))
     _, left_m = fit(SEEN, KNOWN | {6: wrong})
     assert max(left_m, key=lambda id: left_m[id]) == 6 and left_m[6] > 0.3

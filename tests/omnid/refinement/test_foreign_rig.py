@@ -6,7 +6,7 @@ import pytest
 
 from omnid.core.rig.rig_check import RigFinding
 from omnid.core.rig.start_check import StartFinding, start_finding
-from omnid.refinement.rig_verdict import is_suspicious
+from omnid.refinement.foreign_rig import is_suspicious
 
 
 def finding(spread_px: float) -> RigFinding:
