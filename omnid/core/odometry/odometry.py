@@ -34,6 +34,9 @@ Flags = NDArray[np.bool_]
 
 UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while poses are refused, m/s and rad/s
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
+# Share of the predicted landmarks, inliers, below which they are also searched with a pyramid: without one, in noise,
+# tracks stay near a wrong prediction and confirm it.
+NEAR_RATIO = 0.5
 GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
 START_ROUNDS = 2  # of starting a map again, once the velocity is known
@@ -98,7 +101,7 @@ class VisualOdometry:
             # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
             refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
             estimate = with_more_inliers(estimate, refined)
-            if self._is_good(estimate):
+            if self._is_good(estimate, is_near):
                 break
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
@@ -188,11 +191,12 @@ class VisualOdometry:
         T_unturned[:3, 3] = T_predicted[:3, 3]
         yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
 
-    def _is_good(self, estimate: PoseEstimate | None) -> bool:
-        """True if no other guess is needed."""
+    def _is_good(self, estimate: PoseEstimate | None, is_near: bool) -> bool:
+        """True if no other guess is needed; is_near: it was found near a guess, without a pyramid."""
         limits = self._limits
         return (
             estimate is not None
+            and estimate.inliers >= NEAR_RATIO * is_near * estimate.visible
             and estimate.tracked >= GOOD_TRACKED_RATIO * estimate.visible
             and estimate.inlier_ratio >= limits.good_inlier_ratio
             and estimate.inliers >= limits.good_inliers
