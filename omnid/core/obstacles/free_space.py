@@ -23,7 +23,8 @@ CELLS: Final = 256  # on each side of the square; it follows the robot
 MARGIN_CELLS: Final = 90  # nearer to the border than this, the square is moved; no direction is looked up farther
 STEP_M: Final = 0.05  # along a direction that is looked up
 HIDDEN_M: Final = 0.3  # of floor that is missing, beyond the nearest that the cameras see
-HIDDEN_SECTORS: Final = 8  # side by side; floor of few edges is missed in up to 4, by chance
+HIDDEN_SECTORS: Final = 12  # side by side, in two pairs: floor of few edges is missed in fewer, or once
+SAME_SECTORS: Final = 5  # by which what hides it has moved from pair to pair
 SHIFT: Final = 4  # fractional bits of the corners that are drawn
 
 
@@ -38,9 +39,11 @@ class FreeSpace:
         self._seen_ns = np.full((CELLS, CELLS), np.iinfo(np.int64).min, np.int64)
         self._corner = np.zeros(2, np.int64)  # cell (0, 0) in odom
         self._directions = azimuths()
+        self._hidden_before = np.zeros(len(self._directions), bool)
 
     def clear(self) -> None:
         """Forget everything."""
+        self._hidden_before[:] = False
         self._seen_ns[:] = np.iinfo(np.int64).min
 
     def update(self, stamp_ns: int, T_odom_base: Array, free_m: Array, floor_from_m: float = math.inf
@@ -48,7 +51,7 @@ class FreeSpace:
         """Add the free ranges (SECTORS,) of a pair, 0 where nothing was seen; return those that are known now.
 
         A direction in which some floor is seen now says all there is; only where none is seen, memory counts. Returned
-        beside it is where something new hides the floor: where nothing is seen in HIDDEN_SECTORS, and memory knows
+        beside it is where something new hides the floor: two pairs saw nothing in HIDDEN_SECTORS, and memory knows
         floor at least HIDDEN_M beyond floor_from_m, from which on the cameras see floor elsewhere.
         """
         centre = T_odom_base[:2, 3] / CELL_M
@@ -66,7 +69,10 @@ class FreeSpace:
         x, y = np.floor(centre).astype(np.int64) - self._corner
         drawn[y, x] = 1  # the robot stands there
         self._seen_ns[drawn > 0] = stamp_ns
-        is_hidden = _wide((free_m <= 0) & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
+        wide = _wide((free_m <= 0) & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
+        shifts = range(-SAME_SECTORS, SAME_SECTORS + 1)
+        is_hidden = wide & np.logical_or.reduce([np.roll(self._hidden_before, shift) for shift in shifts])
+        self._hidden_before = wide
         return np.where(is_hidden, 0.0, np.where(free_m > 0, free_m, remembered)), is_hidden
 
     def _remembered(self, stamp_ns: int, centre: Array, direction: Array) -> Array:

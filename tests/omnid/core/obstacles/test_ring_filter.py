@@ -155,6 +155,7 @@ def floor_beside(degrees: float) -> Observation:
 def test_what_hides_the_floor_and_shows_nothing_else_is_an_obstacle_until_the_floor_is_seen_again() -> None:
     ring = RingFilter(SETTINGS)
     assert np.isnan(ring.update(0, pose(), floor_beside(0)).ranges_m).all()
+    assert np.isnan(ring.update(S // 10, pose(0.02), floor_beside(20)).ranges_m).all()
     someone = ring.update(S // 5, pose(0.05), floor_beside(20))
     np.testing.assert_allclose(someone.ranges_m[171:189], HIDING_M)
     assert np.isnan(someone.ranges_m[:170]).all() and (someone.free_m[171:189] == 0).all()
