@@ -23,6 +23,7 @@ class Person:
     repeat: str = "once"  # once | loop | back and forth
     start_s: float = 0.0
     starts_within_m: float = 0.0  # waits until the robot is so near to the last point of the path; 0: does not wait
+    waits_within_m: float = 0.0  # stands rather than come nearer than that to the robot; 0: walks on
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] after so much time of walking."""
@@ -50,11 +51,20 @@ class Walkers:
 
     def advance(self, time_s: float, robot: Point) -> None:
         """Set the time, with the robot at a point [m]."""
-        self.time_s = time_s
+        passed_s, self.time_s = time_s - self.time_s, time_s
         for number, person in enumerate(self._people):
+            started_s = self._started_s[number]
+            if person.waits_within_m and started_s is not None and self._comes_near(person, passed_s, started_s, robot):
+                self._started_s[number] = started_s + passed_s
             if self._started_s[number] is None and time_s >= person.start_s and (
                     math.dist(robot, person.path[-1]) <= person.starts_within_m):
                 self._started_s[number] = time_s
+
+    def _comes_near(self, person: Person, passed_s: float, started_s: float, robot: Point) -> bool:
+        """True if the last step brings a person too near to the robot."""
+        before_m, now_m = (math.dist(person.place(at_s - started_s)[:2], robot)
+                           for at_s in (self.time_s - passed_s, self.time_s))
+        return now_m < before_m and now_m < person.waits_within_m
 
     def faces(self) -> list[Rectangle]:
         """Return the people's rectangles in the world now."""

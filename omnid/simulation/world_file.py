@@ -200,7 +200,7 @@ def _box(rng: Random, table: ValidatedTable) -> list[Rectangle]:
 
 
 def _person(rng: Random, table: ValidatedTable) -> Person:
-    table.allow_only(("path", "speed_mps", "repeat", "start_s", "starts_within_m", "size_m"))
+    table.allow_only(("path", "speed_mps", "repeat", "start_s", "starts_within_m", "waits_within_m", "size_m"))
     size = _size(table) if table.has("size_m") else PERSON_M
     return Person(
         tuple(box(rng, (0.0, 0.0), size, 0.0)),
@@ -208,7 +208,8 @@ def _person(rng: Random, table: ValidatedTable) -> Person:
         _positive(table, "speed_mps", 0.0, 5.0) if table.has("speed_mps") else 1.0,
         table.choice("repeat", ("once", "loop", "back and forth")) if table.has("repeat") else "once",
         _positive(table, "start_s", 0.0, 1e5) if table.has("start_s") else 0.0,
-        _positive(table, "starts_within_m", 0.0, 100.0) if table.has("starts_within_m") else 0.0)
+        *(_positive(table, key, 0.0, 100.0) if table.has(key) else 0.0
+          for key in ("starts_within_m", "waits_within_m")))
 
 
 def _size(table: ValidatedTable) -> tuple[float, float, float]:

@@ -54,6 +54,18 @@ def test_walls_have_doors_and_boxes_have_outlines(tmp_path: Path) -> None:
     assert clearance_m(footprints(world.standing, 2.5), (2.0, 0.05), 0.2) == pytest.approx(-0.2)  # the lintel
 
 
+def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
+    polite = HALL.replace('repeat = "back and forth"', "waits_within_m = 0.8")
+    people = Walkers(load_world(write(tmp_path, polite), 1).people)
+    robot = (0.5, -1.0)  # in the way
+    for tenth in range(1, 31):
+        people.advance(0.1 * tenth, robot)
+    assert -0.35 <= people.places()[0][0] <= -0.3
+    for tenth in range(31, 41):
+        people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
+    assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
+
+
 def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
     people = Walkers(load_world(write(tmp_path, HALL), 1).people)
     people.advance(1.0, (-5.0, 0.0))
