@@ -101,12 +101,14 @@ class RouteRecorder:
         self.name = name
         self.length_m = 0.0
         self._points: list[tuple[Array, float, int, Array]] = []
+        self._newest: tuple[Array, int, Array] | None = None  # pose, keyframe, pose in it: where the recording ends
 
     def add(self, pose: Array, speed_mps: float, keyframe: int, keyframe_pose: Array) -> None:
         """Add a pose (3,) of the base in the map where it has moved; keyframe_pose (3,): of its keyframe.
 
         Raise OmnidError for a route that gets too long.
         """
+        self._newest = pose, keyframe, relative(keyframe_pose, pose)
         if self._points:
             step = relative(self._points[-1][0], pose)
             moved_m = math.hypot(step[0], step[1])
@@ -127,7 +129,7 @@ class RouteRecorder:
         if self.length_m < SHORTEST_ROUTE_M:
             raise OmnidError(f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
                              "and more: drive it, then finish")
-        poses, speeds, keyframes, in_keyframe = zip(*self._points, strict=True)
+        poses, speeds, keyframes, in_keyframe = zip(*self._to_its_end(), strict=True)
         stamps = dict(noted)
         for id in set(keyframes):
             found = keyframe(id) if id != NO_KEYFRAME else None
@@ -136,6 +138,17 @@ class RouteRecorder:
         route = Route(self.name, np.array(poses), np.array(speeds), np.array(keyframes, np.int64),
                       np.array(in_keyframe), stamps, created_s, map_name)
         return replace(route, poses=route.in_map(keyframe))
+
+    def _to_its_end(self) -> list[tuple[Array, float, int, Array]]:
+        """Return the points; the last one is where the recording ends, however near to that before it."""
+        if self._newest is None:
+            return self._points
+        last, speed_mps, *_ = self._points[-1]
+        pose, keyframe, in_keyframe = self._newest
+        step = relative(last, pose)
+        if math.hypot(step[0], step[1]) <= 0.5 * SPACING_M or len(self._points) >= MOST_POINTS:
+            return [*self._points[:-1], (pose, speed_mps, keyframe, in_keyframe)]
+        return [*self._points, (pose, math.copysign(speed_mps, step[0]), keyframe, in_keyframe)]
 
 
 def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool,

@@ -65,9 +65,28 @@ def test_points_are_apart_and_keep_the_way() -> None:
     poses = way()
     route = taught(poses, Map(poses))
     steps = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
-    assert steps.min() > 0.09 and steps.max() < 0.13
-    assert route.length_m == pytest.approx(12.0, abs=0.2)
+    assert steps[:-1].min() > 0.09 and steps[:-1].max() < 0.13 and 0.04 < steps[-1] < 0.18
+    assert route.length_m == pytest.approx(12.0, abs=0.1)
     assert not route.is_closed
+
+
+@pytest.mark.parametrize("last", range(6))
+def test_a_route_ends_where_the_robot_stood_when_it_was_finished(last: int) -> None:
+    poses = way()[:500 + last]
+    standing = np.repeat(poses[-1:], 5, axis=0) + np.array([0.0, 0.0, math.radians(4)])
+    route = taught(np.vstack([poses, standing]), places := Map(poses))
+    np.testing.assert_allclose(route.poses[-1], standing[-1], atol=1e-9)
+    (path,) = repeated_paths(route, places, poses[0], loops=1, reverse=False)
+    assert len(path.legs) == 1 and not path.legs[0].backwards
+    np.testing.assert_allclose(path.goal, poses[-1, :2], atol=1e-9)
+    assert path.legs[0].speed.min() == pytest.approx(0.3), "the last step is driven as the others"
+
+
+def test_a_small_step_back_at_the_end_is_driven_backwards() -> None:
+    ahead = np.column_stack([0.03 * np.arange(69), np.zeros(69), np.zeros(69)])
+    route = taught(np.vstack([ahead, [(1.96, 0.0, 0.0)]]), places := Map(ahead))
+    (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
+    assert [leg.backwards for leg in path.legs] == [False, True] and path.goal[0] == pytest.approx(1.96)
 
 
 def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
