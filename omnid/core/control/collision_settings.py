@@ -27,8 +27,8 @@ class CollisionSettings:
     slow_m: float = knob(0.5, "an obstacle nearer than this ahead slows it down to slow_mps, m", low=0, high=10)
     slow_side_m: float = knob(0.12, "the same beside its way, m", low=0, high=10)
     slow_mps: float = knob(0.2, "speed near obstacles and into the unknown, m/s", low=0.01, high=10)
-    unknown: str = knob(SLOW, "a way ahead that shows neither obstacle nor floor: slow drives into it at slow_mps, "
-                        "stop never does", choices=(SLOW, STOP, IGNORE))
+    unknown: str = knob(STOP, "at the end of the floor that was seen, where nothing is known: stop; slow drives on at "
+                        "slow_mps, also into a plain wall", choices=(STOP, SLOW, IGNORE))
     stale: str = knob(STOP, "when the newest ring of obstacles is older than stale_s, or there is none",
                       choices=(STOP, SLOW, IGNORE))
     stale_s: float = knob(0.8, "age of the images of the newest ring beyond which it is stale, s", low=0.1, high=10)

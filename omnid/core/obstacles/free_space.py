@@ -3,6 +3,9 @@
 Near the robot the cameras see no floor, and a plain wall shows nothing at all: what is known there is where the free
 floor ended when it was seen from farther away. Where a wide piece of floor is missing that was seen before, something
 has come that hides it, though stereo sees nothing on it.
+
+Where the base stands, nothing was seen from farther away. There the floor around it counts as free, as far as the
+cameras cannot see it, except towards what hides it in a wide angle.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ STEP_M: Final = 0.05  # along a direction that is looked up
 HIDDEN_M: Final = 0.3  # of floor that is missing, beyond the nearest that the cameras see
 HIDDEN_SECTORS: Final = 12  # side by side, in two pairs: floor of few edges is missed in fewer, or once
 SAME_SECTORS: Final = 5  # by which what hides it has moved from pair to pair
+ASSUMED_SECTORS: Final = 60  # side by side without floor; from here on, something near hides it also where none is seen
+RESTING_M: Final = 0.05  # within which a base stands
 SHIFT: Final = 4  # fractional bits of the corners that are drawn
 
 
@@ -40,10 +45,12 @@ class FreeSpace:
         self._corner = np.zeros(2, np.int64)  # cell (0, 0) in odom
         self._directions = azimuths()
         self._hidden_before = np.zeros(len(self._directions), bool)
+        self._rest: tuple[Array, int] | None = None  # place [m] where the base stands, and since when
 
     def clear(self) -> None:
         """Forget everything."""
         self._hidden_before[:] = False
+        self._rest = None
         self._seen_ns[:] = np.iinfo(np.int64).min
 
     def update(self, stamp_ns: int, T_odom_base: Array, free_m: Array, floor_from_m: float = math.inf
@@ -58,22 +65,38 @@ class FreeSpace:
         self._follow(centre)
         angle = self._directions + math.atan2(T_odom_base[1, 0], T_odom_base[0, 0])
         direction = np.column_stack([np.cos(angle), np.sin(angle)])
-        remembered = self._remembered(stamp_ns, centre, direction)
-        longest = self._distances[-1]
-        corners = centre - self._corner - 0.5 + np.minimum(free_m, longest)[:, None] / CELL_M * direction
-        drawn = np.zeros((CELLS, CELLS), np.uint8)
-        cv2.fillPoly(drawn, [np.rint(corners * 2**SHIFT).astype(np.int32)], 1, shift=SHIFT)
-        # Near the robot, cells are wider than directions: those that a direction without floor touches are not free.
-        blind = centre - self._corner - 0.5 + np.where(free_m > 0, 0.0, longest)[:, None] / CELL_M * direction
-        cv2.fillPoly(drawn, [np.rint(blind * 2**SHIFT).astype(np.int32)], 0, shift=SHIFT)
+        unseen = free_m <= 0
+        assumed = np.zeros_like(unseen)
+        if self._stands(stamp_ns, T_odom_base[:2, 3]) and math.isfinite(floor_from_m):
+            assumed = unseen & ~_wide(unseen, ASSUMED_SECTORS)
+        drawn = self._drawn(centre, np.where(assumed, floor_from_m, free_m), direction, unseen & ~assumed)
         x, y = np.floor(centre).astype(np.int64) - self._corner
-        drawn[y, x] = 1  # the robot stands there
-        self._seen_ns[drawn > 0] = stamp_ns
-        wide = _wide((free_m <= 0) & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
+        drawn[y, x] = True  # the robot stands there
+        self._seen_ns[drawn] = stamp_ns
+        remembered = self._remembered(stamp_ns, centre, direction)
+        wide = _wide(unseen & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
         shifts = range(-SAME_SECTORS, SAME_SECTORS + 1)
         is_hidden = wide & np.logical_or.reduce([np.roll(self._hidden_before, shift) for shift in shifts])
         self._hidden_before = wide
-        return np.where(is_hidden, 0.0, np.where(free_m > 0, free_m, remembered)), is_hidden
+        return np.where(is_hidden, 0.0, np.where(unseen, remembered, free_m)), is_hidden
+
+    def _stands(self, stamp_ns: int, position: Array) -> bool:
+        """True at the start, and where the base has stood for so long that memory has ended."""
+        if self._rest is None:
+            self._rest = (position.copy(), stamp_ns - self._memory_ns)
+        elif math.dist(position, self._rest[0]) > RESTING_M:
+            self._rest = (position.copy(), stamp_ns)
+        return stamp_ns - self._rest[1] >= self._memory_ns
+
+    def _drawn(self, centre: Array, free_m: Array, direction: Array, blind: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the cells within ranges (SECTORS,) along directions (SECTORS, 2), without those of blind sectors."""
+        longest = self._distances[-1]
+        drawn = np.zeros((CELLS, CELLS), np.uint8)
+        # Near the robot, cells are wider than directions: those that a blind direction touches are left out.
+        for reach_m, value in ((np.minimum(free_m, longest), 1), (np.where(blind, longest, 0.0), 0)):
+            corners = centre - self._corner - 0.5 + reach_m[:, None] / CELL_M * direction
+            cv2.fillPoly(drawn, [np.rint(corners * 2**SHIFT).astype(np.int32)], value, shift=SHIFT)
+        return drawn > 0
 
     def _remembered(self, stamp_ns: int, centre: Array, direction: Array) -> Array:
         """Return how far (SECTORS,) all cells along the directions (SECTORS, 2) were free."""

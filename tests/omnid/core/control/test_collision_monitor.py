@@ -103,9 +103,9 @@ def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
 
 def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
     wall = with_unknown(-20, 20)
-    allowed, reason = after(wall)
+    assert after(wall) == (Twist(), monitor_module.UNKNOWN)
+    allowed, reason = after(wall, settings=replace(SETTINGS, unknown="slow"))
     assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.UNKNOWN
-    assert after(wall, settings=replace(SETTINGS, unknown="stop")) == (Twist(), monitor_module.UNKNOWN)
     assert after(wall, settings=replace(SETTINGS, unknown="ignore")) == (AHEAD, "")
     assert after(wall, Twist(-0.5)) == (Twist(-0.5), "")
 

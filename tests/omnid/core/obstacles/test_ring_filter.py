@@ -8,6 +8,7 @@ import numpy as np
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles.free_space import CELL_M
 from omnid.core.obstacles.observation import Observation
 from omnid.core.obstacles.ring_filter import HIDING_M, RingFilter
 from omnid.core.obstacles.settings import RingSettings
@@ -115,7 +116,7 @@ def test_the_floor_that_was_seen_to_be_free_is_remembered_where_none_is_seen() -
     np.testing.assert_allclose(near.free_m[AHEAD], 0.5, atol=0.1)
     np.testing.assert_allclose(near.free_m[BEHIND][[0, -1]], 3.5, atol=0.1)
     late = ring.update(S + round((SETTINGS.free_s + 1) * S), pose(1.5), nothing)
-    assert (late.free_m == 0).all()
+    assert (late.free_m <= CELL_M).all()
 
 
 def test_a_floor_that_is_seen_now_says_more_than_the_memory() -> None:
@@ -172,3 +173,19 @@ def test_a_few_directions_without_floor_and_what_ended_the_floor_before_hide_not
         seen = floor_beside(0)
         free = np.where(AHEAD, left_m if left_m > 1.2 else 0.0, seen.free_m).astype(np.float32)
         assert np.isnan(wall.update(round(x_m * 5 * S), pose(x_m), seen._replace(free_m=free)).ranges_m).all()
+
+
+def test_where_the_base_stands_the_floor_that_cameras_cannot_see_counts_as_free_but_not_towards_a_near_wall() -> None:
+    ring = RingFilter(SETTINGS)
+    for minute in range(3):  # longer than the memory
+        standing = ring.update(minute * 60 * S, pose(), floor_beside(40))
+        np.testing.assert_allclose(standing.free_m[165:195], 1.2, atol=0.1)
+    np.testing.assert_allclose(ring.update(121 * S, pose(0.5), floor_beside(40)).free_m[175:185], 0.7, atol=0.1)
+    assert (RingFilter(SETTINGS).update(0, pose(), floor_beside(90)).free_m[175:185] <= CELL_M).all()
+
+
+def test_floor_that_was_never_seen_is_not_free_while_the_base_drives() -> None:
+    ring = RingFilter(SETTINGS)
+    nothing = floor_beside(360)._replace(floor_from_m=np.inf)
+    ring.update(0, pose(), nothing)
+    assert (ring.update(S, pose(0.2), floor_beside(40)).free_m[175:185] <= 2 * CELL_M).all()
