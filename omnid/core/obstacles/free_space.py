@@ -57,9 +57,10 @@ class FreeSpace:
                ) -> tuple[Array, NDArray[np.bool_]]:
         """Add the free ranges (SECTORS,) of a pair, 0 where nothing was seen; return those that are known now.
 
-        A direction in which some floor is seen now says all there is; only where none is seen, memory counts. Returned
-        beside it is where something new hides the floor: two pairs saw nothing in HIDDEN_SECTORS, and memory knows
-        floor at least HIDDEN_M beyond floor_from_m, from which on the cameras see floor elsewhere.
+        A direction in which some floor is seen now says all there is. Where none is seen, memory counts, and in fewer
+        directions than HIDDEN_SECTORS those beside them. Returned beside it is where something new hides the floor: two
+        pairs saw nothing in HIDDEN_SECTORS, and memory knows floor at least HIDDEN_M beyond floor_from_m, from which on
+        the cameras see floor elsewhere.
         """
         centre = T_odom_base[:2, 3] / CELL_M
         self._follow(centre)
@@ -78,7 +79,8 @@ class FreeSpace:
         shifts = range(-SAME_SECTORS, SAME_SECTORS + 1)
         is_hidden = wide & np.logical_or.reduce([np.roll(self._hidden_before, shift) for shift in shifts])
         self._hidden_before = wide
-        return np.where(is_hidden, 0.0, np.where(unseen, remembered, free_m)), is_hidden
+        known = np.where(unseen, remembered, free_m)
+        return np.where(is_hidden, 0.0, np.where(unseen, _without_dips(known, HIDDEN_SECTORS), known)), is_hidden
 
     def _stands(self, stamp_ns: int, position: Array) -> bool:
         """True at the start, and where the base has stood for so long that memory has ended."""
@@ -128,3 +130,9 @@ def _wide(marked: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
     for shift in range(1, least):
         begins &= np.roll(marked, -shift)
     return np.asarray(np.logical_or.reduce([np.roll(begins, shift) for shift in range(least)]))
+
+
+def _without_dips(values: Array, least: int) -> Array:
+    """Return values (SECTORS,) with dips narrower than so many sectors filled up to the lower of their sides."""
+    highest = np.maximum.reduce([np.roll(values, shift) for shift in range(least)])
+    return np.asarray(np.minimum.reduce([np.roll(highest, -shift) for shift in range(least)]))

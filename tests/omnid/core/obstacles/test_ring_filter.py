@@ -189,3 +189,12 @@ def test_floor_that_was_never_seen_is_not_free_while_the_base_drives() -> None:
     nothing = floor_beside(360)._replace(floor_from_m=np.inf)
     ring.update(0, pose(), nothing)
     assert (ring.update(S, pose(0.2), floor_beside(40)).free_m[175:185] <= 2 * CELL_M).all()
+
+
+def test_a_few_directions_without_floor_are_as_free_as_those_beside_them() -> None:
+    floor = floor_beside(0).free_m
+    for missing, free in ((8, True), (20, False)):
+        ring = RingFilter(SETTINGS)
+        ring.update(0, pose(), floor_beside(360)._replace(floor_from_m=np.inf))
+        seen = np.where(np.arange(SECTORS) // missing == 3, 0.0, floor).astype(np.float32)
+        assert (ring.update(S, pose(0.2), floor_beside(0)._replace(free_m=seen)).free_m > 2.9).all() == free
