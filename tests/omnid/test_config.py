@@ -62,3 +62,12 @@ def test_the_daemon_refuses_a_setpoint_in_its_configuration() -> None:
 @pytest.mark.parametrize("command", ["run", "replay"])
 def test_the_defaults_give_no_warning(command: str) -> None:
     assert unused_settings(Config(), command, []) == []
+
+
+@pytest.mark.parametrize(("overrides", "matching"), [
+    ([], "auto"), (["odometry.method=paper"], "enhanced"),
+    (["odometry.method=paper", "stereo.matching.method=sad"], "sad"),
+    (["odometry.method=paper", "stereo.matching.method=enhanced"], "enhanced")])
+def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(overrides: list[str], matching: str
+                                                                                ) -> None:
+    assert load_config(None, overrides).stereo_settings().matching.method == matching

@@ -201,17 +201,13 @@ def test_every_setting_has_a_description(omnid: Command) -> None:
 def test_the_papers_method_selects_the_enhanced_sad_unless_the_matching_is_set(
     omnid: Command, tmp_path: Path, scene: Path
 ) -> None:
-    """By option, by --set and by a file; a matching method that is set explicitly wins."""
+    """By option and by a file; a matching method that is set explicitly wins."""
     settings = tmp_path / "omnid.toml"
     settings.write_text(omnid("config").out.replace('method = "default"', 'method = "paper"'))
-    explicit = ("--set", "stereo.matching.method=enhanced")
-    other = ("--set", "stereo.matching.method=sad")
-    cases = {"option": ("--method", "paper"), "set": ("--set", "odometry.method=paper"),
-             "file": ("--config", settings), "explicit": ("--method", "paper", *explicit),
-             "other": ("--method", "paper", *other)}
+    cases = {"option": ("--method", "paper"), "file": ("--config", settings),
+             "other": ("--method", "paper", "--set", "stereo.matching.method=sad")}
     for name, words in cases.items():
         result = omnid.replay(scene / "log.mcap", *words, "--tum", tmp_path / name, rig=scene / "rig.toml")
         assert result.code == 0, result.err
     trajectories = {name: (tmp_path / name).read_bytes() for name in cases}
-    assert trajectories["option"] == trajectories["set"] == trajectories["file"] == trajectories["explicit"]
-    assert trajectories["other"] != trajectories["option"]
+    assert trajectories["option"] == trajectories["file"] != trajectories["other"]

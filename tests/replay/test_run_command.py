@@ -118,7 +118,8 @@ def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
     assert daemon.process.returncode == 0 and "Traceback" not in err, err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT,
+                                    pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> None:
     """Also while it starts."""
     port = free_port()
