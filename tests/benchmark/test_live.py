@@ -1,6 +1,8 @@
 """Latencies of the live daemon: `python -m pytest -m benchmark -s tests/benchmark/test_live.py`; soak test: `-m slow`.
 
-OMNID_BENCHMARK_S: duration of a measurement in s (60). OMNID_SOAK_MINUTES: duration of the soak test (2; 10: full).
+OMNID_BENCHMARK_S: duration of a measurement in s (60). OMNID_BENCHMARK_LOG: FOLDER:HZ, a folder with log.mcap and
+its rig.toml, and the rate of its pairs; without it, the sample's at 10 Hz. OMNID_SOAK_MINUTES: duration of the soak
+test (2; 10: full).
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ import pytest
 
 from tests.replay.live import Base, Daemon, Operator, answers, free_port, started, wait_until
 
-LOG = Path(str(files("omnid.sample") / "log.mcap"))  # 10 pairs a second of 512x512, its rig attached
+FOLDER, _, HZ = os.environ.get("OMNID_BENCHMARK_LOG", f"{files('omnid.sample')}:10").rpartition(":")
+RIG = ("--rig", f"{FOLDER}/rig.toml") if Path(FOLDER, "rig.toml").exists() else ()  # the sample's is attached
 MEASURE_S = float(os.environ.get("OMNID_BENCHMARK_S", "60"))
 SOAK_S = 60 * float(os.environ.get("OMNID_SOAK_MINUTES", "2"))
 LATEST_MS = 20.0  # largest lateness of the motor's tick, 99.9th percentile
@@ -30,14 +33,14 @@ STAGES = ("lower", "upper", "pair", "dewarp", "odometry", "mapping", "bus", "bus
 
 @contextmanager
 def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, Operator, Base]]:
-    """Run `omnid run` on the sample log with a simulated motor controller and an operator who sends commands."""
+    """Run `omnid run` on the log with a simulated motor controller and an operator who sends commands."""
     port = free_port()
     with ExitStack() as ends:
         base = Base(folder)
         ends.callback(base.close)
         words = [f'bus.listen=["tcp/127.0.0.1:{port}"]', *settings]
-        command = [sys.executable, "-m", "omnid", "run", "--log", str(LOG), "--pace", str(pace), "--motor",
-                   str(base.port), *(part for word in words for part in ("--set", word))]
+        command = [sys.executable, "-m", "omnid", "run", "--log", f"{FOLDER}/log.mcap", "--pace", str(pace), *RIG,
+                   "--motor", str(base.port), *(part for word in words for part in ("--set", word))]
         process = ends.enter_context(started(command, port))
         wait_until(lambda: answers(port) or not process.alive, "the daemon's answer")
         operator = Operator(port)
@@ -79,7 +82,7 @@ def figures(operator: Operator, load: float) -> dict[str, str]:
 @pytest.mark.parametrize("rate_hz", [10, 30])
 def test_latencies_and_the_deadline_of_the_motor_tick(tmp_path: Path, rate_hz: int, per_core: int) -> None:
     with busy_processes(per_core * (os.cpu_count() or 1)), \
-            daemon(tmp_path, rate_hz / 10, f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base):
+            daemon(tmp_path, rate_hz / float(HZ), f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base):
         time.sleep(MEASURE_S)
         found = figures(operator, os.getloadavg()[0])
         assert base.line.base.errors == 0
