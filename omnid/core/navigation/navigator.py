@@ -33,6 +33,7 @@ PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)
 BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left
 PLANNED_M: Final = 4.0  # of the path that the local planner is given
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
+AROUND: Final = "it looks for a way around an obstacle"
 
 
 @dataclass(slots=True)
@@ -149,8 +150,9 @@ class Navigator:
                                  offset_m=following.offset_m)
         # 5. What holds the wheels, and progress.
         if self._is_stuck(drive, now, following.left_m, dt_s):
-            return self._failed(f"no progress for {self._settings.stuck_s:g} s"
-                                f"{': ' + now.wheels.reason if _holds(now) else ''}: look at the robot")
+            why = now.wheels.reason if _holds(now) else AROUND if plan.avoiding else ""
+            return self._failed(f"no progress for {self._settings.stuck_s:g} s{': ' + why if why else ''}: look at the "
+                                "robot")
         self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
         self.reason = now.wheels.reason if _holds(now) else plan.reason
         drive.waits.clear()

@@ -128,7 +128,17 @@ def test_gives_up_without_progress() -> None:
     base = driving()
     base.slip = 0.0
     answer = base.run(20)
-    assert answer.state is NavigationState.FAILED and "no progress for 3 s" in answer.reason
+    assert answer.state is NavigationState.FAILED and answer.reason == "no progress for 3 s: look at the robot"
+
+
+def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = driving()
+    box = base.pose[:2] + np.column_stack([np.full(9, 1.1), np.linspace(-0.15, 0.15, 9)])
+    without = base.seen
+    monkeypatch.setattr(base, "seen", lambda: without()._replace(obstacles=box))
+    base.slip = 0.0
+    answer = base.run(20)
+    assert answer.reason == "no progress for 3 s: it looks for a way around an obstacle: look at the robot"
 
 
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
