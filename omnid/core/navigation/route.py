@@ -172,13 +172,17 @@ def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: i
 
 
 def _entry(poses: Array, pose: Array) -> int:
-    """Return the point of a route at which the robot begins."""
+    """Return the point of a route at which the robot begins; at the end of a closed one, a new round begins."""
     away_m = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
     cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
     near = away_m <= ENTRY_M
     if not near.any():
         raise OmnidError(f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within "
                          f"{ENTRY_M:g} m, anywhere on it")
+    if math.dist(poses[0, :2], poses[-1, :2]) <= CLOSED_M:
+        way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        before_end = near & (way_m < way_m[-1] - CLOSED_M)
+        near = before_end if before_end.any() else near
     return int(np.argmin(np.where(near, cost, np.inf)))
 
 

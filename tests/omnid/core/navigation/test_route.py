@@ -14,6 +14,7 @@ from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.places.planar import composed
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
@@ -187,6 +188,17 @@ def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     assert closed.is_closed
     rounds = repeated_paths(closed, Map(ring), np.zeros(3), loops=3, reverse=False)
     assert len(rounds) == 3 and rounds[1] is rounds[2] and rounds[1].length_m == pytest.approx(4 * math.pi, abs=0.3)
+
+
+@pytest.mark.parametrize(("short_m", "beside_m"), [(0.0, 0.0), (0.35, 0.1), (0.35, -0.3), (0.9, 0.0)])
+def test_at_the_end_of_a_closed_route_a_new_round_begins(short_m: float, beside_m: float) -> None:
+    a = np.arange(0, math.tau - short_m / 2, 0.01)
+    ring = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
+    route, places = taught(ring, Map(ring)), Map(ring)
+    for reverse in (False, True):
+        end = composed(ring[:1] if reverse else ring[-1:], np.array([0.0, beside_m, math.pi if reverse else 0.0]))[0]
+        (path,) = repeated_paths(route, places, end, loops=1, reverse=reverse)
+        assert path.length_m > 4 * math.pi - 2.5
 
 
 def test_in_a_way_there_and_back_the_heading_decides_where_it_begins() -> None:
