@@ -3,8 +3,8 @@
 In the corridor around the rooms of `building` somebody drives a round of 33 m, or its first metres, while map and route
 are recorded. The route is then repeated in the saved map from other starts on it, with other light, a fifth of the
 posters exchanged, and two people who walk across the corridor and wait for a near robot. A row for each drive: its end,
-cross-track error of the true path against the true path of the lesson (p95, and p95 where no obstacle was gone
-around), distance to the lesson's end, way, contacts, least clearance, and why it stood.
+cross-track error of the true path against the true path of the lesson (p95, also of detours around obstacles),
+distance to the lesson's end, way, contacts, least clearance, and why it stood.
 """
 
 from __future__ import annotations
