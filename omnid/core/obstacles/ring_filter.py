@@ -22,6 +22,8 @@ VOTE_NS: Final = 1_500_000_000  # older pairs do not vote
 SAME_SECTORS: Final = 2  # difference in direction at which two ranges may be of one obstacle
 SAME_M: Final = 0.12  # and difference in range, beside the noise
 SAME_SIGMAS: Final = 3.0
+BEHIND_M: Final = 0.1  # beyond obstacles.ring.blind_m: from here on a range shows that a nearer obstacle is gone
+NEAR_NS: Final = 60_000_000_000  # for which a nearer obstacle is believed against a range that does not show that
 HIDING_M: Final = 0.35  # range of what hides the floor and shows stereo nothing: how near it is, is not known
 
 
@@ -106,7 +108,11 @@ class RingFilter:
             return accepted, sigma, seen_ns
         ranges, sigmas, stamps = self._in_base(self._memory, T_odom_base)
         fresh = stamp_ns - stamps <= self._settings.memory_s * 1e9
-        keep = unknown & np.isfinite(ranges) & (fresh | (ranges <= self._settings.blind_m))
+        is_near = ranges <= self._settings.blind_m
+        # What is too near for stereo is matched wrongly, a little farther away: that is no view past it.
+        is_hiding = is_near & (ranges < accepted) & (accepted <= self._settings.blind_m + BEHIND_M)
+        is_hiding &= stamp_ns - stamps <= NEAR_NS
+        keep = np.isfinite(ranges) & (unknown & (fresh | is_near) | is_hiding)
         return (np.where(keep, ranges, accepted), np.where(keep, sigmas, sigma), np.where(keep, stamps, seen_ns))
 
     def _points(self, T_odom_base: Array, ranges: Array, sigma: Array, seen_ns: NDArray[np.int64]) -> RingPoints:

@@ -198,3 +198,20 @@ def test_a_few_directions_without_floor_are_as_free_as_those_beside_them() -> No
         ring.update(0, pose(), floor_beside(360)._replace(floor_from_m=np.inf))
         seen = np.where(np.arange(SECTORS) // missing == 3, 0.0, floor).astype(np.float32)
         assert (ring.update(S, pose(0.2), floor_beside(0)._replace(free_m=seen)).free_m > 2.9).all() == free
+
+
+def test_an_obstacle_too_near_for_stereo_is_not_farther_because_it_is_matched_wrongly() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(4):
+        ring.update(i * S // 5, pose(0.1 * i), ring_of(1.0 - 0.1 * i))
+    for i in range(4, 30):  # on to 0.4 m, where it seems to stay at 0.75 m
+        near = ring.update(i * S // 5, pose(min(0.1 * i, 0.6)), ring_of(0.75))
+    assert np.nanmax(near.ranges_m[175:185]) < 0.5
+    for i in range(30, 34):
+        gone = ring.update(i * S // 5, pose(0.6), ring_of(1.2))
+    np.testing.assert_allclose(gone.ranges_m[AHEAD], 1.2, atol=1e-4)
+    for i in range(4):
+        ring.update(40 * S + i * S // 5, pose(0.6), ring_of(0.5))
+    for i in range(4):
+        late = ring.update(102 * S + i * S // 5, pose(0.6), ring_of(0.8))
+    np.testing.assert_allclose(late.ranges_m[AHEAD], 0.8, atol=1e-4)
