@@ -30,6 +30,9 @@ HIDDEN_SECTORS: Final = 12  # side by side, in two pairs: floor of few edges is 
 SAME_SECTORS: Final = 5  # by which what hides it has moved from pair to pair
 ASSUMED_SECTORS: Final = 60  # side by side without floor; from here on, something near hides it also where none is seen
 RESTING_M: Final = 0.05  # within which a base stands
+END_M: Final = 0.15  # before the end of the floor that was seen: steps of 0.1 m and the noise of stereo
+MISSED_NS: Final = 1_500_000_000  # after which floor that is in view and not seen any more is not free
+IN_VIEW_M: Final = 2.5  # up to here floor is seen now and then, also where it has few edges
 SHIFT: Final = 4  # fractional bits of the corners that are drawn
 
 
@@ -58,9 +61,9 @@ class FreeSpace:
         """Add the free ranges (SECTORS,) of a pair, 0 where nothing was seen; return those that are known now.
 
         A direction in which some floor is seen now says all there is. Where none is seen, memory counts, and in fewer
-        directions than HIDDEN_SECTORS those beside them. Returned beside it is where something new hides the floor: two
-        pairs saw nothing in HIDDEN_SECTORS, and memory knows floor at least HIDDEN_M beyond floor_from_m, from which on
-        the cameras see floor elsewhere.
+        directions than HIDDEN_SECTORS those beside them; memory loses what is in view and is not seen any more.
+        Returned beside it is where something new hides the floor: two pairs saw nothing in HIDDEN_SECTORS, and memory
+        knows floor at least HIDDEN_M beyond floor_from_m, from which on the cameras see floor elsewhere.
         """
         centre = T_odom_base[:2, 3] / CELL_M
         self._follow(centre)
@@ -70,10 +73,13 @@ class FreeSpace:
         assumed = np.zeros_like(unseen)
         if self._stands(stamp_ns, T_odom_base[:2, 3]) and math.isfinite(floor_from_m):
             assumed = unseen & ~_wide(unseen, ASSUMED_SECTORS)
-        drawn = self._drawn(centre, np.where(assumed, floor_from_m, free_m), direction, unseen & ~assumed)
+        reach_m = np.where(assumed, floor_from_m, np.maximum(free_m - END_M, 0.0))
+        drawn = self._drawn(centre, reach_m, direction, unseen & ~assumed)
         x, y = np.floor(centre).astype(np.int64) - self._corner
         drawn[y, x] = True  # the robot stands there
         self._seen_ns[drawn] = stamp_ns
+        if math.isfinite(floor_from_m):
+            self._forget_missed(stamp_ns, centre, floor_from_m + 2 * CELL_M)
         remembered = self._remembered(stamp_ns, centre, direction)
         wide = _wide(unseen & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
         shifts = range(-SAME_SECTORS, SAME_SECTORS + 1)
@@ -99,6 +105,13 @@ class FreeSpace:
             corners = centre - self._corner - 0.5 + reach_m[:, None] / CELL_M * direction
             cv2.fillPoly(drawn, [np.rint(corners * 2**SHIFT).astype(np.int32)], value, shift=SHIFT)
         return drawn > 0
+
+    def _forget_missed(self, stamp_ns: int, centre: Array, from_m: float) -> None:
+        """Forget cells from a distance on that are in view and were not seen for MISSED_NS: something hides them."""
+        x, y = (CELL_M * (np.arange(CELLS) + 0.5 + first - at) for first, at in zip(self._corner, centre, strict=True))
+        distance2 = y[:, None] ** 2 + x[None, :] ** 2
+        in_view = (distance2 > from_m**2) & (distance2 < IN_VIEW_M**2)
+        self._seen_ns[in_view & (self._seen_ns < stamp_ns - MISSED_NS)] = np.iinfo(np.int64).min
 
     def _remembered(self, stamp_ns: int, centre: Array, direction: Array) -> Array:
         """Return how far (SECTORS,) all cells along the directions (SECTORS, 2) were free."""

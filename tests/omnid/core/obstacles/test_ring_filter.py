@@ -8,7 +8,7 @@ import numpy as np
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.free_space import CELL_M
+from omnid.core.obstacles.free_space import CELL_M, END_M
 from omnid.core.obstacles.observation import Observation
 from omnid.core.obstacles.ring_filter import HIDING_M, RingFilter
 from omnid.core.obstacles.settings import RingSettings
@@ -113,8 +113,8 @@ def test_the_floor_that_was_seen_to_be_free_is_remembered_where_none_is_seen() -
     nothing = ring_of(np.nan)
     ring.update(0, pose(), floor)
     near = ring.update(S, pose(1.5), nothing)
-    np.testing.assert_allclose(near.free_m[AHEAD], 0.5, atol=0.1)
-    np.testing.assert_allclose(near.free_m[BEHIND][[0, -1]], 3.5, atol=0.1)
+    np.testing.assert_allclose(near.free_m[AHEAD], 0.5 - END_M, atol=0.1)
+    np.testing.assert_allclose(near.free_m[BEHIND][[0, -1]], 3.5 - END_M, atol=0.1)
     late = ring.update(S + round((SETTINGS.free_s + 1) * S), pose(1.5), nothing)
     assert (late.free_m <= CELL_M).all()
 
@@ -215,3 +215,16 @@ def test_an_obstacle_too_near_for_stereo_is_not_farther_because_it_is_matched_wr
     for i in range(4):
         late = ring.update(102 * S + i * S // 5, pose(0.6), ring_of(0.8))
     np.testing.assert_allclose(late.ranges_m[AHEAD], 0.8, atol=1e-4)
+
+
+def test_memory_does_not_reach_through_somebody_who_has_come_and_shows_nothing() -> None:
+    ring = RingFilter(SETTINGS)
+    for i in range(5):
+        ring.update(i * S // 5, pose(), floor_beside(0))
+    standing_m = 2.0  # from the start; hides the floor from there on
+    for i in range(5, 45):
+        x_m = min(0.05 * (i - 5), 1.5)
+        left_m = standing_m - x_m
+        free = np.where(AHEAD, left_m if left_m > 1.2 else 0.0, 3.0).astype(np.float32)
+        seen = ring.update(i * S // 5, pose(x_m), floor_beside(0)._replace(free_m=free))
+    assert seen.free_m[172:188].max() <= standing_m - 1.5 + CELL_M
