@@ -6,6 +6,9 @@ has come that hides it, though stereo sees nothing on it.
 
 Where the base stands, nothing was seen from farther away. There the floor around it counts as free, as far as the
 cameras cannot see it, except towards what hides it in a wide angle.
+
+What this cannot know: something that stereo does not see and that is narrower than HIDDEN_SECTORS, or nearer than the
+floor in view where the base starts. Wider patches of floor without edges count as unknown.
 """
 
 from __future__ import annotations
@@ -69,6 +72,7 @@ class FreeSpace:
         self._follow(centre)
         angle = self._directions + math.atan2(T_odom_base[1, 0], T_odom_base[0, 0])
         direction = np.column_stack([np.cos(angle), np.sin(angle)])
+        # 1. Floor that counts as free: seen in this pair, or too near to be seen where the base stands.
         unseen = free_m <= 0
         assumed = np.zeros_like(unseen)
         if self._stands(stamp_ns, T_odom_base[:2, 3]) and math.isfinite(floor_from_m):
@@ -78,9 +82,11 @@ class FreeSpace:
         x, y = np.floor(centre).astype(np.int64) - self._corner
         drawn[y, x] = True  # the robot stands there
         self._seen_ns[drawn] = stamp_ns
+        # 2. Memory: without what is in view and is missed, so that it does not reach through what has come.
         if math.isfinite(floor_from_m):
             self._forget_missed(stamp_ns, centre, floor_from_m + 2 * CELL_M)
         remembered = self._remembered(stamp_ns, centre, direction)
+        # 3. Floor that is remembered and missed in a wide angle, in two pairs: something hides it.
         wide = _wide(unseen & (remembered > floor_from_m + HIDDEN_M), HIDDEN_SECTORS)
         shifts = range(-SAME_SECTORS, SAME_SECTORS + 1)
         is_hidden = wide & np.logical_or.reduce([np.roll(self._hidden_before, shift) for shift in shifts])

@@ -83,7 +83,6 @@ class VisualOdometry:
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
         T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
-
         exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
 
         # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
