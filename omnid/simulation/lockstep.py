@@ -32,7 +32,7 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.runs.pipeline import NavigationParts, Sinks, wheel_state, wire
+from omnid.runs.pipeline import NavigationParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
@@ -86,6 +86,7 @@ class SimulatedRun:
     T_world_base: Array  # (N, 4, 4) true
     T_odom_base: Array  # (N, 4, 4) estimated
     states: tuple[str, ...]  # of the poses
+    slipping: NDArray[np.bool_]  # (N,) True where the daemon says that the wheels slip
     ticks: tuple[Tick, ...]
     lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
     rings: tuple[ObstacleRing, ...]
@@ -143,6 +144,8 @@ class _Lockstep:
         self._rings: list[ObstacleRing] = []
         self._navigation: list[NavigationUpdate] = []
         self._places: list[PlaceUpdate] = []
+        self._slipping: list[bool] = []
+        self._stages: WiredStages | None = None
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
@@ -156,15 +159,16 @@ class _Lockstep:
                                 RouteFolder(Path(config.navigation.routes)), config.places.map)
         sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)}, navigation=parts,
                       places={"in map": Take(self._places.append)} if config.places.map else {})
-        wire(graph, pairs, shape, config, run_places.known_to(sinks))
+        self._stages = wire(graph, pairs, shape, config, run_places.known_to(sinks))
         graph.run()
         run_places.finish()
         return SimulatedRun(
             np.array([stamp for stamp, _, _ in self._poses], np.int64),
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
             np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
-            tuple(state for _, _, state in self._poses), tuple(vehicle.log.ticks), tuple(vehicle.log.lines),
-            tuple(self._rings), tuple(self._navigation), tuple(self._places), self._rig.T_base_rig)
+            tuple(state for _, _, state in self._poses), np.array(self._slipping, bool),
+            tuple(vehicle.log.ticks), tuple(vehicle.log.lines), tuple(self._rings),
+            tuple(self._navigation), tuple(self._places), self._rig.T_base_rig)
 
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
         """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
@@ -221,6 +225,7 @@ class _Lockstep:
         T_base_rig = self._rig.T_base_rig
         self._odometry = odometry
         self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state))
+        self._slipping.append(self._stages is not None and self._stages.odometry.sensors.is_slipping)
         pose = controller_pose(odometry, T_base_rig)
         self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_pose(pose))
 

@@ -2,7 +2,9 @@
 
 Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
 what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
-path to the straight legs, contacts, least clearance.
+path to the straight legs, contacts, least clearance; of a time in the dark the way and the error that it added to
+the pose; when slip was noticed, after it began, and how many pairs noticed it at other times. The building is driven around by
+map and path (tests/benchmark/building_round.py).
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,10 +23,13 @@ from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from tests.benchmark.building_round import building_round
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
+NOTICED_LATE_S = 0.5  # after its end, within which slip may be noticed
 
 
 @dataclass
@@ -63,11 +68,14 @@ class Case:
     goals: list[Goal] = field(default_factory=list)
     faults: tuple[Fault, ...] = ()
     slips: tuple[Slip, ...] = ()
+    sensors: bool = True  # odometry of the wheels, and a gyro
 
 
 STRAIGHT: list[Goal] = [(10.0, 0.0, 0.0)]
 SQUARE: list[Goal] = [(2.5, 0.0, 90.0), (2.5, 2.5, 180.0), (0.0, 2.5, -90.0), (0.0, 0.0, 0.0)]
-ROUND: list[Goal] = [(5.05, 0.0, 90.0), (5.05, 7.1, 180.0), (-5.05, 7.1, -90.0), (-5.05, 0.0, 0.0), (0.0, 0.0, 0.0)]
+DARK = Fault("dark", 10.0, 13.0)
+SLIP = Slip(10.0, 11.0, 0.2)
+BUILDING = "building"
 
 
 def corridor(seed: int) -> World:
@@ -79,9 +87,9 @@ def corridor(seed: int) -> World:
 CASES: dict[str, Case] = {
     "straight": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT),
     "square": Case(lambda seed: load_world("room", seed), lambda: Goals(SQUARE), 120.0, SQUARE),
-    "building": Case(lambda seed: load_world("building", seed), lambda: Goals(ROUND), 240.0, ROUND),
-    "dark": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (Fault("dark", 10.0, 13.0),)),
-    "slip": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (), (Slip(10.0, 11.0, 0.2),)),
+    "dark": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (DARK,)),
+    "dark without": Case(corridor, lambda: Goals(STRAIGHT), 20.0, STRAIGHT, (DARK,), (), sensors=False),
+    "slip": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (), (SLIP,)),
 }
 
 
@@ -108,27 +116,67 @@ def row(case: Case, run: SimulatedRun) -> list[str]:
     moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)
     stops = [line for _, line in run.lines if line.startswith("the wheels stop")]
     return [state, *ends, f"{np.linalg.norm(moved, axis=1).sum():.2f}", str(len(run.contacts)),
-            f"{run.clearance_m:.2f}", "; ".join(dict.fromkeys(stops))[:120]]
+            f"{run.clearance_m:.2f}", dark(case, run), slip(case, run), "; ".join(dict.fromkeys(stops))[:120]]
+
+
+def dark(case: Case, run: SimulatedRun) -> str:
+    """Return way [m] and error [cm] of the poses of the time in the dark, from the last pair before it on."""
+    times_s = (run.stamps_ns - START_NS) * 1e-9
+    texts = []
+    for fault in case.faults:
+        first, last = np.searchsorted(times_s, (fault.start_s, fault.end_s)) - 1
+        truth, estimate = (se3.inverse(poses[first]) @ poses[last] for poses in (run.T_world_base, run.T_odom_base))
+        way_m = np.linalg.norm(np.diff(run.T_world_base[first:last + 1, :2, 3], axis=0), axis=1).sum()
+        error_m = np.linalg.norm((se3.inverse(truth) @ estimate)[:2, 3])
+        texts.append(f"{way_m:.2f} m, {100 * error_m:.1f} cm")
+    return "; ".join(texts)
+
+
+def slip(case: Case, run: SimulatedRun) -> str:
+    """Return when slip was noticed after it began [s], and how many pairs noticed it at other times."""
+    times_s = (run.stamps_ns - START_NS) * 1e-9
+    at_slips, texts = np.zeros(len(times_s), bool), []
+    for slipped in case.slips:
+        within = (times_s >= slipped.start_s) & (times_s < slipped.end_s + NOTICED_LATE_S)
+        noticed_s = times_s[within & run.slipping]
+        texts.append(f"{noticed_s[0] - slipped.start_s:.1f} s" if len(noticed_s) else "not noticed")
+        at_slips |= within
+    return "; ".join([*texts, str(int((run.slipping & ~at_slips).sum()))])
 
 
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmark.drive")
-    parser.add_argument("cases", nargs="+", choices=[*CASES, "all"], metavar="CASE")
+    parser.add_argument("cases", nargs="+", choices=[*CASES, BUILDING, "all"], metavar="CASE")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--size", type=int, default=512)
     arguments = parser.parse_args()
     heads = ("case", "seed", "end", "end error cm", "deg", "off the legs cm", "way m", "contacts", "clearance m",
-             "stops", "s a pair")
+             "in the dark", "slip noticed", "stops", "s a pair")
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
-    for name in CASES if "all" in arguments.cases else arguments.cases:
-        case = CASES[name]
+    for name in [*CASES, BUILDING] if "all" in arguments.cases else arguments.cases:
         for seed in arguments.seeds:
-            robot = with_slips(make_robot(arguments.size), case.slips)
-            started_s = time.process_time()
-            run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
-            cost_s = (time.process_time() - started_s) / max(1, len(run.stamps_ns))
-            print("|", " | ".join([name, str(seed), *row(case, run), f"{cost_s:.2f}"]), "|", flush=True)
+            size = arguments.size
+            cells = round_row(seed, size) if name == BUILDING else drive_row(CASES[name], seed, size)
+            print("|", " | ".join([name, str(seed), *cells]), "|", flush=True)
+
+
+def drive_row(case: Case, seed: int, size_px: int) -> list[str]:
+    """Drive; return the figures."""
+    robot = replace(with_slips(make_robot(size_px), case.slips), has_odometry=case.sensors, has_gyro=case.sensors)
+    started_s = time.process_time()
+    run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
+    return [*row(case, run), f"{(time.process_time() - started_s) / max(1, len(run.stamps_ns)):.2f}"]
+
+
+def round_row(seed: int, size_px: int) -> list[str]:
+    """Drive around the building in its map; return the figures."""
+    started_s = time.process_time()
+    end = building_round(seed, size_px)
+    way_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in end.run.ticks], axis=0), axis=1).sum()
+    return [end.words, f"{100 * end.error_m:.1f}", f"{math.degrees(end.error_rad):.2f}", f"{100 * end.off_path_m:.1f}",
+            f"{way_m:.2f}", str(len(end.run.contacts)), f"{end.run.clearance_m:.2f}", "", "", end.stops,
+            f"{(time.process_time() - started_s) / end.pairs:.2f}"]
 
 
 if __name__ == "__main__":

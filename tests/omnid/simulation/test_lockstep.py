@@ -76,7 +76,10 @@ def test_a_goal_is_reached_by_the_true_robot() -> None:
     assert np.hypot(*(run.truth_in_odom[-1][:2, 3] - (0.5, 0.0))) < 0.05
 
 
-def test_slipping_wheels_turn_farther_than_the_robot_drives() -> None:
-    robot = with_slips(make_robot(SIZE), [Slip(0.0, 9.0, 0.5)])
-    slipping = simulate(WORLD, robot, forward, seconds=2.0, seed=1, config=CONFIG).truth_in_odom[-1]
-    assert slipping[0, 3] < 0.6 * drive(1).truth_in_odom[-1][0, 3]
+def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
+    run = simulate(WORLD, with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1,
+                   config=CONFIG)
+    x_m = run.truth_in_odom[:, 0, 3]
+    assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
+    noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9
+    assert len(noticed_s) >= 5 and noticed_s.min() > 1.5
