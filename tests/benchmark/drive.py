@@ -3,8 +3,8 @@
 Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
 what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
 path to the straight legs, contacts, least clearance; of a time in the dark the way and the error that it added to
-the pose; when slip was noticed, after it began, and how many pairs noticed it at other times. The building is driven around by
-map and path (tests/benchmark/building_round.py).
+the pose; when slip was noticed, after it began, and how many pairs noticed it at other times. The building is driven
+around by map and path (tests/benchmark/building_round.py).
 """
 
 from __future__ import annotations
