@@ -17,13 +17,12 @@ from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
 CAMERAS: Final[tuple[Camera, Camera]] = ("lower", "upper")
-SAMPLES: Final = 2  # per pixel and axis
 
 
 class SimulatedCameras:
     """Renders raw grey frames; an image follows from world, people, pose, sequence number and seed alone."""
 
-    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int = SAMPLES) -> None:
+    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int) -> None:
         """samples: per pixel and axis."""
         self._world, self._seed, self._samples = world, seed, samples
         self._mounted = {"lower": rig.lower, "upper": rig.upper}

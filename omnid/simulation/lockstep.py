@@ -133,7 +133,7 @@ class _Lockstep:
                  faults: tuple[Fault, ...]) -> None:
         self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
         self._rig = with_masks(robot.rig)
-        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed)
+        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
         self._vehicle = Vehicle(world, robot, config, seed)
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
