@@ -219,8 +219,8 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2, help="rays of a pixel, per axis")
     parser.add_argument("--no-people", action="store_true")
     arguments = parser.parse_args()
-    heads = ("seed", "drive", "end", "off the lesson p95 cm", "without detours", "most cm", "around obstacles s", "end error cm",
-             "way m", "s", "contacts", "clearance m", "stood or slowed", "processor s")
+    heads = ("seed", "drive", "end", "off the lesson p95 cm", "without detours", "most cm", "around obstacles s",
+             "end error cm", "way m", "s", "contacts", "clearance m", "stood or slowed", "processor s")
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
     robot = replace(make_robot(arguments.size), samples=arguments.samples)
     for seed in arguments.seeds:
