@@ -36,7 +36,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "stop": ("stop", "stop --robot rover --connect tcp/robot:7447"),
     "drive": ("drive", "drive --robot rover --connect tcp/robot:7447"),
     "goto": ("goto 3 1.5 90", "goto -1.2 0.5 --frame map --robot rover --connect tcp/robot:7447", "goto --cancel"),
-    "route teach": ("route teach morning", "route teach morning --no-wait"),
+    "route teach": ("route teach morning", "route teach morning --replace"),
     "route finish": ("route finish",),
     "route repeat": ("route repeat morning", "route repeat morning --reverse --loops 5 --no-wait"),
     "route stop": ("route stop",),

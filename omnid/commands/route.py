@@ -25,6 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
     teach = _add(actions, "teach", run_teach, "record a route while somebody drives (`omnid drive`, a joystick)",
                  on_robot=False)
+    teach.add_argument("--replace", action="store_true", help="in the place of a route of that name, which stays until "
+                       "the new one is written; without it an existing name is refused")
     teach.add_argument("--no-wait", action="store_true", help="end at once: `omnid route finish` writes it")
     _add(actions, "finish", run_text, "end the recording and write the route and the map", on_robot=False, named=False)
     repeat = _add(actions, "repeat", run_repeat, "drive a route, from where the robot is on it", on_robot=False)
@@ -64,7 +66,7 @@ def run_teach(args: argparse.Namespace) -> int:
 
     name = route_name(args.name)
     with NavigationClient(config_of(args).bus) as client:
-        client.route(f"teach {name}")
+        client.route(f"teach {name} replace" if args.replace else f"teach {name}")
         if args.no_wait:
             print(f"records {name}: drive it, then `omnid route finish`")
             return 0

@@ -109,6 +109,10 @@ class RouteFolder:
         return sorted(path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"*{SUFFIX}")
                       if not path.name.startswith("."))
 
+    def has(self, name: str) -> bool:
+        """True if there is a file for a route of that name, readable or not."""
+        return self.path(name).exists()
+
     def read(self, name: str) -> Route:
         """Return a route. Raise OmnidError where there is none, or where its file is damaged."""
         path = self.path(name)

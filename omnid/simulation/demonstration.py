@@ -59,7 +59,7 @@ class TeachAndRepeat:
                 yield "arm"
                 return
             self._tell(moment, "is taught the route: it is driven along an oval")
-            yield RouteRequest(RouteAction.TEACH, ROUTE)
+            yield RouteRequest(RouteAction.TEACH, ROUTE, replace=True)  # that of an earlier demonstration
             yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
             return
         navigation = moment.navigation

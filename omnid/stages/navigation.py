@@ -162,7 +162,7 @@ class NavigationStage:
             case RouteAction.TEACH:
                 if self._navigator.task.startswith("route") and self._navigator.drive is not None:
                     raise OmnidError("a route is being repeated: stop it first")
-                routes.teach(request.name, self._situation())
+                routes.teach(request.name, self._situation(), replace=request.replace)
             case RouteAction.FINISH:
                 routes.finish(command.arrival_ns // 1_000_000_000)
             case RouteAction.STOP:

@@ -20,7 +20,10 @@ Array = NDArray[np.float64]
 
 
 class RouteStore(Protocol):
-    """Files of routes; each method raises OmnidError where it cannot."""
+    """Files of routes; reading and writing raise OmnidError where they cannot."""
+
+    def has(self, name: str) -> bool:
+        """True if there is a route of that name, readable or not."""
 
     def read(self, name: str) -> Route:
         """Return a route."""
@@ -71,12 +74,17 @@ class Routes:
         """Length of what is recorded so far."""
         return self._recorder.length_m if self._recorder else 0.0
 
-    def teach(self, name: str, now: Situation) -> None:
+    def teach(self, name: str, now: Situation, *, replace: bool = False) -> None:
         """Begin to record: where the robot is localised, or in a map that begins with this run. Raise OmnidError else.
+
+        replace: a route of that name may exist, and gives way when the recording is finished.
         """
         places = self._map()
         if self._recorder is not None:
             raise OmnidError(f"the route {self._recorder.name} is being taught: finish or stop it first")
+        if not replace and self._store.has(name):
+            raise OmnidError(f"there is a route {name} already: choose another name, or replace it (`omnid route teach "
+                             f"{name} --replace`)")
         refusal = refusal_of_map(now, math.inf)
         if refusal and not (places.is_new and now.resets == 0 and now.in_map is not None):
             raise OmnidError(refusal)

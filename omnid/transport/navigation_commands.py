@@ -1,8 +1,8 @@
 """Requests to the navigation from the network, validated: `cmd/goal`, `cmd/path`, `cmd/navigation`, `cmd/route`.
 
 goal is a geometry_msgs/msg/PoseStamped, path a nav_msgs/msg/Path, both in the frame map or odom; a quaternion of zeros
-asks for no heading. navigation and route are std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME", "finish",
-"repeat NAME [reverse] [loops=N]", "stop".
+asks for no heading. navigation and route are std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME [replace]",
+"finish", "repeat NAME [reverse] [loops=N]", "stop".
 """
 
 from __future__ import annotations

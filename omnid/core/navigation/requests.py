@@ -17,7 +17,7 @@ LONGEST_TEXT: Final = 200  # characters of a request
 LONGEST_NAME: Final = 64
 _NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 _LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
-ROUTE_USAGE: Final = '"teach NAME", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'
+ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'
 
 
 class NavigationFrame(StrEnum):
@@ -72,6 +72,7 @@ class RouteRequest:
     reverse: bool = False
     loops: int = 1
     from_start: bool = False  # the whole route; else from where the robot is on it
+    replace: bool = False  # teach in the place of a route of that name
 
 
 Request: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
@@ -107,8 +108,8 @@ def route_request(text: str) -> RouteRequest:
     match words:
         case ["finish" | "stop" as action]:
             return RouteRequest(RouteAction(action))
-        case ["teach", name]:
-            return RouteRequest(RouteAction.TEACH, route_name(name))
+        case ["teach", name, *options] if options in ([], ["replace"]):
+            return RouteRequest(RouteAction.TEACH, route_name(name), replace=bool(options))
         case ["repeat", name, *options] if len(options) == len({option.partition("=")[0] for option in options}):
             return _repeat(route_name(name), options, text)
     raise OmnidError(f"{_shown(text)} is no request about routes: expected {ROUTE_USAGE}")

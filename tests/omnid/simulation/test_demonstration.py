@@ -39,7 +39,7 @@ def begun() -> tuple[TeachAndRepeat, list[str]]:
     assert list(script(replace(moment(0.0, None), place=None))) == []
     assert list(script(replace(moment(0.1, None), controller=ControllerState()))) == ["arm"]
     teach, path = script(moment(1.0, None, MapState.ODOMETRY_ONLY))
-    assert teach == RouteRequest(RouteAction.TEACH, "demo")
+    assert teach == RouteRequest(RouteAction.TEACH, "demo", replace=True)
     assert isinstance(path, PathRequest) and len(drive_path(path.xy).legs) == 1, "it is driven without a halt"
     return script, lines
 

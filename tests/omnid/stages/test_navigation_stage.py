@@ -219,6 +219,10 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     update = robot.send(RouteRequest(RouteAction.FINISH))
     assert update.answer is not None and not update.answer.refusal and not update.teaching
     assert robot.places.saves == 1, "the map is saved with it"
+    update = robot.send(RouteRequest(RouteAction.TEACH, "hall"))
+    assert update.answer is not None and "there is a route hall already" in update.answer.refusal
+    assert robot.send(RouteRequest(RouteAction.TEACH, "hall", replace=True)).teaching == "hall"
+    robot.send(RouteRequest(RouteAction.STOP))  # so that the old one stays
     end = robot.pose.copy()
     robot.send(RouteRequest(RouteAction.REPEAT, "hall", reverse=True))
     assert robot.updates[-1].task == "route hall"
