@@ -36,7 +36,8 @@ def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
     "", "teach", "repeat a from=", "repeat a from=here from=start", "repeat a from=end",
     "teach a b", "teach a replace replace", "teach ../etc", "teach /x", "teach .hidden", "repeat", "repeat a loops=0",
     "repeat a loops=", "repeat a loops=10001", "repeat a loops=1 loops=2", "repeat a reverse reverse",
-    "repeat a backwards", "finish now", "stop all", "TEACH a", "teach \N{SNOWMAN}", "teach " + "a" * 65, "repeat a" + " " * 500, "delete a", "repeat a\0"])
+    "repeat a backwards", "finish now", "stop all",
+    "TEACH a", "teach \N{SNOWMAN}", "teach " + "a" * 65, "repeat a" + " " * 500, "delete a", "repeat a\0"])
 def test_other_texts_are_refused_in_one_line(text: str) -> None:
     with pytest.raises(OmnidError) as error:
         route_request(text)
