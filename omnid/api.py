@@ -20,7 +20,8 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from omnid.config import Config, load_config, unused_settings
+from omnid.config import Config, load_config
+from omnid.config_use import unused_settings
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError

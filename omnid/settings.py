@@ -27,10 +27,10 @@ from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, g
 
 from calib.bounded_toml import parse_toml
 from omnid.errors import OmnidError
+from omnid.settings_file import bytes_of, table_of
 
 T = TypeVar("T")
 _Path: TypeAlias = tuple[str, ...]
-_MAX_BYTES: Final = 1 << 20
 _SHOWN: Final = 60  # characters of a value in a message
 _MISFIT: Final = object()
 _KINDS: Final[dict[Any, tuple[str, str]]] = {
@@ -127,7 +127,7 @@ def load(
     renamed: old dotted path of a key or a section -> its new path, or a sentence where no key takes its place.
     Raises OmnidError for a file that cannot be read and for everything in it that is not exactly as declared.
     """
-    data, origin = (b"", "defaults") if path is None else (_bytes_of(path), str(path))
+    data, origin = (b"", "defaults") if path is None else (bytes_of(path), str(path))
     return parse(root, data, origin=origin, overrides=overrides, renamed=renamed)
 
 
@@ -143,20 +143,12 @@ def parse(
     keys = _Keys(tuple(_paths(root)), renamed)
     changes = [_parsed_override(root, text, keys) for text in overrides]
     try:
-        table = _table_of(data)
+        table = table_of(data)
         for path, value in changes:
             insert(table, path, value)
         return cast("T", _built(root(), table, (), keys))
     except OmnidError as error:
         raise OmnidError(f"{origin}: {error}") from None
-
-
-def read_table(path: str | PathLike[str]) -> dict[str, Any]:
-    """Return the table of a TOML file; OmnidError where it cannot be read."""
-    try:
-        return _table_of(_bytes_of(path))
-    except OmnidError as error:
-        raise OmnidError(f"{path}: {error}") from None
 
 
 def from_table(root: type[T], table: dict[str, Any], origin: str, renamed: Mapping[str, str]) -> T:
@@ -181,27 +173,6 @@ def knob_paths(root: type) -> list[str]:
 def value_at(settings: object, path: str) -> object:
     """Return the value at a dotted path."""
     return reduce(getattr, path.split("."), settings)
-
-
-def _bytes_of(path: str | PathLike[str]) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            data = file.read(_MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OmnidError(f"cannot read the settings file {str(path)!r}: {reason}") from None
-    if len(data) > _MAX_BYTES:
-        raise OmnidError(f"the settings file {str(path)!r} has more than {_MAX_BYTES} bytes: is it the right file?")
-    return data
-
-
-def _table_of(data: bytes) -> dict[str, Any]:
-    try:
-        return parse_toml(data.decode())
-    except UnicodeDecodeError as error:
-        raise OmnidError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
-    except (ValueError, RecursionError) as error:
-        raise OmnidError(f"expected TOML, found: {' '.join(str(error).split())}") from None
 
 
 def _parsed_override(root: type, text: str, keys: _Keys) -> tuple[_Path, object]:

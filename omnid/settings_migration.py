@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from os import PathLike
 from typing import Any, TypeVar
 
-from omnid.settings import from_table, insert, read_table
+from omnid.settings import from_table, insert
+from omnid.settings_file import read_table
 
 T = TypeVar("T")
 

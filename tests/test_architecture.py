@@ -59,7 +59,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.__main__": "omnid.cli",
     "omnid.api":
         "calib.errors calib.models calib.rig calib.rig_file drivers.errors drivers.frame omnid.config "
-        "omnid.engine omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump omnid.stages",
+        "omnid.config_use omnid.engine omnid.errors omnid.messages omnid.runs omnid.settings omnid.settings_dump "
+        "omnid.stages",
     "omnid.batch": "drivers.logs omnid.errors omnid.report omnid.version",
     "omnid.calibration":
         "calib.boards calib.errors calib.fit calib.masks calib.models calib.panorama calib.rig "
@@ -70,15 +71,16 @@ ARROWS: Mapping[str, str] = {
     "omnid.commands":
         "calib.boards calib.camera_file calib.fit calib.kalibr calib.masks calib.models calib.ocam_file calib.rig "
         "calib.rig_file calib.rig_frame calib.se3 calib.transform_file drivers.cameras drivers.errors drivers.frame "
-        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.controller omnid.core.navigation "
-        "omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics omnid.doctor omnid.engine "
-        "omnid.errors omnid.formats omnid.messages omnid.monitor omnid.navigation_state omnid.recordings "
-        "omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.simulation omnid.sinks "
-        "omnid.stages omnid.transport omnid.viewer omnid.web",
+        "drivers.logs omnid.batch omnid.calibration omnid.config omnid.config_use omnid.controller "
+        "omnid.core.navigation omnid.core.odometry omnid.core.places omnid.core.rig omnid.diagnostics omnid.doctor "
+        "omnid.engine omnid.errors omnid.formats omnid.messages omnid.monitor omnid.navigation_state "
+        "omnid.recordings omnid.report omnid.runs omnid.service omnid.settings omnid.settings_dump omnid.simulation "
+        "omnid.sinks omnid.stages omnid.transport omnid.viewer omnid.web",
     "omnid.config":
-        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation omnid.core.obstacles "
-        "omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.errors omnid.settings "
+        "drivers.cameras drivers.logs omnid.controller omnid.core.control omnid.core.navigation "
+        "omnid.core.obstacles omnid.core.odometry omnid.core.places omnid.core.stereo omnid.engine omnid.settings "
         "omnid.settings_migration omnid.transport",
+    "omnid.config_use": "omnid.config omnid.errors omnid.settings",
     "omnid.controller":
         "drivers.errors drivers.motion drivers.motor drivers.motors drivers.motors.protocols "
         "drivers.motors.simulated omnid.core.control omnid.engine omnid.errors omnid.settings",
@@ -137,9 +139,10 @@ ARROWS: Mapping[str, str] = {
         "omnid.settings_dump omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.sample": "",
     "omnid.service": "calib.errors calib.rig_file omnid.config omnid.errors omnid.settings_dump",
-    "omnid.settings": "calib.bounded_toml omnid.errors",
+    "omnid.settings": "calib.bounded_toml omnid.errors omnid.settings_file",
     "omnid.settings_dump": "omnid.settings",
-    "omnid.settings_migration": "omnid.settings",
+    "omnid.settings_file": "calib.bounded_toml omnid.errors",
+    "omnid.settings_migration": "omnid.settings omnid.settings_file",
     "omnid.simulation":
         "calib.errors calib.models calib.rig calib.se3 calib.validation drivers.cameras drivers.errors "
         "drivers.frame drivers.imu drivers.motion drivers.motor drivers.motors.protocols drivers.motors.simulated "

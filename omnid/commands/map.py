@@ -72,7 +72,8 @@ def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run_build(args: argparse.Namespace) -> int:
     """Replay the logs one after the other, each in the map of those before, and write the map."""
-    from omnid.config import load_config, unused_settings
+    from omnid.config import load_config
+    from omnid.config_use import unused_settings
     from omnid.core.places.place_views import summary
     from omnid.diagnostics.progress import Progress
     from omnid.errors import OmnidError

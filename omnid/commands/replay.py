@@ -63,7 +63,8 @@ def _add_computation(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
-    from omnid.config import load_config, unused_settings
+    from omnid.config import load_config
+    from omnid.config_use import unused_settings
     from omnid.runs.replay import ReplayOptions
 
     options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), span_s=_span_of(args), tum=args.tum,
