@@ -17,6 +17,7 @@ import serial  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
 from drivers.motion import GyroSample
+from drivers.pseudo_terminal import TerminalCheck
 
 START: Final = 0x55
 GYRO: Final = 0x52
@@ -59,7 +60,8 @@ class PacketReader:
 class WitMotionGyro:
     """The gyro on a serial port; its rate and baud rate are those that it was set to by its maker's program.
 
-    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). A port that is gone is opened again.
+    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). A port that is gone is opened again, but
+    no pseudo-terminal that another program has since.
     """
 
     def __init__(self, port: str, baud: int = DEFAULT_BAUD, on_event: Callable[[str], None] = lambda _: None) -> None:
@@ -67,6 +69,8 @@ class WitMotionGyro:
         self._name, self._baud, self._on_event = port, baud, on_event
         self._closed = False
         self._reader = PacketReader()
+        self._terminal = TerminalCheck(port)
+        self._reported = ""  # why the port could not be opened again
         self.restarts = 0
         self._port = self._opened()
 
@@ -116,11 +120,15 @@ class WitMotionGyro:
             time.sleep(READ_S)
         self.restarts += 1
         try:
-            self._port = self._opened()
-        except DriverError:
+            self._port, self._reported = self._opened(), ""
+        except DriverError as error:
             self._port = None
+            if str(error) != self._reported:
+                self._reported = str(error)
+                self._on_event(self._reported)
 
     def _opened(self) -> serial.Serial | None:
+        self._terminal.require_same()
         try:
             return serial.Serial(self._name, self._baud, timeout=READ_S, exclusive=True)
         except (serial.SerialException, OSError, ValueError) as error:

@@ -19,6 +19,7 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
+from drivers.pseudo_terminal import TerminalCheck
 
 CONNECT_TRY_S: Final = 0.2
 STOPS_AT_CLOSE: Final = 3  # tries
@@ -52,7 +53,8 @@ class SerialMotor:
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
     status with watchdog_expired; the command after it drives. A port that is gone is opened again by a later `send`,
-    with growing waits, during which `send` fails at once.
+    with growing waits, during which `send` fails at once. A pseudo-terminal that another program has since is not
+    opened.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class SerialMotor:
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
         self._name, self._baud = port, baud or self._protocol.baud
+        self._terminal = TerminalCheck(port)
         self._timeout_s, self._watchdog_ms = timeout_s, watchdog_ms
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
@@ -185,6 +188,7 @@ class SerialMotor:
             raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
         self._next_open_s = time.monotonic() + self._wait_s
         self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+        self._terminal.require_same()
         self._port = _opened(self._name, self._baud)
 
     def _release(self) -> None:
