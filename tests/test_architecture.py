@@ -91,7 +91,8 @@ ARROWS: Mapping[str, str] = {
     "omnid.core.navigation":
         "omnid.core.control omnid.core.obstacles omnid.core.places omnid.errors omnid.navigation_state "
         "omnid.settings omnid.tracking_state",
-    "omnid.core.obstacles": "omnid.core.mapping omnid.errors omnid.settings",
+    "omnid.core.obstacles":
+        "calib.panorama calib.se3 omnid.core.mapping omnid.core.odometry omnid.errors omnid.settings",
     "omnid.core.odometry":
         "calib.panorama calib.se3 drivers.motion omnid.core omnid.core.stereo omnid.settings omnid.tracking_state",
     "omnid.core.odometry.paper": "calib.se3 omnid.core.odometry omnid.core.stereo omnid.errors omnid.tracking_state",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,11 +14,13 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.obstacles.floor_plane import FloorPlane
+from omnid.core.obstacles.floor_view import FloorCamera
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.obstacles.observation import observe
+from omnid.core.obstacles.observation import observe, with_floor
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
-from omnid.messages import ObstacleRing, OdometryUpdate
+from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS, no_wait
 from omnid.stages.odometry import of_base
@@ -59,6 +62,10 @@ class Obstacles:
         self._settings = ring_settings(geometry, config)
         self._filter, self._tracker = RingFilter(self._settings), MovingTracker()
         self._view = viewpoint(geometry)
+        self._geometry = geometry
+        self._T_rect_base = geometry.rig.T_rect_rig @ se3.inverse(geometry.rig.T_base_rig)
+        self._floor = FloorCamera(geometry.cylinder, self._T_rect_base, self._settings.floor_m)
+        self._plane: FloorPlane | None = None
         self._last_ns: int | None = None
         self._resets = 0
 
@@ -75,12 +82,23 @@ class Obstacles:
         depth = odometry.depth
         points = se3.apply(self._T_base_rig, depth.points)
         seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
+        panoramas = depth.panoramas
+        seen = with_floor(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
         pose = planar(T_odom_base)
-        ring = self._filter.update(odometry.stamp_ns, pose, seen)
+        ring = self._filter.update(odometry.stamp_ns, pose, seen,
+                                   partial(self._floor.view, panoramas.lower, panoramas.visible))
         moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
                             moving)
+
+    def _plane_of(self, panoramas: Panoramas) -> FloorPlane:
+        """Return the plane of the floor in panoramas; all of a run show the same part of the world."""
+        if self._plane is None:
+            geometry = self._geometry
+            self._plane = FloorPlane(geometry.cylinder, self._T_rect_base, self._settings.floor_m,
+                                     geometry.rig.baseline_m, panoramas.visible)
+        return self._plane
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""

@@ -65,6 +65,12 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings) 
     return Observation(result, sigma.astype(np.float32), free.astype(np.float32), floor_from_m)
 
 
+def with_floor(seen: Observation, free_m: Array) -> Observation:
+    """Return the observation with floor (SECTORS,) that was seen otherwise, where no obstacle ends it."""
+    is_found = np.isfinite(seen.ranges_m)
+    return seen._replace(free_m=np.where(is_found, seen.free_m, np.maximum(seen.free_m, free_m)).astype(np.float32))
+
+
 def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> HeightBand:
     """Tell obstacles from floor among points (N, 3), for sigmas (N,) along rays from a viewpoint (3,)."""
     low, high = (settings.floor_m + height for height in settings.heights_m)

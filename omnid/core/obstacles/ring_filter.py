@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths, fill_gaps
-from omnid.core.obstacles.free_space import FreeSpace
+from omnid.core.obstacles.floor_view import FloorView
+from omnid.core.obstacles.free_space import FreeRanges, FreeSpace
 from omnid.core.obstacles.observation import Observation
 from omnid.core.obstacles.settings import RingSettings
 
@@ -24,7 +26,6 @@ SAME_M: Final = 0.12  # and difference in range, beside the noise
 SAME_SIGMAS: Final = 3.0
 BEHIND_M: Final = 0.1  # beyond obstacles.ring.blind_m: from here on a range shows that a nearer obstacle is gone
 NEAR_NS: Final = 60_000_000_000  # for which a nearer obstacle is believed against a range that does not show that
-HIDING_M: Final = 0.35  # range of what hides the floor and shows stereo nothing: how near it is, is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,9 +40,9 @@ class RingPoints:
 class RingFilter:
     """Confirms obstacles by votes, and remembers those whose direction is unknown now.
 
-    An obstacle that too few pairs have seen makes its direction unknown, not free. Something that stereo does not see,
-    but that hides floor which was seen before, counts as an obstacle at HIDING_M until the floor is seen again. All
-    memory is bounded: PAIRS observations, one remembered obstacle a sector.
+    An obstacle that too few pairs have seen makes its direction unknown, not free, and so does what stereo does not
+    see, but what hides floor that was free before. All memory is bounded: PAIRS observations, one remembered obstacle a
+    sector.
     """
 
     def __init__(self, settings: RingSettings) -> None:
@@ -57,8 +58,12 @@ class RingFilter:
         self._free.clear()
         self._memory = None
 
-    def update(self, stamp_ns: int, T_odom_base: Array, seen: Observation) -> Observation:
-        """Return the ring after a pair, whose base frame has the pose T_odom_base (4, 4)."""
+    def update(self, stamp_ns: int, T_odom_base: Array, seen: Observation, view: Callable[[Array], FloorView]
+               ) -> Observation:
+        """Return the ring after a pair, whose base frame has the pose T_odom_base (4, 4).
+
+        view: returns the looks of the floor at places (N, 2) [m] in the base frame.
+        """
         ranges = [np.where(np.isfinite(seen.ranges_m), seen.ranges_m, np.inf).astype(float)]
         sigmas = [np.where(np.isfinite(seen.sigma_m), seen.sigma_m, 0.0).astype(float)]
         stamps = [stamp_ns]
@@ -72,14 +77,15 @@ class RingFilter:
         age_stamps = np.array(stamps, np.int64)[of]
         unknown = ~np.isfinite(accepted) & ~np.isposinf(seen.ranges_m)
         accepted, sigma, age_stamps = self._remembered(stamp_ns, T_odom_base, accepted, sigma, age_stamps, unknown)
-        known = np.isfinite(accepted)
-        result = np.where(known, accepted, np.where(np.isposinf(seen.ranges_m), np.inf, np.nan)).astype(np.float32)
         # An obstacle ends what is known to be free, one that is not confirmed as well.
-        free, is_hidden = self._free.update(stamp_ns, T_odom_base,
-                                            np.minimum(seen.free_m, np.where(known, accepted, np.inf)),
-                                            seen.floor_from_m)
-        free = np.where(known, np.minimum(free, accepted), free)
-        result[is_hidden & ~known] = HIDING_M
+        free_m = np.minimum(seen.free_m, accepted)
+        floor = self._free.update(stamp_ns, T_odom_base, FreeRanges(free_m, accepted), seen.floor_from_m, view)
+        # What is behind something that has come is not known any more.
+        accepted = np.where(floor.hidden_m < accepted, np.inf, accepted)
+        known = np.isfinite(accepted)
+        is_open = np.isposinf(seen.ranges_m) & np.isposinf(floor.hidden_m)
+        result = np.where(known, accepted, np.where(is_open, np.inf, np.nan)).astype(np.float32)
+        free = np.minimum(floor.free_m, accepted)
         is_seen = np.isfinite(seen.ranges_m)
         self._history.append((stamp_ns, self._points(T_odom_base, np.where(is_seen, seen.ranges_m, np.nan),
                                                      sigmas[0], np.full(SECTORS, stamp_ns))))
