@@ -160,6 +160,8 @@ class PlacesConfig:
     localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
     save_s: float = knob(60.0, "time between two saves of the extended map, s; it is also saved at the end",
                          low=1, high=86400)
+    tags: str = knob("", "TOML file of AprilTags (36h11) that are to be landmarks, with names, numbers and sizes; a "
+                     "map knows its own ones")
     limits: PlaceLimits = field(default_factory=PlaceLimits)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
+from omnid.commands.map_option import add_tags_option, tag_settings
 from omnid.commands.map_tags import add_align, add_tags
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     build.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
     build.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
+    add_tags_option(build)
     build.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     build.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(build)
@@ -82,7 +84,7 @@ def run_build(args: argparse.Namespace) -> int:
     from omnid.runs.replay import ReplayOptions, run_log
     from omnid.sinks.files import check_outputs
 
-    config = load_config(args.config, args.overrides)
+    config = load_config(args.config, [*args.overrides, *tag_settings(args)])
     warnings = unused_settings(config, "replay", args.overrides)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
@@ -224,6 +226,8 @@ def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
     yield f"sessions     {sizes.sessions}"
     yield f"keyframes    {sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped"
     yield f"loops        {sizes.loops}"
+    if sizes.tags:
+        yield f"tags         {sizes.tags}, of which {sizes.tags_seen} were seen; `omnid map tags` lists them"
     yield f"path         {sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m"
     if sizes.parts > 1:
         yield f"parts        {sizes.parts}, between which no pose is known"

@@ -1,4 +1,4 @@
-"""The options --map and --localize-only of `omnid run` and `omnid replay`."""
+"""The options --map, --localize-only and --tags of `omnid run` and `omnid replay`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from pathlib import Path
 
 
 def add_map(parser: argparse.ArgumentParser) -> None:
-    """Add --map and --localize-only."""
+    """Add --map, --localize-only and --tags."""
     group = parser.add_argument_group("map of places")
     group.add_argument("--map", type=Path, metavar="FILE.omap", help="localise in a map of places and extend it at "
                        "the end; a file that does not exist is made; the points of the 3-D map are written by "
                        "`omnid replay --cloud FILE.ply`")
     group.add_argument("--localize-only", action="store_true", help="leave the map as it is")
+    add_tags_option(group)
+
+
+def add_tags_option(parser: argparse._ActionsContainer) -> None:
+    """Add --tags."""
+    parser.add_argument("--tags", type=Path, metavar="TAGS.toml", help="AprilTags (36h11) that are to be landmarks of "
+                        "the map, with names, numbers and sizes; the map keeps them")
+
+
+def tag_settings(args: argparse.Namespace) -> list[str]:
+    """Return the settings that --tags sets."""
+    return [] if args.tags is None else [f"places.tags={args.tags}"]
 
 
 def map_settings(args: argparse.Namespace) -> list[str]:
@@ -23,4 +35,4 @@ def map_settings(args: argparse.Namespace) -> list[str]:
         raise OmnidError(f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "
                          "map are written by --cloud FILE.ply")
     settings = [] if args.map is None else [f"places.map={args.map}"]
-    return [*settings, *(["places.localize_only=true"] if args.localize_only else [])]
+    return [*settings, *tag_settings(args), *(["places.localize_only=true"] if args.localize_only else [])]

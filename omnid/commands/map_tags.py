@@ -5,27 +5,35 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.map_option import add_map, map_settings
 
 if TYPE_CHECKING:
+    from omnid.core.places.map_tags import MapTag
+    from omnid.core.places.place_map import PlaceMap
+    from omnid.core.places.place_rig import PlaceRig
+    from omnid.core.places.tags import TagEstimate
     from omnid.engine.telemetry import Telemetry
     from omnid.sinks.tag_collector import TagCollector
     from omnid.stages.geometry import Geometry
 
+# Tags by id, the poses of those that were found, and how many views were refused.
+Found: TypeAlias = "tuple[dict[int, MapTag], dict[int, TagEstimate], int]"
 LARGEST_M = 0.3  # that may be left at a landmark: beyond it, a number was mistaken
 
 
 def add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `map tags`."""
-    tags = actions.add_parser("tags", help="the poses of AprilTags (36h11) that a log shows, as landmarks with names")
-    tags.add_argument("log", type=Path, metavar="LOG", help="as of `omnid replay`")
-    tags.add_argument("--tag", action="append", required=True, metavar="ID=SIZE", help="number of a tag and the edge "
-                      "of its black square, m; may be repeated")
+    tags = actions.add_parser("tags", help="AprilTags (36h11) as landmarks with names: those of a map, or those that a "
+                              "log shows")
+    tags.add_argument("source", type=Path, metavar="FILE.omap|LOG", help="a map, or a log as of `omnid replay`")
+    tags.add_argument("--tag", action="append", default=[], metavar="ID=SIZE", help="of a log: number of a tag and the "
+                      "edge of its black square, m; may be repeated")
     tags.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     tags.add_argument("--write", type=Path, metavar="TAGS.toml", help="write them as landmarks, for `omnid map align`")
     add_map(tags)
@@ -38,8 +46,8 @@ def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add `map align`."""
     parser = actions.add_parser("align", help="move a map into the axes of a plan of the building, by known AprilTags")
     parser.add_argument("map", type=Path, metavar="FILE.omap")
-    parser.add_argument("--seen", type=Path, required=True, metavar="TAGS.toml", help="the tags in the map, as written "
-                        "by `omnid map tags LOG --map FILE.omap --localize-only --write TAGS.toml`")
+    parser.add_argument("--seen", type=Path, metavar="TAGS.toml", help="the tags in the map, as written by `omnid map "
+                        "tags LOG --map FILE.omap --localize-only --write TAGS.toml`; default: those of the map")
     parser.add_argument("--known", type=Path, required=True, metavar="PLAN.toml", help="the same tags on the plan: x, "
                         "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
@@ -48,63 +56,109 @@ def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run_tags(args: argparse.Namespace) -> int:
     """Print the poses of the tags; return 1 if one was not found."""
-    import numpy as np
-
-    from calib import se3
-    from omnid.config import load_config
     from omnid.core.places.alignment import landmark
-    from omnid.engine.flow import Slot
     from omnid.formats.landmark_file import write_landmarks
-    from omnid.runs.replay import ReplayOptions, run_log
     from omnid.sinks.files import check_outputs
-    from omnid.sinks.tag_collector import TagCollector
 
-    sizes_m = _sizes_m(args.tag)
     if args.write is not None:
-        check_outputs([("--write", args.write)], [("the log that is read", args.log)])
-    config = load_config(args.config, [*args.overrides, *map_settings(args)])
-    collector: Slot[TagCollector] = Slot()
-
-    def observer(geometry: Geometry, _: Telemetry) -> TagCollector:
-        collector.put(TagCollector(geometry, sizes_m))
-        return cast("TagCollector", collector.get())
-
-    result = run_log(args.log, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))
-    for warning in result.warnings:
-        print(f"omnid: warning: {warning}", file=sys.stderr)
-    found = cast("TagCollector", collector.get())
-    rows = [{"id": id, "xyz_m": tag.T[:3, 3].tolist(), "quaternion_xyzw": se3.quaternion(tag.T[:3, :3]).tolist(),
-             "sigma_m": float(np.sqrt(np.trace(tag.covariance[:3, :3]) / 3)),
-             "sigma_deg": float(np.degrees(np.sqrt(np.trace(tag.covariance[3:, 3:]) / 3))),
-             "views": tag.views, "rejected": tag.rejected} for id, tag in found.tags().items()]
+        check_outputs([("--write", args.write)], [("the file that is read", args.source)])
+    tags, found, refused = _of_map(args) if args.source.suffix == ".omap" else _of_log(args)
+    rows = [_row(tags[id], tag) for id, tag in found.items()]
     if args.json:
-        print_json({"tags": rows, "refused": found.refused})
+        print_json({"tags": rows, "refused": refused})
     else:
         print(*_tag_lines(rows), sep="\n")
     if args.write is not None:
-        write_landmarks(args.write, [landmark(id, sizes_m[id], tag.T) for id, tag in found.tags().items()])
-    missing = sizes_m.keys() - {row["id"] for row in rows}
+        write_landmarks(args.write, [replace(landmark(id, tags[id].size_m, tag.T), name=tags[id].name)
+                                     for id, tag in found.items()])
+    missing = tags.keys() - found.keys()
     if missing:
-        print(f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {found.refused} views were of another size",
+        print(f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {refused} views were of another size",
               file=sys.stderr)
     return int(bool(missing))
 
 
+def _of_map(args: argparse.Namespace) -> Found:
+    """Return the tags of a map, their poses, and 0."""
+    from omnid.errors import OmnidError
+    from omnid.formats.place_file import read_places
+
+    if args.tag or args.tags or args.rig or args.map:
+        raise OmnidError(f"map tags {args.source}: --tag, --tags, --rig and --map belong to a log: leave them out, "
+                         "or name a log instead of the map")
+    places, rig = read_places(args.source)
+    return places.tags.known, _tags_of(places, rig), 0
+
+
+def _tags_of(places: PlaceMap, rig: PlaceRig) -> dict[int, TagEstimate]:
+    """Return the poses of the tags of a map, in the axes of the base at its start."""
+    return {id: replace(tag, T=rig.T_base_rect @ tag.T)
+            for id, tag in places.tags.all_located(places.poses).items()}
+
+
+def _of_log(args: argparse.Namespace) -> Found:
+    """Return the tags that are asked for, the poses of those that a log shows, and how many views were refused."""
+    from omnid.config import load_config
+    from omnid.core.places.map_tags import MapTag
+    from omnid.engine.flow import Slot
+    from omnid.errors import OmnidError
+    from omnid.formats.landmark_file import read_tags
+    from omnid.runs.replay import ReplayOptions, run_log
+    from omnid.sinks.tag_collector import TagCollector
+
+    tags = {} if args.tags is None else read_tags(args.tags)
+    tags |= {id: MapTag(id, str(id), size_m) for id, size_m in _sizes_m(args.tag).items()}
+    if not tags:
+        raise OmnidError(f"map tags {args.source}: expected --tag ID=SIZE for each tag that a log shows, such as "
+                         "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap")
+    config = load_config(args.config, [*args.overrides, *map_settings(args)])
+    collector: Slot[TagCollector] = Slot()
+
+    def observer(geometry: Geometry, _: Telemetry) -> TagCollector:
+        collector.put(TagCollector(geometry, {id: tag.size_m for id, tag in tags.items()}))
+        return cast("TagCollector", collector.get())
+
+    result = run_log(args.source, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))
+    for warning in result.warnings:
+        print(f"omnid: warning: {warning}", file=sys.stderr)
+    seen = cast("TagCollector", collector.get())
+    return tags, seen.tags(), seen.refused
+
+
+def _row(tag: MapTag, found: TagEstimate) -> dict[str, Any]:
+    """Return a tag as a row for the user."""
+    import numpy as np
+
+    from calib import se3
+
+    return {"id": tag.id, "name": tag.name, "size_m": tag.size_m, "xyz_m": found.T[:3, 3].tolist(),
+            "quaternion_xyzw": se3.quaternion(found.T[:3, :3]).tolist(),
+            "sigma_m": float(np.sqrt(np.trace(found.covariance[:3, :3]) / 3)),
+            "sigma_deg": float(np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:]) / 3))),
+            "views": found.views, "rejected": found.rejected}
+
+
 def run_align(args: argparse.Namespace) -> int:
     """Write the map in the axes of the plan."""
-    from omnid.core.places.alignment import align, fit
+    from omnid.core.places.alignment import align, fit, landmark
     from omnid.errors import OmnidError
     from omnid.formats.landmark_file import read_landmarks
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs
 
-    check_outputs([("-o", args.output)], [("--seen", args.seen), ("--known", args.known)])
-    seen, known = read_landmarks(args.seen), read_landmarks(args.known)
+    given = [] if args.seen is None else [("--seen", args.seen)]
+    check_outputs([("-o", args.output)], [*given, ("--known", args.known)])
+    known = read_landmarks(args.known)
     places, rig = read_places(args.map)
+    if args.seen is not None:
+        seen, source = read_landmarks(args.seen), args.seen
+    else:
+        seen = {id: landmark(id, places.tags.known[id].size_m, tag.T) for id, tag in _tags_of(places, rig).items()}
+        source = args.map
     try:
         T_plan_map, left_m = fit(seen, known)
     except ValueError as error:
-        raise OmnidError(f"map align: {args.seen} and {args.known} have {len(seen.keys() & known.keys())} tags in "
+        raise OmnidError(f"map align: {source} and {args.known} have {len(seen.keys() & known.keys())} tags in "
                          f"common: {error}") from None
     worst = max(left_m, key=lambda id: left_m[id])
     if left_m[worst] > LARGEST_M:
@@ -119,8 +173,8 @@ def run_align(args: argparse.Namespace) -> int:
 
 def _sizes_m(words: list[str]) -> dict[int, float]:
     """Return the sizes of "5=0.2" by their tags. Raises OmnidError."""
+    from omnid.core.places.tags import MAX_TAG, SIZES_M
     from omnid.errors import OmnidError
-    from omnid.formats.landmark_file import MAX_TAG, SIZES_M
 
     sizes: dict[int, float] = {}
     for word in words:
@@ -136,8 +190,9 @@ def _sizes_m(words: list[str]) -> dict[int, float]:
 
 
 def _tag_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    yield f"{'tag':>4}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}{'rejected':>10}"
+    yield (f"{'tag':>4}  {'name':<16}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}"
+           f"{'rejected':>10}")
     for row in rows:
         x, y, z = row["xyz_m"]
-        yield (f"{row['id']:>4}{x:>10.3f}{y:>10.3f}{z:>10.3f}{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}"
-               f"{row['views']:>7}{row['rejected']:>10}")
+        yield (f"{row['id']:>4}  {row['name']:<16}{x:>10.3f}{y:>10.3f}{z:>10.3f}"
+               f"{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}{row['views']:>7}{row['rejected']:>10}")

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Set
 from contextlib import closing
 from glob import escape
 from pathlib import Path
@@ -18,19 +19,23 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.places.map_tags import MAX_VIEWS, TagView
 from omnid.core.places.place_map import UNUSED, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
+from omnid.core.places.tags import MAX_TAG
 from omnid.errors import OmnidError
 from omnid.formats import place_rows
 from omnid.formats.place_rows import BadRowError
 
-VERSION: Final = 2  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+VERSION: Final = 3  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
+WITHOUT_TAGS: Final = 2  # the version before, which is read as well
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
 MAX_VALUE_BYTES: Final = 1 << 20  # of one value in the database
 MAX_KEYFRAMES: Final = 100_000
 MAX_LINKS: Final = 1_000_000
+MAX_TAG_VIEWS: Final = 100_000
 MAX_STEPS: Final = 50  # blocks of a million instructions that SQLite may take to read a map
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
@@ -38,9 +43,15 @@ SCHEMA: Final = {
                 "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
                 "crc32 INTEGER)",
     "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
-    "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, width INTEGER, height INTEGER, "
+    "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, tags INTEGER, tag_views INTEGER, "
+           "width INTEGER, height INTEGER, "
            "row0 REAL, baseline_m REAL, T_rig_rect BLOB, T_base_rig BLOB, rig_hash TEXT, crc32 INTEGER)",
+    "tag": "CREATE TABLE tag (id INTEGER PRIMARY KEY, name TEXT, size_m REAL, crc32 INTEGER)",
+    "tag_view": "CREATE TABLE tag_view (keyframe INTEGER, tag INTEGER, T_rect_tag BLOB, covariance BLOB, "
+                "crc32 INTEGER)",
 }
+SCHEMA_2: Final = {"keyframe": SCHEMA["keyframe"], "link": SCHEMA["link"],
+                   "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", "")}
 
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
@@ -71,10 +82,10 @@ def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMa
     Raises OmnidError, in one line, for any file that is no whole map.
     """
     path = Path(path)
-    _require_map(path)
+    version = _version_of(path)
     try:
         with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
-            return _read(_Reader(database), PlaceMap() if into is None else into)
+            return _read(_Reader(database, version), PlaceMap() if into is None else into)
     except BadRowError as error:
         raise OmnidError(f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
                          ) from error
@@ -83,8 +94,8 @@ def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMa
                          "with `omnid map build`") from error
 
 
-def _require_map(path: Path) -> None:
-    """Check the header: that of an SQLite database, ours, of this version."""
+def _version_of(path: Path) -> int:
+    """Return the version in the header, once it is that of an SQLite database, ours, of a version that is read."""
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -94,11 +105,12 @@ def _require_map(path: Path) -> None:
     if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
     version = int.from_bytes(header[60:64])
-    if version != VERSION:
+    if version not in (WITHOUT_TAGS, VERSION):
         raise OmnidError(f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
                          "`omnid map build`, or update omnid")
     if size > MAX_FILE_BYTES:
         raise OmnidError(f"{path}: expected a map of at most {MAX_FILE_BYTES >> 20} MB, found {size >> 20} MB")
+    return version
 
 
 def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
@@ -116,7 +128,9 @@ def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
                      for id in ids)
         _insert(database, "keyframe", keyframes)
         _insert(database, "link", (place_rows.link_row(link) for link in places.links))
-        _insert(database, "map", [place_rows.map_row(rig, len(ids), len(places.links), places.dropped)])
+        _insert(database, "tag", (place_rows.tag_row(places.tags.known[id]) for id in sorted(places.tags.known)))
+        _insert(database, "tag_view", (place_rows.tag_view_row(view) for view in places.tags.views))
+        _insert(database, "map", [place_rows.map_row(rig, places)])
         database.execute("COMMIT")
 
 
@@ -146,14 +160,15 @@ def _sync(path: Path) -> None:
 class _Reader:
     """Rows of a database that may be hostile: bounded work, no code of the file, checked sums."""
 
-    def __init__(self, database: sqlite3.Connection) -> None:
-        self._database, self._steps = database, 0
+    def __init__(self, database: sqlite3.Connection, version: int) -> None:
+        self._database, self._steps, self.version = database, 0, version
+        schema = SCHEMA if version == VERSION else SCHEMA_2
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         database.set_progress_handler(self._too_long, 1_000_000)
         for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
             database.execute(f"PRAGMA {setting}")
-        found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(SCHEMA) + 1))
-        if found != SCHEMA:
+        found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
+        if found != schema:
             raise BadRowError("its tables are not those of a map")
 
     def rows(self, table: str, most: int) -> Iterator[place_rows.Row]:
@@ -175,10 +190,14 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
     heads = list(reader.rows("map", 1))
     if not heads:
         raise BadRowError("the table map is empty")
-    head = place_rows.read_map_row(heads[0])
+    has_tags = reader.version == VERSION
+    head = place_rows.read_map_row(heads[0] if has_tags else place_rows.head_of_version_2(heads[0]))
     keyframes = [place_rows.read_keyframe_row(row, head.rig) for row in reader.rows("keyframe", MAX_KEYFRAMES)]
     links = [place_rows.read_link_row(row) for row in reader.rows("link", MAX_LINKS)]
-    for name, found, expected in (("keyframes", len(keyframes), head.keyframes), ("links", len(links), head.links)):
+    tags = [place_rows.read_tag_row(row) for row in reader.rows("tag", MAX_TAG + 1)] if has_tags else []
+    views = [place_rows.read_tag_view_row(row) for row in reader.rows("tag_view", MAX_TAG_VIEWS)] if has_tags else []
+    for name, found, expected in (("keyframes", len(keyframes), head.keyframes), ("links", len(links), head.links),
+                                  ("tags", len(tags), head.tags), ("views of tags", len(views), head.tag_views)):
         if found != expected:
             raise BadRowError(f"expected {expected} {name}, found {found}")
     _check([(keyframe, T_map_rect) for keyframe, T_map_rect, _ in keyframes], links)
@@ -187,7 +206,20 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
         if use != UNUSED:
             places.uses[keyframe.id] = use
     places.links, places.dropped = links, head.dropped
+    _check_views(views, {tag.id for tag in tags}, places.keyframes.keys())
+    places.tags.known = {tag.id: tag for tag in tags}
+    places.tags.views = views
     return places, head.rig
+
+
+def _check_views(views: list[TagView], tags: Set[int], keyframes: Set[int]) -> None:
+    """Check poses and covariances of views, and that they are of tags and keyframes of the map."""
+    if any(view.tag not in tags or view.keyframe not in keyframes for view in views):
+        raise BadRowError("a view of a tag is of no tag, or of no keyframe")
+    if any(count > MAX_VIEWS for count in Counter(view.tag for view in views).values()):
+        raise BadRowError(f"a tag has more than {MAX_VIEWS} views")
+    place_rows.require_rigid([view.T_rect_tag for view in views])
+    place_rows.require_covariances([view.covariance for view in views], place_rows.LEAST_VARIANCE)
 
 
 def _check(keyframes: list[tuple[PlaceKeyframe, NDArray[np.float64]]], links: list[Link]) -> None:

@@ -12,8 +12,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe
+from omnid.core.places.map_tags import MapTag, TagView
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
+from omnid.core.places.tags import MAX_NAME, MAX_TAG, SIZES_M
 
 Array = NDArray[np.float64]
 Row: TypeAlias = tuple[Any, ...]
@@ -42,6 +44,8 @@ class Head(NamedTuple):
     keyframes: int
     links: int
     dropped: int
+    tags: int
+    tag_views: int
 
 
 def checksum(row: Row) -> int:
@@ -66,22 +70,38 @@ def link_row(link: Link) -> Row:
     return link.a, link.b, link.inliers, _bytes(link.T_a_b[:3], "<f8"), _bytes(link.covariance, "<f8")
 
 
-def map_row(rig: PlaceRig, keyframes: int, links: int, dropped: int) -> Row:
+def tag_row(tag: MapTag) -> Row:
+    """Return the row of a tag."""
+    return tag.id, tag.name, float(tag.size_m)
+
+
+def tag_view_row(view: TagView) -> Row:
+    """Return the row of a view of a tag."""
+    return view.keyframe, view.tag, _bytes(view.T_rect_tag[:3], "<f8"), _bytes(view.covariance, "<f8")
+
+
+def map_row(rig: PlaceRig, places: PlaceMap) -> Row:
     """Return the row of the table `map`."""
-    return (keyframes, links, dropped, rig.cylinder.width, rig.cylinder.height, float(rig.cylinder.row0),
+    return (len(places.keyframes), len(places.links), places.dropped, len(places.tags.known),
+            len(places.tags.views), rig.cylinder.width, rig.cylinder.height, float(rig.cylinder.row0),
             float(rig.baseline_m), _bytes(rig.T_rig_rect[:3], "<f8"), _bytes(rig.T_base_rig[:3], "<f8"), rig.rig_hash)
 
 
 def read_map_row(row: Row) -> Head:
     """Return the head of a map. Raises BadRowError."""
-    keyframes, links, dropped, width, height, row0, baseline_m, T_rig_rect, T_base_rig, rig_hash = row
+    keyframes, links, dropped, tags, tag_views, width, height, row0, baseline_m, T_rig_rect, T_base_rig, rig_hash = row
     if not isinstance(rig_hash, str) or len(rig_hash) > MAX_HASH or not rig_hash.isalnum():
         raise BadRowError("the hash of the rig is none")
     cylinder = Cylinder(_integer(width, 1, MAX_PIXELS), _integer(height, 1, MAX_PIXELS), _number(row0, -1e6, 1e6))
     rig = PlaceRig(cylinder, _number(baseline_m, *BASELINES_M), _transform(T_rig_rect), _transform(T_base_rig),
                    rig_hash)
     require_rigid([rig.T_rig_rect, rig.T_base_rig])
-    return Head(rig, _integer(keyframes), _integer(links), _integer(dropped))
+    return Head(rig, _integer(keyframes), _integer(links), _integer(dropped), _integer(tags), _integer(tag_views))
+
+
+def head_of_version_2(row: Row) -> Row:
+    """Return the row `map` of version 2, which had no tags, as one of today."""
+    return (*row[:3], 0, 0, *row[3:])
 
 
 def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array, KeyframeUse]:
@@ -112,6 +132,20 @@ def read_link_row(row: Row) -> Link:
     """Return a link. Raises BadRowError. Its pose and covariance are not checked."""
     a, b, inliers, T_a_b, covariance = row
     return Link(_integer(a), _integer(b), _transform(T_a_b), _array(covariance, "<f8", (6, 6)), _integer(inliers))
+
+
+def read_tag_row(row: Row) -> MapTag:
+    """Return a tag. Raises BadRowError."""
+    id, name, size_m = row
+    if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():
+        raise BadRowError("the name of a tag is none")
+    return MapTag(_integer(id, 0, MAX_TAG), name, _number(size_m, *SIZES_M))
+
+
+def read_tag_view_row(row: Row) -> TagView:
+    """Return a view of a tag. Raises BadRowError. Its pose and covariance are not checked."""
+    keyframe, tag, T_rect_tag, covariance = row
+    return TagView(_integer(keyframe), _integer(tag), _transform(T_rect_tag), _array(covariance, "<f8", (6, 6)))
 
 
 def require_rigid(transforms: Sequence[Array]) -> None:

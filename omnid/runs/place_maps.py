@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
+from omnid.core.places.map_tags import MapTag
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig, seen_by
 from omnid.core.places.place_views import keep_only, parts
 from omnid.errors import OmnidError
+from omnid.formats.landmark_file import read_tags
 from omnid.formats.place_file import read_places, write_places
 from omnid.runs.pipeline import Sinks
 from omnid.sinks.files import check_outputs
@@ -40,7 +42,7 @@ class RunPlaces:
         A file that does not exist is made by this run, unless it only localises.
         Raises OmnidError for a file that is no map, or that of another rig.
         """
-        settings, self._warn = config.places, warn
+        settings, self._warn, self._tags = config.places, warn, config.places.tags
         _require_consistent(settings)
         self._path = Path(settings.map) if settings.map and given is None and not build else None
         self._writes = self._path is not None and not settings.localize_only
@@ -52,11 +54,25 @@ class RunPlaces:
             self._warn(f"{self._path}: there is no such map: this run begins a new one")
         elif self._path is not None:
             given = RigPlaces(*read_places(self._path, new_places(settings)))
-        self.places = given.places if given else new_places(settings) if build or begins else None
+        tags = read_tags(Path(settings.tags)) if settings.tags else {}
+        begins = begins or build
+        self.places = given.places if given else new_places(settings) if begins or tags else None
+        self._is_kept = given is not None or begins
+        if self.places is not None:
+            self._know(tags, self.places)
         self._saved = frozenset[int]()  # keyframes in the file
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         if given is not None and self._known:
             self._compare(given)
+
+    def _know(self, tags: Mapping[int, MapTag], places: PlaceMap) -> None:
+        """Let the map know the tags of the settings, under their names there."""
+        for id, tag in tags.items():
+            known = places.tags.known.get(id)
+            if known is not None and known.size_m != tag.size_m:
+                raise OmnidError(f"places.tags {self._tags}: tag {id} ({tag.name}) has an edge of {tag.size_m:g} m, "
+                                 f"but {known.size_m:g} m in the map: correct it, or leave the tag out")
+        places.tags.known |= tags
 
     def known_to(self, sinks: Sinks) -> Sinks:
         """Return the sinks of the run with this map, if there is one."""
@@ -98,7 +114,7 @@ class RunPlaces:
 
         Raises OmnidError if the file cannot be written.
         """
-        if self.places is None:
+        if self.places is None or not self._is_kept:
             return None
         joined = self._joined(self.places)
         new = len(joined - self._known)
@@ -145,5 +161,7 @@ def _unmasked(camera: MountedCamera) -> MountedCamera:
 def _require_consistent(settings: PlacesConfig) -> None:
     if settings.map and not settings.enabled:
         raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
+    if settings.tags and not settings.enabled:
+        raise OmnidError("places.tags needs places.enabled = true: leave one of them out")
     if settings.localize_only and not settings.map:
         raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")

@@ -48,6 +48,37 @@ def test_a_tag_is_located_in_the_map(omnid: Command, tagged: Path, tmp_path: Pat
     assert mark.size_m == EDGE_M and mark.facing_rad is not None and abs(mark.facing_rad + np.pi / 2) < 0.1
 
 
+TAGS = f'schema = 1\n[tag."door 5"]\nid = 5\nsize_m = {EDGE_M}\n'
+
+
+def test_a_map_keeps_its_tags_and_is_aligned_by_them(omnid: Command, tagged: Path, tmp_path: Path) -> None:
+    (tmp_path / "tags.toml").write_text(TAGS)
+    omap, rig = tmp_path / "a.omap", tagged / "rig.toml"
+    code, out, err = omnid("map", "build", tagged / "log.mcap", "-o", omap, "--rig", rig, "--tags",
+                           tmp_path / "tags.toml", "--quiet")
+    assert code == 0 and "tags         1, of which 1 were seen" in out and not err
+    code, out, _ = omnid("map", "tags", omap, "--json")
+    [found] = json.loads(out)["tags"]
+    assert code == 0 and found["id"] == 5 and found["name"] == "door 5" and found["views"] >= 2
+    assert np.linalg.norm(np.array(found["xyz_m"]) - AT_START) < 0.02
+    assert "door 5" in omnid("map", "tags", omap).out
+    # On the plan it hangs at (7, 8) and faces x.
+    (tmp_path / "plan.toml").write_text(TAGS + "xyz_m = [7, 8, 1]\nfacing_deg = 0\n")
+    aligned = tmp_path / "b.omap"
+    assert omnid("map", "align", omap, "--known", tmp_path / "plan.toml", "-o", aligned).code == 0
+    [moved] = json.loads(omnid("map", "tags", aligned, "--json").out)["tags"]
+    np.testing.assert_allclose(moved["xyz_m"], [7, 8, 1], atol=1e-6)
+    # A run in the map knows its tags, and refuses another size.
+    result = omnid.replay(tagged / "log.mcap", "--map", omap, "--localize-only", rig=rig)
+    assert result.code == 0 and result.count("tags_seen") == 1
+    (tmp_path / "tags.toml").write_text(TAGS.replace(f"= {EDGE_M}", "= 0.5"))
+    error = omnid.refused("replay", tagged / "log.mcap", "--rig", rig, "--quiet", "--map", omap, "--tags",
+                          tmp_path / "tags.toml")
+    assert "tag 5 (door 5) has an edge of 0.5 m, but 0.6 m in the map" in error
+    assert "belong to a log" in omnid.refused("map", "tags", omap, "--tag", "5=0.6")
+    assert "expected --tag ID=SIZE" in omnid.refused("map", "tags", tagged / "log.mcap")
+
+
 def test_wrong_sizes_are_one_line(omnid: Command, tagged: Path) -> None:
     for word, message in (("5", "expected ID=SIZE"), ("5=x", "expected ID=SIZE"), ("900=0.2", "0 to 586"),
                           ("5=0", "0.005 to 10 m"), ("5=nan", "0.005 to 10 m")):

@@ -22,6 +22,8 @@ KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
 SURE_INLIERS: Final = 24  # of recognitions that count without motion: a robot may stand
+TAG_SAME_M, TAG_SAME_RAD = 0.5, math.radians(12)  # the same of poses by a tag, whose direction is less certain,
+TAG_SQUARED: Final = 16.8  # and their squared Mahalanobis distance: 99 % of chi-squared, 6 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +43,11 @@ class Hypothesis:
     def T_map_odom(self, poses: Mapping[int, Array]) -> Array:
         """Return the pose of odom in the map of these poses of keyframes."""
         return np.asarray(self.T_map_rect(poses) @ se3.inverse(self.T_odom_rect))
+
+    @property
+    def is_sure(self) -> bool:
+        """True if it counts without motion since the one before."""
+        return self.recognition.by_tag or self.recognition.inliers >= SURE_INLIERS
 
     def link(self) -> Link:
         """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
@@ -76,7 +83,7 @@ class Hypotheses:
         self._kept.append(new)
         distinct: list[Hypothesis] = []
         for one in (*(kept for kept in known if _consistent(kept, new, poses)), new):
-            if one.recognition.inliers >= SURE_INLIERS or all(_apart(one, other) for other in distinct):
+            if one.is_sure or all(_apart(one, other) for other in distinct):
                 distinct.append(one)
         return distinct if len(distinct) >= CONSISTENT else []
 
@@ -84,7 +91,15 @@ class Hypotheses:
 def _consistent(a: Hypothesis, b: Hypothesis, poses: Mapping[int, Array]) -> bool:
     """True if both place the newer frame at the same pose in the map."""
     difference = se3.inverse(a.T_map_odom(poses) @ b.T_odom_rect) @ b.T_map_rect(poses)
-    return length_m(difference) < SAME_M and angle_rad(difference) < SAME_RAD
+    if not (a.recognition.by_tag or b.recognition.by_tag):
+        return length_m(difference) < SAME_M and angle_rad(difference) < SAME_RAD
+    if length_m(difference) >= TAG_SAME_M or angle_rad(difference) >= TAG_SAME_RAD:
+        return False
+    # The odometry between both frames is far more certain than a tag.
+    A = se3.adjoint(se3.inverse(a.T_odom_rect) @ b.T_odom_rect)
+    S = b.recognition.covariance + np.linalg.inv(A) @ a.recognition.covariance @ np.linalg.inv(A).T
+    error = se3.log(difference)
+    return bool(error @ np.linalg.solve(S, error) < TAG_SQUARED)
 
 
 def _apart(a: Hypothesis, b: Hypothesis) -> bool:

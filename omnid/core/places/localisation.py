@@ -27,6 +27,8 @@ from omnid.core.places.place_search import Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
 from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.core.places.signature import Thumbnail, thumbnail
+from omnid.core.places.tag_recognition import TagRecogniser
+from omnid.core.places.tags import TagPose
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
@@ -42,6 +44,7 @@ TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
 GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
 FAILED_SEARCHES: Final = 3  # one after the other, after which range scans are compared, if the settings say so
+TAG_SIGMAS: Final = 3.0  # by which a pose that a tag told may err
 RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
 
 
@@ -86,6 +89,7 @@ class MapLocaliser:
         self.places.bound(len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
                           round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed))
         self.search = PlaceSearch(model)
+        self._tags = TagRecogniser(model, self.places) if self.places.tags else None
         self.correction = MapCorrection(self.places)
         self.ageing = Ageing(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
@@ -99,6 +103,7 @@ class MapLocaliser:
         self._path_m = 0.0
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
+        self._by_tag = False  # it was a tag, which tells the pose less exactly than a view
         self._last_T: Array | None = None
         self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
         self._failed = 0  # searches of this part that found nothing
@@ -116,14 +121,16 @@ class MapLocaliser:
             small = thumbnail(frame.stereo.lower.panorama)
             features = describe(frame.stereo)
             # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
-            found = self._recognise(frame, small, features)
+            tags = self._tags.find(frame.stereo) if self._tags else []
+            found = self._recognise(frame, small, features, tags)
             # 2. Keep the keyframe, linked to the one before by odometry.
             if is_keyframe:
-                self._add(frame, small, features)
+                self._add(frame, small, features, tags)
             # 3. Correct the map where several frames agree.
             if found is not None and self._newest is not None:
                 self._close_loop(frame, found, self._newest)
-                self._age(found)
+                if not found.by_tag:
+                    self._age(found)
         # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
         if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
@@ -137,8 +144,15 @@ class MapLocaliser:
         return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
                 "dropped": self.places.dropped, "aged": self.ageing.aged, "rejected": self.correction.rejected,
                 "unjoined": len(set(self._part_of.values())) - 1 if self._part_of else 0,
-                "ambiguous": self.search.ambiguous, "refused": self.search.refused} | (
+                "ambiguous": self.search.ambiguous, "refused": self.search.refused} | self._counts_of_tags() | (
                     {} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
+
+    def _counts_of_tags(self) -> dict[str, int]:
+        if self._tags is None:
+            return {}
+        return {"tags_seen": len({view.tag for view in self.places.tags.views}),
+                "tag_views": len(self.places.tags.views), "tag_views_forgotten": self.places.tags.forgotten,
+                "tags_ambiguous": self._tags.ambiguous, "tags_of_other_size": self._tags.refused}
 
     def map(self) -> PlaceMap:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
@@ -190,18 +204,35 @@ class MapLocaliser:
         """True if a keyframe holds what recognises it."""
         return len(self.places.keyframes[id].features.views) > 0
 
-    def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
+    def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
+                   ) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
         self._searched = frame.stamp_ns, frame.T_odom_rect
-        found = self.search.near(small, features, self.places, self._expected(frame))
+        expected = self._expected(frame)
+        found = self.search.near(small, features, self.places, expected)
         if found is None and (far := self._elsewhere()):
             by_scan = None if self._by_scan is None else self._by_scan.T_map_rect(frame.T_odom_rect)
             found = self.search.far(small, features, self.places, far, by_scan)
+        if found is None and tags and self._tags is not None:
+            found = self._recognise_by_tag(self._tags, tags, expected)
         if found is not None:
             self._failed = 0
         elif len(features.views) >= MIN_MATCHES:  # in the dark there is nothing to fail
             self._failed += 1
         return found
+
+    def _recognise_by_tag(self, recogniser: TagRecogniser, tags: list[TagPose], expected: Expected
+                          ) -> Recognition | None:
+        """Return the place of a frame by a tag: as odometry expects it, else in the oldest other part that has it."""
+        near = recogniser.recognise(tags, expected.error_m)
+        if near is not None:
+            return self.search.expected_only(near, self.places, expected)
+        far = self._elsewhere()
+        for part in sorted({self._part_of[id] for id in far}):
+            found = recogniser.recognise(tags, {id for id in far if self._part_of[id] == part})
+            if found is not None:
+                return found
+        return None
 
     def _proposed(self, frame: OdometryFrame) -> list[Array]:
         """Return the poses (4, 4) in the map that the last search suggests for a frame, ambiguous ones too."""
@@ -221,12 +252,16 @@ class MapLocaliser:
             path_m, at = self._recognised_at
             apart_m = np.linalg.norm(self.places.positions(ids) - at, axis=1)
             drift_m = np.minimum(drift_m, self._path_m - path_m + apart_m)
-        error_m = dict(zip(ids, (GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
-        error_rad = dict(zip(ids, (GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
+        # A pose by a tag may err by more than odometry since then.
+        covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
+        sigmas = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])]) if self._by_tag else np.zeros(2)
+        slack_m, slack_rad = (TAG_SIGMAS * sigmas).tolist()
+        error_m = dict(zip(ids, (slack_m + GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
+        error_rad = dict(zip(ids, (slack_rad + GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
         return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
 
-    def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
-        """Add a keyframe to the map."""
+    def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]) -> None:
+        """Add a keyframe to the map, with the tags that it shows."""
         if self._localize_only:
             features = PlaceFeatures(features.descriptors[:0], features.views[:0])
             ties = [id for id in self.places.keyframes if id not in self._fixed]
@@ -239,6 +274,8 @@ class MapLocaliser:
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._part_of[keyframe.id], self._path_at[keyframe.id] = self._part, self._path_m
         self._newest = keyframe
+        if self._tags is not None and not self._localize_only:
+            self.places.tags.add(self._tags.views(tags, keyframe.id))
         self._forget_dropped()
 
     def _forget_dropped(self) -> None:
@@ -272,6 +309,7 @@ class MapLocaliser:
         self.correction.close([link for link in links if link.a != link.b], part, self._fixed)
         self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
+        self._by_tag = found.by_tag
 
     def _join(self, other: int, T_map_odom: Array) -> None:
         """Join this part of the map with another one, in whose frame T_map_odom is given; the older one stays."""

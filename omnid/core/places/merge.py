@@ -50,6 +50,7 @@ def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:
     places.poses |= {id: T_map_other @ T for id, T in renumbered.poses.items()}
     places.links += renumbered.links
     places.uses |= renumbered.uses
+    places.tags.join(renumbered.tags, int)
     places.dropped += renumbered.dropped
     MapCorrection(places).close([loops[n] for n in best], sorted(places.keyframes))
     return len(best)
@@ -65,6 +66,7 @@ def _renumbered(other: PlaceMap, places: PlaceMap) -> PlaceMap:
     found.poses = {new[id]: other.poses[id] for id in new}
     found.links = [replace(link, a=new[link.a], b=new[link.b]) for link in other.links]
     found.uses = {new[id]: use for id, use in other.uses.items()}
+    found.tags.join(other.tags, new.__getitem__)
     found.dropped = other.dropped
     return found
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calib import se3
+from omnid.core.places.map_tags import MapTags
 
 Array = NDArray[np.float64]
 
@@ -96,6 +97,7 @@ class PlaceMap:
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
         self.uses: dict[int, KeyframeUse] = {}  # by id; none: UNUSED
+        self.tags = MapTags()
         self.dropped = 0  # keyframes, because the map was full
 
     def __len__(self) -> int:
@@ -145,8 +147,17 @@ class PlaceMap:
             loops = sorted((link for link in joined if link.is_loop), key=lambda link: float(np.trace(link.covariance)))
             self.links += [link if link.a < link.b else link.reversed()
                            for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])]
+        self._move_tag_views(id, bridge)
         del self.keyframes[id], self.poses[id]
         self.uses.pop(id, None)
+
+    def _move_tag_views(self, id: int, bridge: Link | None) -> None:
+        """Give the tags that a keyframe saw to the end of a link from it, or to none."""
+        if bridge is None:
+            self.tags.move_views(id, None, np.eye(4), np.zeros((6, 6)))
+        else:
+            there = bridge.reversed()
+            self.tags.move_views(id, bridge.b, there.T_a_b, there.covariance)
 
     def _least_useful(self, newest: int) -> int:
         """Return the id of the keyframe that is to be dropped, not the newest."""
@@ -173,6 +184,7 @@ class PlaceMap:
         part.poses = {id: self.poses[id] for id in part.keyframes}
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
         part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
+        part.tags = self.tags.part(chosen)
         return part
 
     def move(self, poses: dict[int, Array]) -> None:

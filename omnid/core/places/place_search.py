@@ -91,6 +91,13 @@ class PlaceSearch:
                      if not _is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)]
         return self._unambiguous(found, places.poses)
 
+    def expected_only(self, found: Recognition | None, places: PlaceMap, expected: Expected) -> Recognition | None:
+        """Return a recognition by other evidence, None where odometry contradicts it."""
+        if found is None or _is_expected(found, places.poses, expected):
+            return found
+        self.refused += 1
+        return None
+
     def proposed(self, poses: Mapping[int, Array]) -> list[Array]:
         """Return the poses T_map_rect (4, 4) that the last search recognised, whether they count or not."""
         return [poses[place.id] @ place.T_place_rect for place in self._seen if place.id in poses]

@@ -36,6 +36,8 @@ class PlaceSummary:
     parts: int  # of keyframes that no link joins; 1: all is one map
     path_m: float  # length of the links of odometry
     extent_m: tuple[float, float]  # along x and y
+    tags: int  # that the map knows
+    tags_seen: int
     first_stamp_ns: int
     last_stamp_ns: int
 
@@ -50,7 +52,8 @@ def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
         len(keyframes), len({keyframe.session for keyframe in keyframes}),
         sum(len(keyframe.features.views) for keyframe in keyframes), places.loops, places.dropped, len(parts(places)),
         float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
-        (float(extent[0]), float(extent[1])), min(stamps), max(stamps))
+        (float(extent[0]), float(extent[1])), len(places.tags.known),
+        len({view.tag for view in places.tags.views}), min(stamps), max(stamps))
 
 
 def parts(places: PlaceMap) -> list[list[int]]:
@@ -72,6 +75,7 @@ def keep_only(places: PlaceMap, ids: Set[int]) -> None:
     for id in places.keyframes.keys() - ids:
         del places.keyframes[id], places.poses[id]
         places.uses.pop(id, None)
+    places.tags = places.tags.part(ids)
 
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:

@@ -40,6 +40,7 @@ class Recognition:
     inliers: int
     matches: int
     sectors: int  # of SECTORS that hold inliers
+    by_tag: bool = False  # an AprilTag tells the place, whose corners are the inliers
 
 
 def recognise(here: PlaceFeatures, there: PlaceFeatures, id: int, turn_rad: float, model: StereoModel

@@ -22,6 +22,9 @@ from omnid.core.stereo.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
+MAX_TAG: Final = 586  # of the family 36h11
+MAX_NAME: Final = 64  # characters
+SIZES_M: Final = (0.005, 10.0)  # of a tag's edge
 SIGMA_PX: Final = 0.35  # standard deviation of a corner, that of the curvature in the panorama included
 LARGEST_SQUARED: Final = 9.0  # mean squared error of the corners, in SIGMA_PX, of what is a tag of the known size
 CORRELATED_VIEWS: Final = 4.0  # views of a tag that count as one: errors of the rig are common to them

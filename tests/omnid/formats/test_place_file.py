@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from calib.panorama import Cylinder
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import seen_by
 from omnid.errors import OmnidError
-from omnid.formats.place_file import APPLICATION_ID, read_places, write_places
+from omnid.formats.place_file import APPLICATION_ID, SCHEMA_2, read_places, write_places
+from omnid.formats.place_rows import checksum
 from omnid.formats.ply import write_ply
 from tests.faults.mutation import mutated
 from tests.omnid.formats.place_maps import RIG, some_places
@@ -47,6 +49,54 @@ def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
     assert all(same(read.poses[id], places.poses[id]) for id in places.keyframes)
     assert len(read.links) == len(places.links)
     assert all(same(a, b) for a, b in zip(read.links, places.links, strict=True))
+    assert read.tags.known == places.tags.known
+    assert all(same(a, b) for a, b in zip(read.tags.views, places.tags.views, strict=True))
+
+
+def test_a_map_of_the_version_before_is_read(tmp_path: Path) -> None:
+    """It had no tags; its row of the map has another checksum."""
+    path, places = tmp_path / "a.omap", some_places(4)
+    write_places(path, places, RIG)
+    row = head_of(path)
+    row = (*row[:3], *row[5:-1])
+    changed(path, "DROP TABLE tag", "DROP TABLE tag_view", "DROP TABLE map", SCHEMA_2["map"],
+            "PRAGMA user_version = 2")
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(f"INSERT INTO map VALUES ({', '.join('?' * 11)})", (*row, checksum(row)))
+        database.commit()
+    read, rig = read_places(path)
+    assert same(rig, RIG) and same(read.poses[2], places.poses[2]) and not read.tags.known
+    write_places(path, read, rig)
+    assert len(read_places(path)[0]) == 4
+
+
+def head_of(path: Path) -> tuple[object, ...]:
+    """The row of the table map."""
+    with closing(sqlite3.connect(path)) as database:
+        return tuple(database.execute("SELECT * FROM map").fetchone())
+
+
+@pytest.mark.parametrize(
+    ("view", "tag", "message"),
+    [
+        ({"tag": 7}, {}, "a view of a tag is of no tag"),
+        ({"keyframe": 99}, {}, "a view of a tag is of no tag, or of no keyframe"),
+        ({"T_rect_tag": np.diag([-1.0, 1, 1, 1])}, {}, "a pose is no rotation"),
+        ({"covariance": np.zeros((6, 6))}, {}, "a covariance is not positive"),
+        ({}, {"name": "a\nb"}, "the name of a tag is none"),
+        ({}, {"name": "x" * 65}, "the name of a tag is none"),
+        ({}, {"size_m": 20.0}, "outside its range"),
+        ({}, {"id": 587}, "outside its range"),
+    ],
+)
+def test_tags_outside_their_range_are_not_written(
+    tmp_path: Path, view: dict[str, object], tag: dict[str, object], message: str
+) -> None:
+    places = some_places(3)
+    places.tags.views[1] = dataclasses.replace(places.tags.views[1], **view)
+    places.tags.known[5] = dataclasses.replace(places.tags.known[5], **tag)
+    with pytest.raises(OmnidError, match=message):
+        write_places(tmp_path / "a.omap", places, RIG)
 
 
 def test_a_keyframe_takes_less_than_50_kb_and_the_same_map_has_the_same_bytes(tmp_path: Path) -> None:
@@ -114,11 +164,15 @@ def changed(path: Path, *statements: str) -> Path:
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ("PRAGMA user_version = 1", "version 1, expected 2"),
+        ("PRAGMA user_version = 1", "version 1, expected 3"),
         ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
         ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
         ("DELETE FROM keyframe WHERE id = 3", "expected 4 keyframes, found 3"),
         ("DELETE FROM link WHERE rowid = 1", "expected 4 links, found 3"),
+        ("DELETE FROM tag WHERE id = 586", "expected 2 tags, found 1"),
+        ("DELETE FROM tag_view WHERE rowid = 1", "expected 3 views of tags, found 2"),
+        ("UPDATE tag SET name = 'other'", "the checksum of row 1 of tag"),
+        ("PRAGMA user_version = 2", "tables are not those"),
         ("DELETE FROM map", "the table map is empty"),
         ("CREATE TRIGGER t AFTER INSERT ON link BEGIN DELETE FROM link; END", "tables are not those"),
         ("CREATE TABLE other (a)", "tables are not those"),
@@ -133,8 +187,8 @@ def test_a_map_that_was_changed_is_refused(tmp_path: Path, statement: str, messa
 def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
     path = tmp_path / "a.omap"
     endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x FROM n"
-    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 2",
-            *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map")))
+    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 3",
+            *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map", "tag", "tag_view")))
     with pytest.raises(OmnidError, match="tables are not those"):
         read_places(path)
 
