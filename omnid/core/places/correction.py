@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -109,9 +110,21 @@ class MapCorrection:
                                           np.array([b.covariance for _, _, b in pairs]))
         errors, spread = se3.log(se3.inverse(by_loop) @ T_a_b), np.array([link.covariance for link, _, _ in pairs])
         by_odometry = by_odometry + LEAST_ODOMETRY
+        errors, by_odometry, spread = _per_pair([(link.a, link.b) for link, _, _ in pairs], errors, by_odometry, spread)
         # The drift of the whole path, or of its newest part where that is larger: a rig may have been bent meanwhile.
         return max(drift_factor(errors[-count:], by_odometry[-count:], spread[-count:])
-                   for count in (len(pairs), RECENT))
+                   for count in (len(errors), RECENT))
+
+
+def _per_pair(pairs: Sequence[tuple[int, int]], *values: Array) -> list[Array]:
+    """Return the means (K, ...) of values (N, ...) over loops between the same keyframes, in the order of the last one.
+
+    Such loops match the same features: what is wrong with one of them is wrong with the others.
+    """
+    rows: dict[tuple[int, int], list[int]] = {}
+    for n, pair in enumerate(pairs):
+        rows[pair] = [*rows.pop(pair, []), n]
+    return [np.array([value[same].mean(axis=0) for same in rows.values()]) for value in values]
 
 
 def _recent_loops(links: list[Link]) -> list[Link]:
