@@ -17,7 +17,7 @@ from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.obstacles.floor_plane import FloorPlane
 from omnid.core.obstacles.floor_view import FloorCamera
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.obstacles.observation import observe, with_floor
+from omnid.core.obstacles.observation import observe, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
@@ -83,7 +83,7 @@ class Obstacles:
         points = se3.apply(self._T_base_rig, depth.points)
         seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
         panoramas = depth.panoramas
-        seen = with_floor(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
+        seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
         pose = planar(T_odom_base)
         ring = self._filter.update(odometry.stamp_ns, pose, seen,

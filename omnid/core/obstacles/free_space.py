@@ -2,8 +2,9 @@
 
 Near the robot the cameras see no floor, and a plain wall shows nothing at all: what is known there is where the free
 floor ended when it was seen from farther away. In view, memory counts as long as the floor looks as it did: what looks
-otherwise is hidden by something that has come, though stereo may see nothing of it, and so is all behind. What covers
-the nearest floor in view may stand nearer still, unless the ring has it.
+otherwise is hidden by something that has come, though stereo may see nothing of it, and so is all behind, unless both
+cameras see the plane of the floor there: a shadow. What covers the nearest floor in view may stand nearer still, unless
+the ring has it.
 
 Where the base stands, nothing was seen from farther away. There the floor around it counts as free, as far as the
 cameras cannot see it, except towards what hides it in a wide angle.
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.floor_memory import FloorMemory
 from omnid.core.obstacles.floor_view import FloorView
+from omnid.core.obstacles.observation import Observation
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
@@ -55,6 +57,7 @@ class _Window(NamedTuple):
     cells: tuple[slice, slice]  # of the square
     places: Array  # (rows, columns, 2) m, in the base frame
     distance: Array  # (rows, columns) m
+    sector: Counts  # (rows, columns) of the ring
 
 
 class FreeSpace:
@@ -76,12 +79,12 @@ class FreeSpace:
         self._rest = None
         self._forget(np.ones((CELLS, CELLS), bool))
 
-    def update(self, stamp_ns: int, T_odom_base: Array, seen: FreeRanges, from_m: float,
+    def update(self, stamp_ns: int, T_odom_base: Array, seen: Observation, obstacle_m: Array,
                view: Callable[[Array], FloorView]) -> FreeRanges:
         """Add the free ranges of a pair, 0 where nothing was seen; return what is known now.
 
-        seen.hidden_m: nearest obstacles of the ring; from_m: nearest floor that stereo sees in most directions, inf:
-        none; view: returns the looks of the floor at places (N, 2) [m] in the base frame.
+        obstacle_m (SECTORS,): nearest obstacles of the ring, inf: none; view: returns the looks of the floor at places
+        (N, 2) [m] in the base frame.
         """
         centre = T_odom_base[:2, 3] / CELL_M
         self._follow(centre)
@@ -93,14 +96,16 @@ class FreeSpace:
         window = self._window(T_odom_base)
         looks = self._look(window, view)
         same = self._floor.compare(window.cells, looks.grey, looks.noise_grey)
-        self._mark_near(window, looks.in_view, along, seen.hidden_m)
+        # A shadow lies on the floor, which both cameras still see as a plane.
+        self._floor.changed[window.cells][window.distance < seen.plane_m[window.sector]] = False
+        self._mark_near(window, looks.in_view, along, obstacle_m)
         hidden_m = self._up_to(self._floor.changed[along], math.inf)
         # 2. Floor that counts as free: seen in this pair, or too near to be seen where the base stands.
         unseen = seen.free_m <= 0
         assumed = np.zeros_like(unseen)
-        if self._stands(stamp_ns, T_odom_base[:2, 3]) and math.isfinite(from_m):
+        if self._stands(stamp_ns, T_odom_base[:2, 3]) and math.isfinite(seen.floor_from_m):
             assumed = unseen & ~_wide(unseen, ASSUMED_SECTORS)
-        reach_m = np.where(assumed, from_m, np.maximum(seen.free_m - END_M, 0.0))
+        reach_m = np.where(assumed, seen.floor_from_m, np.maximum(seen.free_m - END_M, 0.0))
         free = self._drawn(centre, np.minimum(reach_m, hidden_m), direction, unseen & ~assumed)
         x, y = np.floor(centre).astype(np.int64) - self._corner
         free[y, x] = True  # the robot stands there
@@ -122,7 +127,9 @@ class FreeSpace:
         columns, rows = (slice(at - VIEW_CELLS, at + VIEW_CELLS + 1) for at in (middle - self._corner).tolist())
         cells = middle[:, None] + np.arange(-VIEW_CELLS, VIEW_CELLS + 1)
         x, y = np.meshgrid(*(CELL_M * (cells + 0.5) - T_odom_base[:2, 3:]))
-        return _Window((rows, columns), np.stack([x, y], axis=-1) @ T_odom_base[:2, :2], np.hypot(x, y))
+        places = np.stack([x, y], axis=-1) @ T_odom_base[:2, :2]
+        turned = (np.arctan2(places[..., 1], places[..., 0]) + math.pi) * (SECTORS / (2 * math.pi))
+        return _Window((rows, columns), places, np.hypot(x, y), np.floor(turned).astype(np.intp) % SECTORS)
 
     def _look(self, window: _Window, view: Callable[[Array], FloorView]) -> FloorView:
         """Return the looks of the window's cells (rows, columns)."""
@@ -144,12 +151,10 @@ class FreeSpace:
         sees = np.asarray(shown.any(axis=1))
         covered = sees & is_changed.any(axis=1) & (obstacle_m > self._distances[nearest[:, -1]])
         is_open = sees & (is_known & ~is_changed).all(axis=1)
-        angle = np.arctan2(window.places[..., 1], window.places[..., 0])
-        sector = np.floor((angle + math.pi) * (SECTORS / (2 * math.pi))).astype(np.intp) % SECTORS
-        near = ~in_view & (window.distance < self._distances[first][sector])
+        near = ~in_view & (window.distance < self._distances[first][window.sector])
         changed = self._floor.changed[window.cells]
-        changed[near & covered[sector]] = True
-        changed[(near & is_open[sector]) | (window.distance < ROBOT_M)] = False
+        changed[near & covered[window.sector]] = True
+        changed[(near & is_open[window.sector]) | (window.distance < ROBOT_M)] = False
 
     def _stands(self, stamp_ns: int, position: Array) -> bool:
         """True at the start, and where the base has stood for so long that memory has ended."""

@@ -34,6 +34,7 @@ class Observation(NamedTuple):
     sigma_m: RangeScan  # (SECTORS,) of the ranges; NaN without one
     free_m: RangeScan  # (SECTORS,) up to which the way was seen to be free; 0 where nothing was seen
     floor_from_m: float = math.inf  # nearest floor that the cameras see in most directions; inf: they see none
+    plane_m: RangeScan = np.zeros(SECTORS, np.float32)  # (SECTORS,) up to which the floor's plane is seen without a gap
 
 
 class HeightBand(NamedTuple):
@@ -65,10 +66,10 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings) 
     return Observation(result, sigma.astype(np.float32), free.astype(np.float32), floor_from_m)
 
 
-def with_floor(seen: Observation, free_m: Array) -> Observation:
-    """Return the observation with floor (SECTORS,) that was seen otherwise, where no obstacle ends it."""
-    is_found = np.isfinite(seen.ranges_m)
-    return seen._replace(free_m=np.where(is_found, seen.free_m, np.maximum(seen.free_m, free_m)).astype(np.float32))
+def with_plane(seen: Observation, plane_m: Array) -> Observation:
+    """Return the observation with the floor (SECTORS,) that was seen as a plane, where no obstacle ends it."""
+    free_m = np.where(np.isfinite(seen.ranges_m), seen.free_m, np.maximum(seen.free_m, plane_m))
+    return seen._replace(free_m=free_m.astype(np.float32), plane_m=plane_m.astype(np.float32))
 
 
 def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> HeightBand:

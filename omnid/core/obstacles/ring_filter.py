@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths, fill_gaps
 from omnid.core.obstacles.floor_view import FloorView
-from omnid.core.obstacles.free_space import FreeRanges, FreeSpace
+from omnid.core.obstacles.free_space import FreeSpace
 from omnid.core.obstacles.observation import Observation
 from omnid.core.obstacles.settings import RingSettings
 
@@ -78,8 +78,8 @@ class RingFilter:
         unknown = ~np.isfinite(accepted) & ~np.isposinf(seen.ranges_m)
         accepted, sigma, age_stamps = self._remembered(stamp_ns, T_odom_base, accepted, sigma, age_stamps, unknown)
         # An obstacle ends what is known to be free, one that is not confirmed as well.
-        free_m = np.minimum(seen.free_m, accepted)
-        floor = self._free.update(stamp_ns, T_odom_base, FreeRanges(free_m, accepted), seen.floor_from_m, view)
+        seen = seen._replace(free_m=np.minimum(seen.free_m, accepted).astype(np.float32))
+        floor = self._free.update(stamp_ns, T_odom_base, seen, accepted, view)
         # What is behind something that has come is not known any more.
         accepted = np.where(floor.hidden_m < accepted, np.inf, accepted)
         known = np.isfinite(accepted)

@@ -10,7 +10,7 @@ import pytest
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles.floor_plane import END_M, FARTHEST_M, FloorPlane
 from omnid.core.obstacles.floor_view import FloorCamera
-from omnid.core.obstacles.observation import Observation, with_floor
+from omnid.core.obstacles.observation import Observation, with_plane
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
@@ -63,7 +63,7 @@ def test_an_obstacle_ends_the_floor_that_is_seen_otherwise() -> None:
     ranges = np.full(360, np.nan, np.float32)
     ranges[180] = 1.1
     seen = Observation(ranges, ranges, np.where(np.isfinite(ranges), ranges, 0.5).astype(np.float32))
-    free = with_floor(seen, np.full(360, 2.0)).free_m
+    free = with_plane(seen, np.full(360, 2.0)).free_m
     assert free[180] == np.float32(1.1) and (np.delete(free, 180) == 2.0).all()
 
 

@@ -12,7 +12,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.floor_view import FloorView
 from omnid.core.obstacles.free_space import CELL_M, END_M, MISSED_NS, ROBOT_M
-from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.observation import Observation, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
 from tests.omnid.core.obstacles.drawn_floor import Pattern, Pillar, SeenFloor, blind, plain, tiles
@@ -278,3 +278,12 @@ def test_floor_that_was_hidden_for_longer_than_memory_is_learned_again() -> None
     assert drive.go(10, floor_beside(0)).free_m[175:185].max() < 1.0
     drive.stamp_ns += round(SETTINGS.free_s * S)
     assert drive.go(2, floor_beside(0)).free_m[AHEAD].min() > 2.5
+
+
+def test_a_shadow_hides_no_floor_that_both_cameras_see_as_a_plane() -> None:
+    drive = Drive(SeenFloor())
+    drive.go(3, floor_beside(0))
+    drive.floor.pattern = lambda x, y: np.where(x > 0.5, 60.0, tiles(x, y))
+    plane = with_plane(NOTHING, np.where(azimuths() > 0.1, 2.0, 0.0))
+    shadow = drive.go(5, plane)
+    assert shadow.free_m[192:200].min() > 1.9 and shadow.free_m[168:178].max() < 1.0
