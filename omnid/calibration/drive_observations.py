@@ -197,10 +197,14 @@ def _twist(first: OdometryUpdate, last: OdometryUpdate) -> Array:
     return np.asarray(moved / span_s) if span_s > 0 else np.zeros(6)
 
 
-def tracked_updates(reader: LogReader, place: Geometry, config: Config, log: Path) -> Iterator[OdometryUpdate]:
-    """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
-    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
-    gate = RigGate(place.cylinder, "warn")
+def tracked_updates(reader: LogReader, place: Geometry, config: Config, log: Path, gate: RigGate | None = None
+                    ) -> Iterator[OdometryUpdate]:
+    """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras.
+
+    gate: sees the panoramas first; None: one that warns.
+    """
+    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama, config.camera)
+    gate = RigGate(place.cylinder, "warn") if gate is None else gate
     stereo, odometry = Stereo(place, config.stereo, gate), OdometryStage(place, config.odometry)
     states: Counter[TrackingState] = Counter()
     for pair in filter(None, map(pairing.process, reader.frames())):

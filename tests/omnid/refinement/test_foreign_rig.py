@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from omnid.config import PanoramaConfig, StereoConfig
 from omnid.core.rig.rig_check import RigFinding
-from omnid.core.rig.start_check import StartFinding, start_finding
-from omnid.refinement.foreign_rig import is_suspicious
+from omnid.core.rig.start_check import StartCondition, StartFinding, start_finding
+from omnid.core.stereo.photometry import Light
+from omnid.messages import FramePair, OdometryUpdate
+from omnid.refinement.foreign_rig import is_suspicious, other_rig
+from omnid.simulation.rendering.rigs import make_rig
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import geometry
+from omnid.stages.stereo import Stereo
+from omnid.tracking_state import TrackingState
 
 
 def finding(spread_px: float) -> RigFinding:
@@ -22,3 +31,20 @@ def test_scattered_columns(spread_px: float, condition: str, suspicious: bool) -
 
 def test_a_rig_that_is_off_is_suspicious_and_one_that_was_not_seen_is_not() -> None:
     assert is_suspicious(StartFinding("drifted", finding(0.1), 20)) and not is_suspicious(None)
+
+
+@pytest.mark.parametrize(("lost", "of", "condition", "dark", "is_other"),
+                         [(8, 20, "drifted", False, True), (8, 20, "fits", False, False),
+                          (8, 20, "drifted", True, False), (3, 20, "drifted", False, False),
+                          (2, 4, "drifted", False, False)])
+def test_columns_that_do_not_match_and_lost_poses_are_those_of_another_rig(
+        lost: int, of: int, condition: StartCondition, dark: bool, is_other: bool) -> None:
+    place, black = geometry(make_rig(size=256), PanoramaConfig()), np.zeros((256, 256), np.uint8)
+    panoramas = Dewarp(place, PanoramaConfig()).process(FramePair(0, 0, black, black))
+    depth = Stereo(place, StereoConfig()).process(panoramas)
+    light = Light(5.0, 0.1) if dark else Light(90.0, 20.0)
+    states = [TrackingState.LOST] * lost + [TrackingState.DEGRADED] * (of - lost)
+    updates = [OdometryUpdate(number, 10**9 * number, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 9, 9,
+                              depth, light=light) for number, state in enumerate(states)]
+    said = other_rig(updates, place, StartFinding(condition, finding(1.0), 20))
+    assert bool(said) == is_other and said.startswith(f"no pose is found for {lost} of the first {of} pairs" * is_other)

@@ -12,6 +12,8 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
+from omnid.config import Config
+from omnid.runs.replay import ReplayOptions, run_log
 from omnid.stages.rig_gate import RigContradictedError
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
@@ -35,10 +37,13 @@ def test_a_drifted_rig_is_reported_and_motion_is_not(skewed: tuple[Path, Rig], t
     assert any("do not quite fit the rig" in text for text in warnings) == warned, warnings
 
 
-def test_exchanged_cameras_are_refused(skewed: tuple[Path, Rig]) -> None:
+def test_exchanged_cameras_are_refused_and_nothing_is_written(skewed: tuple[Path, Rig], tmp_path: Path) -> None:
     log, rig = skewed
+    options = ReplayOptions(rig=rig, topics=(rig.topics[1], rig.topics[0]), tum=tmp_path / "a.tum",
+                            record=tmp_path / "a.mcap")
     with pytest.raises(RigContradictedError, match="other way round"):
-        omnid.replay(log, rig, lower=rig.topics[1], upper=rig.topics[0])
+        run_log(log, Config(), options)
+    assert not list(tmp_path.iterdir())
 
 
 def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, Rig]) -> None:
