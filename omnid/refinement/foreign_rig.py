@@ -50,14 +50,14 @@ def other_rig(updates: Iterable[OdometryUpdate], place: Geometry, finding: Start
 
     updates: poses of a log with the rig as it is. finding: of its first pairs, if these were seen at one time.
     """
-    start = _Start(DriveCollector(place, LANDMARKS))
+    start = _FirstPairs(DriveCollector(place, LANDMARKS))
     with suppress(OmnidError):  # the poses are lost too often: those that there are tell why
         start = _first_keyframes(updates, start, place)
     return _difference(start.collector, place) or _untracked(start, finding)
 
 
 @dataclass(slots=True)
-class _Start:
+class _FirstPairs:
     """Keyframes of the first part of a log, and how many of its pairs have no pose."""
 
     collector: DriveCollector
@@ -83,7 +83,7 @@ def _difference(collector: DriveCollector, place: Geometry) -> str:
         return ""  # the drive does not tell
 
 
-def _untracked(start: _Start, finding: StartFinding | None) -> str:
+def _untracked(start: _FirstPairs, finding: StartFinding | None) -> str:
     """Return how badly the log is tracked by a rig whose columns do not match; empty where it is tracked."""
     if finding is None or finding.condition != "drifted" or start.lost < max(LEAST_LOST, MAX_LOST * start.pairs):
         return ""
@@ -93,7 +93,7 @@ def _untracked(start: _Start, finding: StartFinding | None) -> str:
             f"by {straight.turn_deg:.2f} deg)")
 
 
-def _first_keyframes(updates: Iterable[OdometryUpdate], start: _Start, place: Geometry) -> _Start:
+def _first_keyframes(updates: Iterable[OdometryUpdate], start: _FirstPairs, place: Geometry) -> _FirstPairs:
     """Return the start of a log, with the keyframes of its first part that is tracked without a gap."""
     choice, resets, ended = KeyframeChoice(1, KEYFRAME_M, KEYFRAME_RAD), 0, False
     for number, update in enumerate(updates):
