@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.mapping.keyframe_grid import KeyframeScans
+from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
@@ -170,6 +172,16 @@ class PlaceUpdate:
     state: MapState
     keyframe: int = -1  # of the map, to which the pose belongs; -1: none
     T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry
+    scans: KeyframeScans | None = None  # of the part of the map in which the pose is; the same object while it stays
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridUpdate:
+    """Occupancy grid of the map, in the axes of the base at its start."""
+
+    seq: int  # of the newest pair that it knows
+    stamp_ns: int
+    grid: Grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -173,8 +173,8 @@ ARROWS: Mapping[str, str] = {
         "omnid.core.odometry omnid.engine omnid.errors omnid.messages omnid.monitor omnid.recordings omnid.runs "
         "omnid.sinks omnid.stages omnid.tracking_state omnid.transport",
     "omnid.web":
-        "drivers.errors drivers.logs omnid.client omnid.core.navigation omnid.engine omnid.errors omnid.monitor "
-        "omnid.report omnid.tracking_state omnid.transport",
+        "calib.se3 drivers.errors drivers.logs omnid.client omnid.core.navigation omnid.engine omnid.errors "
+        "omnid.monitor omnid.report omnid.tracking_state omnid.transport",
 }
 
 

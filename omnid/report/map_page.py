@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
+from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid, known_part
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.place_views import MappedDrive, drives, grid
@@ -41,7 +41,7 @@ def map_page(title: str, lines: Sequence[tuple[str, str]], places: PlaceMap, rig
 
 def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> str:
     """Return the plan; x (forward at the start of the map) to the right, y up."""
-    cells = _seen(grid(places, rig, CELL_M))
+    cells = known_part(grid(places, rig, CELL_M))
     rows, columns = cells.cells.shape
     (left, bottom), top = cells.corner, cells.corner[1] + rows * cells.cell_m
     paths = np.concatenate([np.array([[left, bottom], [left + columns * cells.cell_m, top]]),
@@ -63,16 +63,6 @@ def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> s
     return (f"<figure class='sheet'><figcaption>{keys}</figcaption><svg viewBox='{box}' role='img' "
             f"aria-label='Map of places'>{''.join(parts)}</svg><small>Dots: keyframes. Behind them what "
             "their range scans saw: white is free, dark is occupied.</small></figure>")
-
-
-def _seen(cells: Grid) -> Grid:
-    """Return the part of a grid that holds its known cells."""
-    rows, columns = np.nonzero(cells.cells != UNKNOWN)
-    if not len(rows):
-        return cells
-    low, high = (int(rows.min()), int(columns.min())), (int(rows.max()) + 1, int(columns.max()) + 1)
-    corner = cells.corner[0] + low[1] * cells.cell_m, cells.corner[1] + low[0] * cells.cell_m
-    return Grid(cells.cells[low[0] : high[0], low[1] : high[1]], cells.cell_m, corner)
 
 
 def _image(cells: Grid, corner: Point, px_per_m: float) -> str:

@@ -16,12 +16,21 @@ from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import (
+    FramePair,
+    GridUpdate,
+    MapUpdate,
+    NavigationUpdate,
+    ObstacleRing,
+    OdometryUpdate,
+    PlaceUpdate,
+)
 from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, GeometryVersions
+from omnid.stages.grid import MapGrid
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import Mapping, no_wait
 from omnid.stages.navigation import NavigationStage
@@ -110,10 +119,11 @@ def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Con
         "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
     mapping, maps = _mapping(graph, odometry, config, sinks)
     places, in_map = _places(graph, odometry, geometry, config, sinks)
+    grids = _grids(graph, in_map, geometry, config, sinks)
     rings = _rings(graph, odometry, geometry, config, sinks)
     updates = _navigation(graph, geometry, config, sinks.navigation, places,
                           [odometry, *(stream for stream in (in_map, rings) if stream)])
-    named = {"bus-map": maps, "bus-places": in_map, "bus-scan": rings, "bus-navigation": updates}
+    named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
     outgoing.update({name: stream for name, stream in named.items() if stream})
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
@@ -149,6 +159,16 @@ def _places(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, 
     for name, sink in sinks.places.items():
         graph.sink(name, sink, in_map)
     return places, in_map
+
+
+def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry, config: Config, sinks: Sinks
+           ) -> Stream[GridUpdate] | None:
+    """Join the occupancy grid of the places; None where it is not consumed."""
+    if in_map is None or not (sinks.recorder or sinks.bus):
+        return None
+    T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
+    return graph.stage("grid", MapGrid(config.mapping.voxel_m, T_base_rect, sinks.map_every_s, sinks.map_period_s),
+                       in_map)
 
 
 def _rings(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.core.mapping.occupancy_grid import occupancy
+from omnid.core.mapping.occupancy_grid import Grid, occupancy
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.navigation_status import navigation_status
 from omnid.stages.geometry import GeometryVersions
 from omnid.stages.odometry import base_pose, of_base
@@ -24,7 +24,8 @@ from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
-Outgoing: TypeAlias = OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | ObstacleRing | NavigationUpdate
+Outgoing: TypeAlias = (OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing
+                       | NavigationUpdate)
 
 
 class OutgoingMessage(NamedTuple):
@@ -42,11 +43,13 @@ class MapEncoding(NamedTuple):
     heights_m: tuple[float, float] = (-1.0, 1.5)  # of obstacles, in the base's frame at the start
     cell_m: float = 0.05  # of the grid
     max_range_m: float = 6.0  # of the scan
+    has_places: bool = False  # the grid comes from their keyframes, in the frame map, not from the points in odom
 
 
 def map_encoding(config: Config, points: int) -> MapEncoding:
     """Return the encoding of the configuration, with at most so many points."""
-    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m, config.obstacles.ring.max_range_m)
+    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m, config.obstacles.ring.max_range_m,
+                       config.places.enabled)
 
 
 class Encoder:
@@ -79,6 +82,8 @@ class Encoder:
                 yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
+            case GridUpdate():
+                yield self._grid("map", message.stamp_ns, message.grid)
             case NavigationUpdate():
                 yield from self._navigation(message)
 
@@ -117,11 +122,16 @@ class Encoder:
         points = _most_confident(update.points, self._map_encoding.points)
         payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
+        if self._map_encoding.has_places:
+            return
         path_xy = self._in_base(_on_ground(update.path_xy))[:, :2]
         grid = occupancy(self._in_base(update.points.xyz), update.points.confidence, path_xy,
                          self._map_encoding.heights_m, self._map_encoding.cell_m)
-        payload = codec.grid_cdr(stamp_ns, "odom", grid.cells, grid.cell_m, grid.corner)
-        yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
+        yield self._grid("odom", update.stamp_ns, grid)
+
+    def _grid(self, frame: str, stamp_ns: int, grid: Grid) -> OutgoingMessage:
+        payload = codec.grid_cdr(stamp_ns + self.offset_ns, frame, grid.cells, grid.cell_m, grid.corner)
+        return OutgoingMessage("map", codec.GRID_SCHEMA, payload)
 
     def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns

@@ -74,7 +74,7 @@ class Places:
         covariance = in_axes(T_map_rig, self._to_rig @ pose.covariance @ self._to_rig.T)
         T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
         return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
-                           pose.keyframe, T_keyframe_rig)
+                           pose.keyframe, T_keyframe_rig, self._localiser.scans())
 
     def keyframe(self, id: int) -> tuple[int, Array] | None:
         """Return stamp and T_map_rig (4, 4) of a keyframe as the map knows it now; from any thread."""

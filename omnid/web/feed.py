@@ -18,12 +18,20 @@ from omnid.client import Diagnostics, Map, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import Pose, decode_map, decode_navigation
+from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation
 from omnid.transport.scan_codec import decode_scan
 from omnid.transport.status_names import WHEELS
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
-from omnid.web.snapshot import MOST_CELLS, map_message, navigation_message, parts_message, scan_message, state_message
+from omnid.web.snapshot import (
+    MOST_CELLS,
+    map_in_odom,
+    map_message,
+    navigation_message,
+    parts_message,
+    scan_message,
+    state_message,
+)
 
 PERIOD_S: Final = 0.03  # least time between two messages of the state
 QUIET_S: Final = 0.5  # without a message of the robot, after which the state is sent all the same
@@ -32,8 +40,9 @@ REQUEST_S: Final = 0.2  # between two looks for channels that browsers ask for
 PANORAMA: Final = "panorama"
 SCAN: Final = "scan"
 NAVIGATION: Final = "navigation"
+MAP_POSE: Final = "map_pose"
 MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
-_LARGEST: Final = {"odom": 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
+_LARGEST: Final = {"odom": 1 << 16, MAP_POSE: 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
                    PANORAMA: 1 << 23, NAVIGATION: 1 << 16}  # bytes
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 _JPEG: Final = b"\xff\xd8"
@@ -56,6 +65,7 @@ class RobotFeed:
         self._scan: Encoded = ""
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._navigation: Encoded = ""
+        self._map_in_odom: list[float | None] | None = None
         self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
         self._state_channel = Newest("state", self._encode_state)
@@ -99,7 +109,7 @@ class RobotFeed:
                 self.link = str(error)
                 await asyncio.sleep(RETRY_S)
         self.link = ""
-        for topic in ("odom", "status", "map", SCAN, NAVIGATION):
+        for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
             self.robot.on_message(self._receiver(loop), topic)
         self.robot.on_alive(self.state.set_alive)
         diagnostics, grid = await asyncio.to_thread(_latched, self.robot)
@@ -132,6 +142,9 @@ class RobotFeed:
 
     def _process_inbox(self) -> None:
         while (message := self.inbox.get(0.0)) is not None:
+            if message.topic == MAP_POSE:
+                self._take_map_pose(message.payload)
+                continue
             before, wheels = self.state.pose, self.state.statuses.get(WHEELS)
             pose = self.state.process(message)
             if pose is not None:
@@ -139,6 +152,12 @@ class RobotFeed:
             elif message.topic == "status":
                 self.wheel_reports += self.state.statuses.get(WHEELS) is not wheels
                 self._parts_channel.changed()
+
+    def _take_map_pose(self, payload: bytes) -> None:
+        try:
+            self._map_in_odom = map_in_odom(decode_map_pose(payload), self._poses) or self._map_in_odom
+        except OmnidError:
+            self.state.broken += 1
 
     def _forget_ended(self) -> None:
         """Forget the statuses of a daemon that has ended: it may start again in another state."""
@@ -198,7 +217,7 @@ class RobotFeed:
     def _encode_state(self) -> str:
         return state_message(self.bus.robot, self.state, self.link,
                              {"dropped": self.inbox.dropped, "browsers": len(self.browsers),
-                              "panoramas": self._panorama_channel.version})
+                              "panoramas": self._panorama_channel.version, "map_in_odom": self._map_in_odom})
 
 
 def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:

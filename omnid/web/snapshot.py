@@ -9,16 +9,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from calib import se3
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, plain
 from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.decode import Map, NavigationReport, Pose
+from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
 from omnid.transport.scan_codec import Scan
 from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
 from omnid.web.remedies import remedy_of
 
 PATH_FRAME: Final = "odom"
+FRAMES: Final = (PATH_FRAME, "map")  # of a map that is drawn
 BASE_FRAME: Final = "base_link"
 MOST_SECTORS: Final = 720  # of a scan
 _LARGEST_M: Final = 1e4  # range of a scan
@@ -45,6 +47,15 @@ def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, 
     })
 
 
+def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] | None:
+    """Return where the map's origin lies in odom, x, y [m] and yaw [rad]; None without a pose in odom at its time."""
+    pose = next((one for one in poses if one.stamp_ns == in_map.stamp_ns), None)
+    if pose is None:
+        return None
+    T_odom_map = pose.T_odom_base @ se3.inverse(in_map.T_map_base)
+    return [finite(float(T_odom_map[0, 3])), finite(float(T_odom_map[1, 3])), finite(float(se3.yaw(T_odom_map)))]
+
+
 def parts_message(state: RobotState) -> str:
     """Return the message `parts`: all status entries, the worst first, stages last."""
     parts = sorted(state.statuses.values(), key=_importance)
@@ -58,13 +69,14 @@ def parts_message(state: RobotState) -> str:
 def map_message(grid: Map) -> bytes:
     """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated.
 
-    Without cells if the grid is not in the frame of the path, odom.
+    Without cells if the grid is neither in the frame of the path, odom, nor in map, of which the state tells where it
+    lies in odom.
     """
-    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame != PATH_FRAME:
+    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
         return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(grid.frame)}, b"")
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
-    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "frame": PATH_FRAME,
+    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "frame": grid.frame,
               "cell_m": step * grid.cell_m, "x_m": grid.corner[0], "y_m": grid.corner[1]}
     return with_header(header, zlib.compress(cells.tobytes(), 1))
 

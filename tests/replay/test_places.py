@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from calib import se3
 from calib.rig_file import read_rig, write_rig
 from omnid.config import Config
+from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -54,7 +55,7 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
     """Check map -> odom, the pose in the map and its state in a recording; the base is the rig."""
     with log.open("rb") as file:
         reader = make_reader(file)
-        found: dict[str, list] = {"/tf": [], "/omnid/map_pose": [], "/omnid/status": []}
+        found: dict[str, list] = {"/tf": [], "/omnid/map_pose": [], "/omnid/status": [], "/omnid/map": []}
         for schema, channel, message in reader.iter_messages(list(found)):
             found[channel.topic].append(STORE.deserialize_cdr(message.data, schema.name)
                                         if channel.topic != "/omnid/status" else decode_diagnostics(message.data))
@@ -70,6 +71,9 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
     states = [status.values["state"] for statuses in found["/omnid/status"] for status in statuses.statuses
               if status.name == PLACES]
     assert states == ["odometry only", "localized"]
+    # The map is that of the keyframes, in their frame: it moves when a loop closes.
+    [grid] = found["/omnid/map"]
+    assert grid.header.frame_id == "map" and {FREE, OCCUPIED} <= set(grid.data.tolist())
 
 
 def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path) -> None:

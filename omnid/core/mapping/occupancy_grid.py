@@ -27,6 +27,16 @@ class Grid:
     corner: tuple[float, float]
 
 
+def known_part(grid: Grid) -> Grid:
+    """Return the part of a grid that holds its known cells; the whole grid without any."""
+    rows, columns = np.nonzero(grid.cells != UNKNOWN)
+    if not len(rows):
+        return grid
+    low, high = (int(rows.min()), int(columns.min())), (int(rows.max()) + 1, int(columns.max()) + 1)
+    corner = grid.corner[0] + low[1] * grid.cell_m, grid.corner[1] + low[0] * grid.cell_m
+    return Grid(grid.cells[low[0] : high[0], low[1] : high[1]], grid.cell_m, corner)
+
+
 def occupancy(points: Array, confidence: Array, path_xy: Array, heights_m: tuple[float, float], cell_m: float) -> Grid:
     """Return a grid over points (N, 3) between two heights [m] with confidence (N,) 0 to 1, and a path (M, 2) [m].
 

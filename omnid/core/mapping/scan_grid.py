@@ -34,9 +34,9 @@ SHIFT: Final = 4  # fractional bits of the corners that are drawn
 class ScanGrid:
     """Log odds of cells, drawn scan by scan; the oldest first, because later ones count more."""
 
-    def __init__(self, low: Array, high: Array, cell_m: float) -> None:
-        """low, high: corners (2,) [m] of the area; cells double in size until there are at most MAX_CELLS."""
-        while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > MAX_CELLS:
+    def __init__(self, low: Array, high: Array, cell_m: float, max_cells: int = MAX_CELLS) -> None:
+        """low, high: corners (2,) [m] of the area; cells double in size until there are at most so many."""
+        while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > max_cells:
             cell_m *= 2
         self._cell_m = cell_m
         self._first = np.floor(low / cell_m)
@@ -84,13 +84,17 @@ class ScanGrid:
 
 def scan_grid(scans: Sequence[RangeScan], poses: Array, cell_m: float) -> Grid:
     """Return the grid of scans whose frames have the poses (K, 4, 4) in the map, the oldest first."""
-    farthest = [float(np.max(scan, where=np.isfinite(scan), initial=0.0)) + cell_m for scan in scans]
-    reach, xy = np.array(farthest)[:, None], poses[:, :2, 3]
+    reach, xy = np.array([reach_m(scan) + cell_m for scan in scans])[:, None], poses[:, :2, 3]
     low, high = (xy - reach, xy + reach) if len(scans) else (np.zeros((1, 2)), np.zeros((1, 2)))
     drawn = ScanGrid(low.min(axis=0), high.max(axis=0), cell_m)
     for scan, pose in zip(scans, poses, strict=True):
         drawn.add(scan, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0]))
     return drawn.grid()
+
+
+def reach_m(scan: NDArray[np.floating]) -> float:
+    """Return the largest known range of a scan [m], 0 without one."""
+    return float(np.max(scan, where=np.isfinite(scan), initial=0.0))
 
 
 def _draw_hits(hit: NDArray[np.uint8], scan: RangeScan, ends: Array) -> None:

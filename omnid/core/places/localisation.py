@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.ageing import Ageing
@@ -106,6 +107,7 @@ class MapLocaliser:
         self._by_tag = False  # it was a tag, which tells the pose less exactly than a view
         self._last_T: Array | None = None
         self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
+        self._scans: tuple[object, KeyframeScans] | None = None  # what they depend on, and they
         self._failed = 0  # searches of this part that found nothing
         self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
 
@@ -158,6 +160,19 @@ class MapLocaliser:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
         oldest = self._part_of.get(min(self._part_of, default=0))
         return self.places.part(id for id, part in self._part_of.items() if part == oldest)
+
+    def scans(self) -> KeyframeScans:
+        """Return the range scans of the part of the map in which the pose is: the submaps that move with keyframes.
+
+        Of a map that stays as it is, its own ones only.
+        """
+        now = self.places.next_id, len(self.places), self._part, len(self._part_of), self.correction.optimisations
+        if self._scans is None or self._scans[0] != now:
+            ids = sorted(id for id, part in self._part_of.items() if part == self._part)
+            ids = [id for id in ids if id in self._fixed] or ids
+            poses = np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4)
+            self._scans = now, KeyframeScans({id: self.places.keyframes[id].scan for id in ids}, poses)
+        return self._scans[1]
 
     def _advance(self, frame: OdometryFrame) -> None:
         """Sum up the path; after a gap of unknown motion begin a new part of the map."""

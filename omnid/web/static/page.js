@@ -23,7 +23,7 @@ function onMessage(message, body) {
     case "state": return showState(message);
     case "path": return plan.addPath(message.from, message.points);
     case "map":
-      byId("map-note").textContent = message.frame === "odom" ? "" : `a map in the frame ${message.frame} is not drawn`;
+      byId("map-note").textContent = ["odom", "map"].includes(message.frame) ? "" : `a map in the frame ${message.frame} is not drawn`;
       return plan.setMap(message, body);
     case "parts":
       showCalibration(message.parts.find((part) => part.name === "calibration"));
@@ -57,6 +57,7 @@ function showState(state) {
   showPose(state);
   byId("no-pose").hidden = state.pose !== null;
   byId("panorama-note").hidden = state.panoramas > 0;
+  plan.setMapInOdom(state.map_in_odom);
   plan.setPose(state.pose, state.fresh);
   document.dispatchEvent(new CustomEvent("omnid-state", { detail: state }));
 }

@@ -17,6 +17,7 @@ export class Plan {
     this.pose = null;
     this.fresh = false;
     this.map = null;
+    this.mapInOdom = null;
     this.obstacles = [];
     this.fits = true;
     this.onFit = () => {};
@@ -168,8 +169,13 @@ export class Plan {
     for (const point of this.obstacles) add(point[0], point[1]);
     if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
     if (this.map !== null) {
-      add(this.map.x_m, this.map.y_m);
-      add(this.map.x_m + this.map.width * this.map.cell_m, this.map.y_m + this.map.height * this.map.cell_m);
+      const [x, y, yaw] = this.mapOrigin();
+      const { x_m: left, y_m: low, cell_m: cell } = this.map;
+      for (const u of [left, left + this.map.width * cell]) {
+        for (const v of [low, low + this.map.height * cell]) {
+          add(x + u * Math.cos(yaw) - v * Math.sin(yaw), y + u * Math.sin(yaw) + v * Math.cos(yaw));
+        }
+      }
     }
     if (left > right) return;
     this.view.x = (left + right) / 2;
@@ -181,10 +187,25 @@ export class Plan {
 
   paintMap(toScreen) {
     if (this.map === null || this.map.image === null) return;
-    const [left, top] = toScreen(this.map.x_m, this.map.y_m + this.map.height * this.map.cell_m);
-    const scale = this.map.cell_m * this.view.scale;
-    this.context.imageSmoothingEnabled = false;
-    this.context.drawImage(this.map.image, left, top, this.map.width * scale, this.map.height * scale);
+    const [x, y, yaw] = this.mapOrigin();
+    const { view: { scale }, context, map } = this;
+    context.save();
+    context.translate(...toScreen(x, y));
+    context.rotate(-yaw);
+    context.imageSmoothingEnabled = false;
+    context.drawImage(map.image, map.x_m * scale, -(map.y_m + map.height * map.cell_m) * scale,
+      map.width * map.cell_m * scale, map.height * map.cell_m * scale);
+    context.restore();
+  }
+
+  // Where the origin of the map's frame lies in odom: x, y in m and yaw in rad.
+  mapOrigin() {
+    return this.map.frame === "map" && this.mapInOdom !== null ? this.mapInOdom : [0, 0, 0];
+  }
+
+  setMapInOdom(origin) {
+    this.mapInOdom = Array.isArray(origin) && origin.every(Number.isFinite) ? origin : null;
+    this.draw();
   }
 
   paintPath(toScreen) {

@@ -168,6 +168,27 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         assert (received["width"], received["body"]) == (0, b"")
 
 
+def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer, bus: Bus) -> None:
+    T_odom_base = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [5.0, 6.0, 0.0])
+    T_odom_map = se3.transform(se3.rotation_exp([0.0, 0.0, -0.25]), [1.0, -2.0, 0.0])
+    odom = codec.odometry_cdr(10**9 + 77, T_odom_base, np.eye(6), np.zeros(6), np.eye(6))
+    in_map = se3.inverse(T_odom_map) @ T_odom_base
+    grid = codec.grid_cdr(10**9, "map", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
+
+    def run() -> None:
+        bus.publish("odom", odom)
+        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 77, in_map, np.eye(6)))
+        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 78, np.eye(4), np.eye(6)))  # no pose of its time
+        bus.publish("map", grid)
+
+    with server.live(server.bearer) as live:
+        shown = Shown(live)
+        received = shown.until("map", run, lambda found: found["width"])
+        assert (received["frame"], received["x_m"], received["y_m"]) == ("map", -1.0, -2.0)
+        state = shown.until("state", run, lambda found: found["map_in_odom"])
+        assert state["map_in_odom"] == pytest.approx([1.0, -2.0, -0.25], abs=1e-6)
+
+
 def test_obstacles_arrive_at_their_places_in_odom(server: WebServer, bus: Bus) -> None:
     ranges = np.full(360, np.nan, np.float32)
     ranges[270], ranges[180], ranges[0] = 1.0, 2.0, np.inf  # to the left, ahead, free behind

@@ -1,0 +1,53 @@
+"""The stage that draws the map: now and then and at the end, only what has changed, nothing under overload."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from omnid.core.mapping.keyframe_grid import KeyframeScans
+from omnid.messages import PlaceUpdate
+from omnid.stages.grid import MapGrid
+from omnid.tracking_state import MapState
+
+SECOND_NS = 10**9
+SCAN = np.full(360, 2.0, np.float16)
+
+
+def scans(count: int) -> KeyframeScans:
+    return KeyframeScans(dict.fromkeys(range(count), SCAN), np.tile(np.eye(4), (count, 1, 1)))
+
+
+def update(seq: int, seen: KeyframeScans | None) -> PlaceUpdate:
+    return PlaceUpdate(seq, seq * SECOND_NS, np.eye(4), np.eye(4), np.eye(6), MapState.ODOMETRY_ONLY, scans=seen)
+
+
+def given(stage: MapGrid, updates: list[PlaceUpdate]) -> list[int]:
+    return [found.seq for found in map(stage.process, updates) if found is not None]
+
+
+def test_it_is_drawn_when_it_is_due_and_has_changed() -> None:
+    stage, one, two = MapGrid(0.05, np.eye(4), every_s=2.0), scans(1), scans(2)
+    assert given(stage, [update(k, one if k < 7 else two) for k in range(1, 8)]) == [2, 7]
+    assert stage.finish() == []
+    assert stage.process(update(8, scans(3))) is None
+    [last] = stage.finish()
+    assert last.seq == 8 and last.grid.cells.max() == 100
+
+
+def test_without_a_period_it_is_drawn_at_the_end() -> None:
+    stage = MapGrid(0.05, np.eye(4))
+    assert stage.finish() == [] and given(stage, [update(k, scans(1)) for k in range(5)]) == []
+    assert [found.seq for found in stage.finish()] == [4]
+    empty = MapGrid(0.05, np.eye(4))
+    empty.process(update(1, None))
+    assert empty.finish() == []
+
+
+def test_nothing_is_drawn_while_the_computer_is_too_slow() -> None:
+    slow = [True]
+    stage = MapGrid(0.05, np.eye(4), 1.0, lambda: math.inf if slow[0] else 0.0)
+    assert given(stage, [update(k, scans(k)) for k in range(1, 5)]) == []
+    slow[0] = False
+    assert given(stage, [update(6, scans(6))]) == [6]
