@@ -139,7 +139,7 @@ class FreeSpace:
         return FloorView(grey.astype(np.float32), in_view, seen.noise_grey)
 
     def _mark_near(self, window: _Window, in_view: Flags, along: tuple[Counts, Counts], obstacle_m: Array) -> None:
-        """Mark the floor nearer than that in view where that is covered, and no longer where it is seen again."""
+        """Mark the floor nearer than that in view where that is covered, until that is seen or the ring has it."""
         square = np.zeros((CELLS, CELLS), bool)
         square[window.cells] = in_view
         shown = square[along]
@@ -149,8 +149,9 @@ class FreeSpace:
         is_changed = self._floor.changed[rows, columns]
         is_known = np.isfinite(self._floor.grey[rows, columns])
         sees = np.asarray(shown.any(axis=1))
-        covered = sees & is_changed.any(axis=1) & (obstacle_m > self._distances[nearest[:, -1]])
-        is_open = sees & (is_known & ~is_changed).all(axis=1)
+        has_obstacle = obstacle_m <= self._distances[nearest[:, -1]]
+        covered = sees & is_changed.any(axis=1) & ~has_obstacle
+        is_open = has_obstacle | (sees & (is_known & ~is_changed).all(axis=1))
         near = ~in_view & (window.distance < self._distances[first][window.sector])
         changed = self._floor.changed[window.cells]
         changed[near & covered[window.sector]] = True

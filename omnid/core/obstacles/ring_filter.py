@@ -25,6 +25,7 @@ SAME_SECTORS: Final = 2  # difference in direction at which two ranges may be of
 SAME_M: Final = 0.12  # and difference in range, beside the noise
 SAME_SIGMAS: Final = 3.0
 BEHIND_M: Final = 0.1  # beyond obstacles.ring.blind_m: from here on a range shows that a nearer obstacle is gone
+THICK_M: Final = 0.4  # of what hides the floor, from its foot to where stereo sees it
 NEAR_NS: Final = 60_000_000_000  # for which a nearer obstacle is believed against a range that does not show that
 
 
@@ -80,8 +81,8 @@ class RingFilter:
         # An obstacle ends what is known to be free, one that is not confirmed as well.
         seen = seen._replace(free_m=np.minimum(seen.free_m, accepted).astype(np.float32))
         floor = self._free.update(stamp_ns, T_odom_base, seen, accepted, view)
-        # What is behind something that has come is not known any more.
-        accepted = np.where(floor.hidden_m < accepted, np.inf, accepted)
+        # What is behind something that has come is not known any more, unless it is that itself.
+        accepted = np.where(floor.hidden_m + THICK_M + SAME_SIGMAS * sigma < accepted, np.inf, accepted)
         known = np.isfinite(accepted)
         is_open = np.isposinf(seen.ranges_m) & np.isposinf(floor.hidden_m)
         result = np.where(known, accepted, np.where(is_open, np.inf, np.nan)).astype(np.float32)

@@ -55,6 +55,8 @@ def test_floor_is_seen_neither_in_the_dark_nor_where_the_robot_hides_it() -> Non
     plane = FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, masked)
     free = plane.free_m(*panoramas(worn, 9.0, plain))
     assert (free[(azimuths() > 0.1) & (azimuths() < 3.0)] == 0).all() and np.median(free[azimuths() < -0.1]) > 2.0
+    behind = panoramas(lambda x, y: np.where(np.hypot(x, y) < 1.6, 120.0, worn(x, y)), 9.0, plain)
+    assert (FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, VISIBLE).free_m(*behind) == 0).all(), "after a gap"
     nothing = FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, np.zeros_like(VISIBLE))
     assert (nothing.free_m(*panoramas(worn, 9.0, plain)) == 0).all()
 

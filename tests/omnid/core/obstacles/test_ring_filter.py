@@ -254,6 +254,8 @@ def test_behind_what_has_come_no_range_is_known() -> None:
     assert np.isnan(drive.go(1, NOTHING).ranges_m[173:187]).all()
     beyond = NOTHING._replace(ranges_m=np.full(SECTORS, np.inf, np.float32))
     assert np.isnan(drive.go(1, beyond).ranges_m[173:187]).all()
+    someone = drive.go(3, wall._replace(ranges_m=np.where(AHEAD, 1.35, np.nan).astype(np.float32)))
+    np.testing.assert_allclose(someone.ranges_m[AHEAD], 1.35, atol=0.01)
 
 
 def test_what_covers_the_nearest_floor_in_view_may_stand_nearer_unless_the_ring_has_it() -> None:
@@ -266,9 +268,11 @@ def test_what_covers_the_nearest_floor_in_view_may_stand_nearer_unless_the_ring_
     assert drive.go(1, NOTHING).free_m[173:187].min() > 2.0
     box = Drive(SeenFloor())
     box.go(3, floor_beside(0))
-    box.go(4, ring_of(0.6))
     box.floor.pillars = [near]
-    np.testing.assert_allclose(box.go(1, NOTHING).free_m[175:185], 0.6, atol=0.06)
+    assert box.go(1, ring_of(0.6)).free_m[173:187].max() <= ROBOT_M + CELL_M, "one pair is no vote"
+    for stereo in (ring_of(0.6), NOTHING):
+        np.testing.assert_allclose(box.go(2, stereo).free_m[175:185], 0.6, atol=0.06)
+        np.testing.assert_allclose(box.go(1, stereo).ranges_m[175:185], 0.6, atol=0.01)
 
 
 def test_floor_that_was_hidden_for_longer_than_memory_is_learned_again() -> None:
