@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_order import array_to_grid, largest_rectangle, orient_corners, select_board_window
-from calib.boards.board_shape import grid_irregularity, has_checker_pattern, is_bounded_board, is_complete_board
+from calib.boards.board_shape import (
+    grid_irregularity,
+    has_checker_pattern,
+    is_bounded_board,
+    is_complete_board,
+    prediction_spread,
+)
 from calib.boards.corner_candidates import Grey, describe_corners, find_corners, smoothed
 from calib.boards.corner_grid import (
     MIN_RING_PX,
@@ -29,7 +35,7 @@ from calib.boards.corner_grid import (
 )
 from calib.boards.corner_refinement import refine_corners
 from calib.boards.derived_images import DerivedImage, Image, derived_images
-from calib.boards.opencv_boards import are_same, confirmed, grids_nearby, opencv_grids
+from calib.boards.opencv_boards import are_same, confirmed, grids_nearby, opencv_grids, shared_part
 from calib.models.camera import Array
 
 # Smaller images are not searched.
@@ -40,6 +46,9 @@ BLUR_PX = 0.7
 TRIED_GRIDS = 5
 # Largest distance of a corner from the position its neighbours predict, in parts of a square.
 MAX_IRREGULARITY = 0.2
+# A corner that is farther off than its board's others is one that a shadow or a cover moves: in parts of the median,
+# where the prediction's own spread is taken out, and least distance in parts of a square.
+MAX_OUTLIER, MIN_OUTLIER = 4.0, 0.015
 # Least share of accepted corners in a detected board.
 MIN_GOOD = 0.75
 # Number of boards without an outline that OpenCV is asked to confirm in one image.
@@ -50,6 +59,8 @@ PARTIAL = 0.6
 MIN_LONE_PART, MIN_LONE_CORNERS = 0.9, 20
 # Larger grids are not grown: in parts of the board's corners, and at least.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
+# What shares more than so much of its corners with a floor is a part of it.
+MAX_SHARED = 0.5
 # A smaller grid is not reported as a board of another size.
 MIN_HINT_CORNERS = 12
 MIN_HINT_SIDE = 3
@@ -92,18 +103,19 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
     """
     if min(image.shape) < MIN_SIDE_PX:
         return BoardSearch(None)
-    largest, partial, unconfirmed = (0, 0), Grid(), list[Grid]()
+    largest, partial, unconfirmed, floors = (0, 0), Grid(), list[Grid](), list[Grid]()
     blurred = smoothed(image, BLUR_PX)
     for searched in derived_images(image) if thorough else islice(derived_images(image), 1):
-        for candidate in _grids(searched, board):
-            grid = grow_grid(blurred, candidate, _most_corners(board))
-            found = _detection(image, blurred, grid, board)
+        grids = [grow_grid(blurred, candidate, _most_corners(board)) for candidate in _grids(searched, board)]
+        floors += [grid for grid in grids if _is_floor(grid, board)]
+        for grid in grids:
+            found = _detection(image, blurred, (grid, floors), board)
             if found is not None and (found.is_complete
                                       or (thorough and _is_confirmed(image, found, board, unconfirmed))):
                 return BoardSearch(found.view(name))
             partial = max(partial, grid, key=lambda one: _likeness(one, board))
             largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
-    view = _opencv_view(image, blurred, (board, partial), name) if thorough else None
+    view = _opencv_view(image, blurred, (board, partial, floors), name) if thorough else None
     is_hint = view is None and min(largest) >= MIN_HINT_SIDE and largest[0] * largest[1] >= MIN_HINT_CORNERS
     return BoardSearch(view, largest if is_hint else (0, 0))
 
@@ -123,21 +135,22 @@ def _likeness(grid: Grid, board: Board) -> float:
     return min(part, 1 / part) if PARTIAL < part < 1 / PARTIAL else 0.0
 
 
-def _opencv_view(image: Image, blurred: Grey, shown: tuple[Board, Grid], name: str) -> BoardView | None:
+def _opencv_view(image: Image, blurred: Grey, shown: tuple[Board, Grid, list[Grid]], name: str) -> BoardView | None:
     """Return the view of the board that OpenCV's detectors find, at last around a grid that shows a part of it.
 
     A board without an outline is accepted if two find it, or if one does and it has many corners, all of them good.
+    shown: the board, the grid that shows a part of it, and the grids of floors.
     """
-    board, partial = shown
+    board, partial, floors = shown
     detected = list[Grid]()
     nearby = grids_nearby(image, partial, board) if _likeness(partial, board) else ()
     for grid in chain(opencv_grids(image, board), nearby):
-        found = _detection(image, blurred, grow_grid(blurred, grid, _most_corners(board)), board)
+        found = _detection(image, blurred, (grow_grid(blurred, grid, _most_corners(board)), floors), board)
         if found is not None and found.is_complete:
             return found.view(name)
         detected.append(grid)
     for number, grid in enumerate(detected):
-        found = _detection(image, blurred, grid, board)
+        found = _detection(image, blurred, (grid, floors), board)
         agree = any(are_same(grid, other) for other in detected[number + 1:])
         if found is not None and (agree or (found.is_bounded and found.part >= MIN_LONE_PART
                                             and found.corners.size // 2 >= MIN_LONE_CORNERS)):
@@ -151,6 +164,11 @@ def _grids(searched: DerivedImage, board: Board) -> Iterator[Grid]:
     corners = find_corners(searched.image)
     for grid in _nearest_in_size(find_grids(blurred, corners), board):
         yield _to_source_pixels(grow_grid(blurred, grid, _most_corners(board)), searched)
+
+
+def _is_floor(grid: Grid, board: Board) -> bool:
+    """True if a grid has more corners than a board with a ring around it, as a frame across its squares makes."""
+    return len(grid) > (board.columns + 2) * (board.rows + 2)
 
 
 def _most_corners(board: Board) -> int:
@@ -171,10 +189,15 @@ def _to_source_pixels(grid: Grid, searched: DerivedImage) -> Grid:
     return with_clockwise_axes(dict(zip(grid, pixels, strict=True)))
 
 
-def _detection(image: Image, blurred: Grey, grid: Grid, board: Board) -> _Detection | None:
-    """Return the board in a grid, its corners refined; None if they are too few or the squares no checkerboard."""
-    placed = select_board_window(grid, board)
-    if placed is None:
+def _detection(image: Image, blurred: Grey, linked: tuple[Grid, list[Grid]], board: Board) -> _Detection | None:
+    """Return the board in a grid, its corners refined; None if they are too few or the squares no checkerboard.
+
+    linked: the grid, and those of floors in the image. Floors are torn where their squares do not fit together, so that
+    a part may look like a board with a few corners too many.
+    """
+    grid, floors = linked
+    placed = None if floors and len(grid) > board.columns * board.rows else select_board_window(grid, board)
+    if placed is None or any(shared_part(array_to_grid(placed), floor) > MAX_SHARED for floor in floors):
         return None
     refined = refine_corners(image, orient_corners(blurred, placed, board))
     good = _without_outliers(blurred, refined)
@@ -189,8 +212,11 @@ def _without_outliers(blurred: Grey, corners: Array) -> Array:
     good[~_corner_mask(blurred, corners)] = np.nan
     for _ in range(good.shape[0] * good.shape[1]):
         off = grid_irregularity(good)
-        worst = np.unravel_index(np.argmax(np.nan_to_num(off)), off.shape)
-        if not off[worst] > MAX_IRREGULARITY:
+        score = off / prediction_spread(good)
+        usual = float(np.nanmedian(score)) if np.isfinite(score).any() else np.nan
+        excess = np.fmax(off / MAX_IRREGULARITY, score / max(MIN_OUTLIER, MAX_OUTLIER * usual))
+        worst = np.unravel_index(np.argmax(np.nan_to_num(excess)), excess.shape)
+        if not excess[worst] > 1:
             break
         # One at a time: an outlier raises the irregularity of its neighbours.
         good[worst] = np.nan

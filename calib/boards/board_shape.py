@@ -70,6 +70,26 @@ def grid_irregularity(corners: Array) -> Array:
     return off
 
 
+def prediction_spread(corners: Array) -> Array:
+    """Return the standard deviation (rows, columns) of corners about their neighbours' prediction, in parts of theirs.
+
+    It is larger at the edge of the board, where the prediction extrapolates; NaN where there is none.
+    """
+    spread = np.full(corners.shape[:2], np.nan)
+    known = np.isfinite(corners[..., 0])
+    padded = np.pad(known, NEIGHBOURS)
+    y, x = (part.ravel().astype(float) for part in np.mgrid[-NEIGHBOURS:NEIGHBOURS + 1, -NEIGHBOURS:NEIGHBOURS + 1])
+    weight, terms = np.exp(-(x * x + y * y) / WEIGHT_WIDTH) * ((x != 0) | (y != 0)), quadratic_terms(x, y)
+    side = 2 * NEIGHBOURS + 1
+    for j, i in np.argwhere(known):
+        own = weight * padded[j:j + side, i:i + side].ravel()
+        if np.count_nonzero(own) >= MIN_NEIGHBOURS:
+            # The value at the corner is the constant term of the weighted fit.
+            gain = np.linalg.pinv(terms * own[:, None], rcond=1e-6)[0] * own
+            spread[j, i] = np.sqrt(1 + gain @ gain)
+    return spread
+
+
 def has_folded_squares(corners: Array) -> bool:
     """True if some square of the corners (rows, columns, 2) has the wrong orientation."""
     along, down = np.diff(corners, axis=1)[:-1], np.diff(corners, axis=0)[:, :-1]

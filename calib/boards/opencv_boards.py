@@ -66,7 +66,12 @@ def _part_around(image: Image, pixels: Array, margin_part: float) -> tuple[Image
 
 def are_same(grid: Grid, other: Grid) -> bool:
     """True if every corner of a grid is one of another grid, within a part of the squares."""
+    return shared_part(grid, other) == 1
+
+
+def shared_part(grid: Grid, other: Grid) -> float:
+    """Return the share of a grid's corners that are those of another grid, within a part of the squares."""
     mine, theirs = (np.array(list(corners.values())) for corners in (grid, other))
     apart = np.linalg.norm(mine[:, None] - theirs, axis=2).min(axis=1)
     sizes = np.array([spacing(grid, cell) for cell in grid])
-    return bool((apart < np.maximum(SAME_PART * sizes, SAME_PX)).all())
+    return float((apart < np.maximum(SAME_PART * sizes, SAME_PX)).mean())

@@ -59,12 +59,12 @@ def classify_detection(found: Array | None, rendered: HardBoard) -> str:
         return "missed"
     truth = rendered.corners.reshape(rendered.board.rows, rendered.board.columns, 2)
     sides = [np.linalg.norm(np.diff(truth, axis=axis), axis=2).min() for axis in (0, 1)]
-    orders = _corner_orders(truth, rendered.board)
+    orders = corner_orders(truth, rendered.board)
     off = min(float(np.nanmax(np.linalg.norm(found - order, axis=1))) for order in orders)
     return "found" if off < max(RIGHT_PX, RIGHT_PART * min(sides)) else "wrong"
 
 
-def _corner_orders(truth: Array, board: Board) -> list[Array]:
+def corner_orders(truth: Array, board: Board) -> list[Array]:
     """Return the truth (N, 2) in every order that a detector may return, flipped or rotated."""
     orders = [truth, truth[::-1], truth[:, ::-1], truth[::-1, ::-1]]
     if board.columns == board.rows:

@@ -7,7 +7,7 @@ import pytest
 
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
-from tests.benchmark.boards import DETECTORS, classify_detection, count, meets_requirement
+from tests.benchmark.boards import DETECTORS, classify_detection, corner_orders, count, meets_requirement
 from tests.benchmark.boards_near import render_near_board
 from tests.benchmark.boards_rendered import HardBoard, render_hard_board
 
@@ -27,6 +27,18 @@ def test_finds_more_boards_than_opencv_and_no_wrong_one() -> None:
 def test_finds_no_board_in_windows_bricks_stripes_and_floors(number: int) -> None:
     image = render_hard_board(7, number).empty
     assert [board for board in ((4, 3), (5, 4), (3, 3)) if find_board(image, Board(*board, 0.03)).view] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "worst_px"), [(36, 0.7), (48, 0.7)])
+def test_finds_the_board_and_not_a_torn_floor_and_drops_corners_at_a_shadow(number: int, worst_px: float) -> None:
+    rendered = render_hard_board(1, number)
+    view = find_board(rendered.image, rendered.board).view
+    assert view is not None and find_board(rendered.empty, rendered.board).view is None
+    truth = rendered.corners.reshape(rendered.board.rows, rendered.board.columns, 2)
+    errors = [float(np.nanmax(np.linalg.norm(view.pixels - order, axis=1)))
+              for order in corner_orders(truth, rendered.board)]
+    assert min(errors) < worst_px
 
 
 def test_classifies_a_board_shifted_by_a_square_as_wrong() -> None:

@@ -99,6 +99,18 @@ def test_drops_a_hidden_corner_and_keeps_the_others() -> None:
     assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
 
 
+def test_drops_corners_that_are_off_by_less_than_a_fifth_of_a_square() -> None:
+    """The edge of a shadow moves corners: they are told from the others by the scatter of those."""
+    rendered = RENDERER.render_board(poses(1)[0])
+    image, moved_px = rendered.image.copy(), 2
+    u, v = rendered.corners[14].round().astype(int).tolist()
+    image[v - 6:v + 7, u - 6:u + 7] = rendered.image[v - 6:v + 7, u - 6 - moved_px:u + 7 - moved_px]
+    view = find_board(image, BOARD).view
+    assert view is not None
+    off = errors_px(view.pixels, rendered.corners)
+    assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
 def test_reports_the_grid_size_if_the_requested_count_is_wrong(asked: tuple[int, int]) -> None:
