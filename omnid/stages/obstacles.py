@@ -15,7 +15,7 @@ from calib import se3
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.obstacles.floor_plane import FloorPlane
-from omnid.core.obstacles.floor_view import FloorCamera
+from omnid.core.obstacles.floor_view import FloorCamera, unmeasured
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.observation import observe, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
@@ -66,6 +66,7 @@ class Obstacles:
         self._T_rect_base = geometry.rig.T_rect_rig @ se3.inverse(geometry.rig.T_base_rig)
         self._floor = FloorCamera(geometry.cylinder, self._T_rect_base, self._settings.floor_m)
         self._plane: FloorPlane | None = None
+        self._is_measured = not floor_is_assumed(geometry, config)  # else no plane is known that pixels could show
         self._last_ns: int | None = None
         self._resets = 0
 
@@ -82,12 +83,13 @@ class Obstacles:
         depth = odometry.depth
         points = se3.apply(self._T_base_rig, depth.points)
         seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
-        panoramas = depth.panoramas
-        seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
+        panoramas, view = depth.panoramas, partial(unmeasured, seen.floor_from_m)
+        if self._is_measured:
+            seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
+            view = partial(self._floor.view, panoramas.lower, panoramas.visible)
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
         pose = planar(T_odom_base)
-        ring = self._filter.update(odometry.stamp_ns, pose, seen,
-                                   partial(self._floor.view, panoramas.lower, panoramas.visible))
+        ring = self._filter.update(odometry.stamp_ns, pose, seen, view)
         moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
                             moving)

@@ -52,3 +52,9 @@ class FloorCamera:
         grey = cv2.remap(smooth.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         grey = grey.ravel()[: len(places)]
         return FloorView(np.where(in_view, grey, np.nan).astype(np.float32), in_view, panorama.noise_grey)
+
+
+def unmeasured(from_m: float, places: Array) -> FloorView:
+    """Return the view of cameras whose height is not known: floor from from_m on, but not where in the images."""
+    in_view = np.hypot(places[:, 0], places[:, 1]) > from_m
+    return FloorView(np.full(len(places), np.nan, np.float32), in_view, math.inf)
