@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calib import se3
 from omnid.config import load_config
-from omnid.messages import ObstacleRing, OdometryUpdate
+from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.runs.replay import ReplayOptions, run_log
+from omnid.simulation.rendering.rigs import make_rig
 from omnid.sinks.encoder import Outgoing
+from omnid.stages.geometry import Geometry
+from omnid.stages.obstacles import Obstacles
+from omnid.tracking_state import TrackingState
+from tests.omnid.core.obstacles.drawn_floor import BASELINE_M, CYLINDER, HEIGHT_M, panoramas, plain, worn
 
 
 class Rings:
@@ -65,3 +72,16 @@ def test_threads_give_the_same_bytes(scene: Path, inline: Rings) -> None:
 
 def test_off_means_off(scene: Path) -> None:
     assert not rings_of(scene, "obstacles.enabled=false").rings
+
+
+@pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
+def test_floor_between_edges_is_seen_where_the_height_of_the_cameras_is_measured(height_m: float) -> None:
+    rig = replace(make_rig(baseline_m=BASELINE_M), T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, height_m]))
+    stage = Obstacles(Geometry(rig, CYLINDER), load_config().obstacles)
+    visible = np.ones((CYLINDER.height, CYLINDER.width), bool)
+    dense = DensePoints(np.full(visible.shape, np.nan, np.float32), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))
+    pair = Panoramas(0, 0, *panoramas(worn, 9.0, plain), visible)
+    ring = stage.process(OdometryUpdate(0, 0, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
+                                        100, 100, StereoDepth(pair, lambda panoramas, exposure: dense)))
+    assert ring is not None and np.isnan(ring.ranges_m).all()
+    assert np.median(ring.free_m) > 2.0 if height_m else ring.free_m.max() < 0.2
