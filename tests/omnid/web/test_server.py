@@ -171,14 +171,14 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
 def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer, bus: Bus) -> None:
     T_odom_base = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [5.0, 6.0, 0.0])
     T_odom_map = se3.transform(se3.rotation_exp([0.0, 0.0, -0.25]), [1.0, -2.0, 0.0])
-    odom = codec.odometry_cdr(10**9 + 77, T_odom_base, np.eye(6), np.zeros(6), np.eye(6))
+    odom = codec.odometry_cdr(10**9 + 55, T_odom_base, np.eye(6), np.zeros(6), np.eye(6))
     in_map = se3.inverse(T_odom_map) @ T_odom_base
     grid = codec.grid_cdr(10**9, "map", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
 
     def run() -> None:
         bus.publish("odom", odom)
-        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 77, in_map, np.eye(6)))
-        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 78, np.eye(4), np.eye(6)))  # no pose of its time
+        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 55, in_map, np.eye(6)))
+        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 56, np.eye(4), np.eye(6)))  # no pose of its time
         bus.publish("map", grid)
 
     with server.live(server.bearer) as live:
