@@ -168,6 +168,25 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         assert (received["width"], received["body"]) == (0, b"")
 
 
+def test_obstacles_arrive_at_their_places_in_odom(server: WebServer, bus: Bus) -> None:
+    ranges = np.full(360, np.nan, np.float32)
+    ranges[270], ranges[180], ranges[0] = 1.0, 2.0, np.inf  # to the left, ahead, free behind
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, math.pi / 2]), [5.0, 6.0, 0.0])
+    odom = codec.odometry_cdr(10**9 + 77, T, np.eye(6), np.zeros(6), np.eye(6))
+
+    def run() -> None:
+        bus.publish("odom", odom, PoseAttachment(3, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
+        bus.publish("scan", scan_cdr(10**9 + 77, "base_link", ranges, ranges, (0.1, 6.0)))
+
+    with server.live(server.bearer) as live:
+        shown = Shown(live)
+        scan = shown.until("scan", run, lambda found: found["points"] and found["points"][0][1] > 5)
+        np.testing.assert_allclose(sorted(scan["points"]), [[4.0, 6.0], [5.0, 8.0]], atol=0.05)
+        assert scan["nearest"] == [1.0, pytest.approx(90.5)]
+        other = scan_cdr(10**9 + 77, "laser", ranges, ranges, (0.1, 6.0))
+        assert shown.until("scan", lambda: bus.publish("scan", other), lambda found: not found["points"])
+
+
 def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer, bus: Bus) -> None:
     T_odom_base = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [5.0, 6.0, 0.0])
     T_odom_map = se3.transform(se3.rotation_exp([0.0, 0.0, -0.25]), [1.0, -2.0, 0.0])
@@ -187,25 +206,6 @@ def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer
         assert (received["frame"], received["x_m"], received["y_m"]) == ("map", -1.0, -2.0)
         state = shown.until("state", run, lambda found: found["map_in_odom"])
         assert state["map_in_odom"] == pytest.approx([1.0, -2.0, -0.25], abs=1e-6)
-
-
-def test_obstacles_arrive_at_their_places_in_odom(server: WebServer, bus: Bus) -> None:
-    ranges = np.full(360, np.nan, np.float32)
-    ranges[270], ranges[180], ranges[0] = 1.0, 2.0, np.inf  # to the left, ahead, free behind
-    T = se3.transform(se3.rotation_exp([0.0, 0.0, math.pi / 2]), [5.0, 6.0, 0.0])
-    odom = codec.odometry_cdr(10**9 + 77, T, np.eye(6), np.zeros(6), np.eye(6))
-
-    def run() -> None:
-        bus.publish("odom", odom, PoseAttachment(3, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
-        bus.publish("scan", scan_cdr(10**9 + 77, "base_link", ranges, ranges, (0.1, 6.0)))
-
-    with server.live(server.bearer) as live:
-        shown = Shown(live)
-        scan = shown.until("scan", run, lambda found: found["points"] and found["points"][0][1] > 5)
-        np.testing.assert_allclose(sorted(scan["points"]), [[4.0, 6.0], [5.0, 8.0]], atol=0.05)
-        assert scan["nearest"] == [1.0, pytest.approx(90.5)]
-        other = scan_cdr(10**9 + 77, "laser", ranges, ranges, (0.1, 6.0))
-        assert shown.until("scan", lambda: bus.publish("scan", other), lambda found: not found["points"])
 
 
 def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> None:
