@@ -85,23 +85,10 @@ class VisualOdometry:
         T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
         exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
 
-        # Once a frame was refused, frames without corners (darkness, a blank wall) are not searched: that saves time.
+        # 2. to 4. Once a frame was refused, those without corners (darkness, a blank wall) are left out to save time.
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
-        estimate: PoseEstimate | None = None
-        for T_guess, is_near in self._guesses(frame, usable, T_predicted) if searched else ():
-            # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=is_near)
-
-            # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
-            #    on the bearings in both panoramas (IV.C, in place of eq. 9).
-            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
-
-            # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-            refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
-            estimate = with_more_inliers(estimate, refined)
-            if self._is_good(estimate, is_near):
-                break
+        estimate = self._estimate(frame, usable, T_predicted, exposure, dt_s) if searched else None
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
@@ -125,6 +112,25 @@ class VisualOdometry:
         self._requested = self._update_map(frame, usable, estimate, exposure)
         result = self._result(estimate.tracked, estimate.inliers, Features(estimate.pixels, estimate.rejected, new))
         return result if self._requested is None else replace(result, is_keyframe=True, keyframe_exposure=exposure)
+
+    def _estimate(self, frame: StereoFrame, usable: Flags, T_predicted: Array, exposure: Exposure | None,
+                  dt_s: float) -> PoseEstimate | None:
+        """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
+        estimate: PoseEstimate | None = None
+        for T_guess, is_near in self._guesses(frame, usable, T_predicted):
+            # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
+            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=is_near)
+
+            # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
+            #    on the bearings in both panoramas (IV.C, in place of eq. 9).
+            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
+
+            # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
+            refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
+            estimate = with_more_inliers(estimate, refined)
+            if self._is_good(estimate, is_near):
+                break
+        return estimate
 
     def complete(self) -> None:
         """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.
