@@ -24,7 +24,7 @@ def layout(image: str, depth: bool) -> Any:
             rrb.Horizontal(
                 rrb.Vertical(_plot("speed", "Speed"), _plot("yaw_rate", "Yaw rate")),
                 rrb.Vertical(_plot("landmarks", "Landmarks"), _plot("sigma", "Standard deviation")),
-                _plot("latency", "Latency, ms"),
+                rrb.Vertical(_plot("latency", "Latency, ms"), _plot("correction", "Correction by the map")),
             ),
             row_shares=[5, 3],
         ),

@@ -9,12 +9,13 @@ from typing import Final
 import numpy as np
 
 from calib import se3
+from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.range_scan import azimuths
 from omnid.engine.telemetry import Telemetry
-from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate
+from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
-from omnid.stages.odometry import of_base
+from omnid.stages.odometry import base_pose, of_base
 from omnid.transport.decode import Cloud, Pose
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.scan_codec import Scan
@@ -32,6 +33,7 @@ class ReplayView:
     def __init__(self, scene: RerunScene, geometry: Geometry, telemetry: Telemetry) -> None:
         self._scene, self._geometry = scene, geometry
         self._latencies = StageLatencies(telemetry)
+        self._drawn: KeyframeScans | None = None  # keyframes that were drawn last
 
     def process(self, message: Outgoing) -> None:
         """Draw a message; velocity commands are not drawn."""
@@ -39,6 +41,8 @@ class ReplayView:
             self._odometry(message)
         elif isinstance(message, MapUpdate):
             self._map(message)
+        elif isinstance(message, PlaceUpdate):
+            self._places(message)
         elif isinstance(message, ObstacleRing):
             self._scene.scan(Scan(message.stamp_ns, "base_link", azimuths(), message.ranges_m, message.sigma_m,
                                   math.inf))
@@ -59,6 +63,21 @@ class ReplayView:
         scene.features(stamp_ns, odometry.features)
         focal_baseline = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m
         scene.depth(stamp_ns, depth_image(depth.disparity, focal_baseline), depth.points)
+
+    def _places(self, update: PlaceUpdate) -> None:
+        """Plot the correction, and draw keyframes and loops where the map has them now."""
+        T_base_rig = self._geometry.rig.T_base_rig
+        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, T_base_rig)
+        self._scene.correction(update.stamp_ns, T_map_odom)
+        keyframes = update.scans
+        if keyframes is None or keyframes is self._drawn or not self._scene.wants("places"):
+            return
+        self._drawn = keyframes
+        to_odom = se3.inverse(T_map_odom) @ T_base_rig @ self._geometry.T_rig_rect
+        at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
+        loops = [(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at]
+        self._scene.places(update.stamp_ns, np.array(list(at.values())).reshape(-1, 3),
+                           np.array(loops).reshape(-1, 2, 3))
 
     def _map(self, update: MapUpdate) -> None:
         points = se3.apply(self._geometry.rig.T_base_rig, update.points.xyz.astype(float)).astype(np.float32)

@@ -1,7 +1,8 @@
 """The rerun recording that all views draw on.
 
 Entities: odom (the world) with path, covariance, map, base_link and its rig with the points of the newest images;
-panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, latency; state; log. Time is the stamp.
+its keyframes and loops; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, latency,
+correction; state; log. Time is the stamp.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ Array = NDArray[np.float64]
 MAX_POSES: Final = 20_000
 MAX_FRAMES: Final = 1_000  # images with features and depth
 MAX_CLOUDS: Final = 50
+MAX_PLACES: Final = 200  # drawings of all keyframes
 MAX_CLOUD_POINTS: Final = 50_000
 MAX_RIG_POINTS: Final = 3_000
 MAX_LOG_LINES: Final = 1_000
@@ -46,6 +48,8 @@ LEGEND: Final = f"""
 
 **Obstacles**: red dots around the base; grey ones mark directions that are unknown.
 
+**Keyframes** of the map: dark dots and the path through them, corrected by loops (violet); odometry's path stays.
+
 **Map and points**: dark below, light above. **Depth**: m from the rig's axis.
 """
 
@@ -61,7 +65,7 @@ class RerunScene:
         self._stream: rr.RecordingStream | None = None
         self._thinning = {"pose": Thinning(MAX_POSES, expected), "frame": Thinning(MAX_FRAMES, expected),
                           "image": Thinning(MAX_FRAMES, expected), "cloud": Thinning(MAX_CLOUDS),
-                          "scan": Thinning(MAX_POSES)}
+                          "scan": Thinning(MAX_POSES), "places": Thinning(MAX_PLACES)}
         self._last_position: Array | None = None  # (3,) m, end of the path
         self._state = ""
         self._lines = 0
@@ -142,6 +146,21 @@ class RerunScene:
         if self.wants("cloud"):
             (points,) = style.evenly(MAX_CLOUD_POINTS, cloud.points[np.isfinite(cloud.points).all(axis=1)])
             self._at(cloud.stamp_ns).log("odom/map", _points_3d(points, 1.5))
+
+    def correction(self, stamp_ns: int, T_map_odom: Array) -> None:
+        """Plot by how much the map corrects odometry."""
+        self._at(stamp_ns)
+        self._plot("correction", "position mm", 1e3 * float(np.linalg.norm(T_map_odom[:3, 3])))
+        self._plot("correction", "heading mdeg", 1e3 * float(np.rad2deg(se3.yaw(T_map_odom))))
+
+    def places(self, stamp_ns: int, keyframes: Array, loops: Array) -> None:
+        """Draw keyframes (K, 3) in the order of the drives, the path through them, and loops (L, 2, 3), in odom [m]."""
+        stream = self._at(stamp_ns)
+        dots = rr.Points3D(keyframes, colors=style.KEYFRAME.colour, radii=_px(style.KEYFRAME.size_px))
+        stream.log("odom/keyframes", dots)
+        path, joined = [keyframes.astype(np.float32)], list(loops.astype(np.float32))
+        stream.log("odom/keyframes/path", rr.LineStrips3D(path, colors=style.KEYFRAME.colour, radii=_px(1.0)))
+        stream.log("odom/loops", rr.LineStrips3D(joined, colors=style.LOOP.colour, radii=_px(style.LOOP.size_px)))
 
     def scan(self, scan: Scan) -> None:
         """Draw the obstacles around the base, and where their directions are unknown."""

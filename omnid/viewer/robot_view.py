@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from typing import Final
 
+from calib import se3
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Diagnostics, Pose, Robot
@@ -14,7 +16,7 @@ from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_pose
+from omnid.transport.decode import PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose, decode_pose
 from omnid.transport.features_attachment import features_from_bytes
 from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.viewer import status_plots
@@ -23,6 +25,7 @@ from omnid.viewer.targets import ViewerTarget
 
 CONNECT_TIMEOUT_S: Final = 2.0
 POLL_S: Final = 0.5  # between two checks for the end
+MOST_POSES: Final = 100
 
 
 class RobotView:
@@ -30,6 +33,7 @@ class RobotView:
 
     def __init__(self, scene: RerunScene) -> None:
         self._scene, self._changes = scene, status_plots.StatusChanges()
+        self._poses: deque[Pose] = deque(maxlen=MOST_POSES)  # a pose in the map comes later than that in odom
         self.broken = 0
 
     def follow(self, bus: BusConfig, target: ViewerTarget, seconds: float | None) -> None:
@@ -68,7 +72,12 @@ class RobotView:
         match content:
             case Pose():
                 self._scene.pose(content)
+                self._poses.append(content)
                 self._scene.latency(content.stamp_ns, ("age",), 1e-6 * (message.received_ns - content.stamp_ns))
+            case PoseInMap():
+                for pose in self._poses:
+                    if pose.stamp_ns == content.stamp_ns:
+                        self._scene.correction(pose.stamp_ns, content.T_map_base @ se3.inverse(pose.T_odom_base))
             case Diagnostics():
                 self._diagnostics(content)
             case Cloud():
@@ -90,11 +99,13 @@ class RobotView:
         status_plots.draw(diagnostics, self._changes, self._scene)
 
 
-def _decoded(message: ReceivedMessage) -> Pose | Diagnostics | Cloud | Scan | RosImage | None:
+def _decoded(message: ReceivedMessage) -> Pose | PoseInMap | Diagnostics | Cloud | Scan | RosImage | None:
     """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
     match message.topic:
         case "odom":
             return decode_pose(message.payload, message.attachment, message.received_ns)
+        case "map_pose":
+            return decode_map_pose(message.payload)
         case "status":
             return decode_diagnostics(message.payload)
         case "cloud":

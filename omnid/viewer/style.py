@@ -36,6 +36,8 @@ STATES: Final = {  # the worse, the thicker
     "lost": Style((213, 94, 0), 5.0),
 }
 OBSTACLE: Final = Style((213, 40, 40), 3.0)  # dots around the base
+KEYFRAME: Final = Style((60, 60, 60), 2.5)  # dots, and the path through them
+LOOP: Final = Style((170, 80, 200), 1.0)
 INLIER: Final = Style((86, 180, 233), 2.5)  # dots
 REJECTED: Final = Style((213, 94, 0), 5.0)  # crosses
 NEW: Final = Style((240, 228, 66), 4.0)  # squares

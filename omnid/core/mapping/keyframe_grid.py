@@ -26,6 +26,7 @@ class KeyframeScans:
 
     scans: Mapping[int, NDArray[np.float16]]  # (360,) each, see range_scan.py
     T_map_rect: Array
+    loops: tuple[tuple[int, int], ...] = ()  # ids of the keyframes between which places were recognised
 
 
 class KeyframeGrid:

@@ -166,12 +166,14 @@ class MapLocaliser:
 
         Of a map that stays as it is, its own ones only.
         """
-        now = self.places.next_id, len(self.places), self._part, len(self._part_of), self.correction.optimisations
+        now = (self.places.next_id, len(self.places), self._part, len(self._part_of), self.correction.optimisations,
+               len(self.places.links))
         if self._scans is None or self._scans[0] != now:
             ids = sorted(id for id, part in self._part_of.items() if part == self._part)
             ids = [id for id in ids if id in self._fixed] or ids
             poses = np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4)
-            self._scans = now, KeyframeScans({id: self.places.keyframes[id].scan for id in ids}, poses)
+            loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
+            self._scans = now, KeyframeScans({id: self.places.keyframes[id].scan for id in ids}, poses, loops)
         return self._scans[1]
 
     def _advance(self, frame: OdometryFrame) -> None:

@@ -54,6 +54,7 @@ def publish(bus: Bus, number: int) -> None:
     pose = codec.odometry_cdr(stamp_ns, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
     bus.publish("odom", pose if number % 7 else b"nonsense",
                 PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
+    bus.publish("map_pose", codec.pose_with_covariance_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
@@ -84,6 +85,8 @@ def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     np.testing.assert_allclose(xyz, np.column_stack([0.01 * numbers, 0.5 + 0 * numbers, 0 * numbers]), atol=1e-5)
     assert rows(drawn, "/state", "StateChange:state")[0].value == ["degraded"]
     assert rows(drawn, "/latency/odometry", "Scalars:scalars")[0].value == [30.5]
+    corrections = rows(drawn, "/correction/position\\ mm", "Scalars:scalars")
+    assert corrections and corrections[0].value == [pytest.approx(200.0)]
     assert np.allclose(rows(drawn, "/panorama/inliers", "Points2D:positions")[0].value, [[3, 4], [5, 6]])
     assert rows(drawn, "/panorama", "EncodedImage:blob") and rows(drawn, "/odom/map", "Points3D:positions")
     assert verified(drawn)

@@ -20,6 +20,7 @@ from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified
 from tests.replay.command import Command
+from tests.simulation import build, write_log
 
 START_NS = 10**18
 
@@ -76,6 +77,23 @@ def test_draws_map_ellipsoid_and_plots(drawn: Path) -> None:
     odometry_ms = [row.value[0] for row in rows(drawn / "out.rrd", "/latency/odometry", "Scalars:scalars")]
     assert odometry_ms and min(odometry_ms) > 0
     assert {"/legend", "/state", "/log", "/sigma/position\\ mm"} <= entities(drawn / "out.rrd")
+
+
+def test_draws_keyframes_and_loops_of_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A drive there and back closes loops; keyframes lie on the path, where nothing corrects it much."""
+    need_rerun()
+    run = build("there_and_back", seed=3, size=256)
+    write_log(tmp_path, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    omnid, drawn = Command(capsys), tmp_path / "out.rrd"
+    assert omnid("view", tmp_path / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet", "-o", drawn).code == 0
+    keyframes = np.array(rows(drawn, "/odom/keyframes", "Points3D:positions")[-1].value)
+    loops = rows(drawn, "/odom/loops", "LineStrips3D:strips")
+    _, path = positions(drawn)
+    apart = np.linalg.norm(keyframes[:, None] - path[None], axis=2).min(axis=1)
+    assert len(keyframes) >= 5 and apart.max() < 0.05
+    assert len(loops[0].value or []) == 0 and len(loops[-1].value) >= 3
+    corrections = [row.value[0] for row in rows(drawn, "/correction/position\\ mm", "Scalars:scalars")]
+    assert len(corrections) == len(path) and corrections[0] == 0 and 0 < corrections[-1] < 50
 
 
 def test_shows_a_recording(drawn: Path, omnid: Command) -> None:
