@@ -4,7 +4,8 @@ DRIVE and TRIAL are folders of `python -m tests.simulation ... --mirrors`, of on
 start is DRIVE/nominal.toml, or the file of that name by --rig; --perturbed: DRIVE/rig.toml with focal lengths 0.1 %,
 centres 0.3 px, xi 0.5 % and the upper camera's tilt 0.1 degree off. ATE: of the path as a rigid body, and from the
 first pose as `omnid eval` does it, which contains the direction of the rig frame. Sigma: of lengths, as the command
-says.
+says. --sigmas: also the errors of each parameter in parts of its stated standard deviation, where the true cameras are
+of the rig's model, and their rms.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from pathlib import Path
 import numpy as np
 
 import omnid
+from calib import se3
+from calib.fit.drive_parameters import RigParameters
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
@@ -47,11 +50,29 @@ def perturbed(rig: Rig) -> Rig:
     return with_upper_rotated(replace(rig, lower=sides[0], upper=sides[1]), (0.07, -0.07, 0.0))
 
 
-def row(drive: Path, trial: Path, start: Rig) -> str:
-    """Return one row of the table."""
+def parameter_scores(found: Rig, truth: Rig) -> dict[str, float]:
+    """Return the errors of a rig's parameters in parts of their stated standard deviations, by name.
+
+    Both rigs have unified cameras. The baseline's length is left out: images do not show it.
+    """
+    assert found.covariance is not None
+    # The parameters are those of a rig frame that stays with the lower camera.
+    X = se3.inverse(truth.lower.T_cam_rig) @ found.lower.T_cam_rig
+    lower, upper = (replace(mounted, T_cam_rig=mounted.T_cam_rig @ X) for mounted in (truth.lower, truth.upper))
+    parameters, true = (RigParameters.about(rig, ("k1", "k2", "p1", "p2"))
+                        for rig in (found, replace(truth, lower=lower, upper=upper)))
+    turned = parameters.transform_steps(true.rig) * parameters.units
+    errors = dict(zip(parameters.names, (parameters.values - true.values - turned).tolist(), strict=True))
+    return {name: errors[name] / found.covariance.sigma(name) for name in found.covariance.names if name in errors}
+
+
+def row(drive: Path, trial: Path, start: Rig, scores: list[dict[str, float]] | None = None) -> str:
+    """Return one row of the table; add the errors of the parameters to scores."""
     started = time.process_time()
     found = calibrate_drive([drive / "log.mcap"], start, report=lambda line: print(line, file=sys.stderr))
     spent_s = time.process_time() - started
+    if scores is not None:
+        scores.append(parameter_scores(found.rig, read_rig(drive / "rig.toml")))
     result = omnid.replay(trial / "log.mcap", found.rig)
     truth = read_tum(trial / "truth.txt")
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
@@ -81,12 +102,16 @@ def main() -> None:
     parser.add_argument("pairs", nargs="+", metavar="DRIVE:TRIAL")
     parser.add_argument("--rig", default="nominal.toml", metavar="FILE", help="the start, in the folder DRIVE")
     parser.add_argument("--perturbed", action="store_true", help="start from the true rig with small errors")
-    args = parser.parse_args()
+    parser.add_argument("--sigmas", action="store_true", help="compare the errors of the parameters with their sigmas")
+    args, scores = parser.parse_args(), list[dict[str, float]]()
     print(HEAD)
     for pair in args.pairs:
         drive, trial = map(Path, pair.split(":"))
         start = perturbed(read_rig(drive / "rig.toml")) if args.perturbed else read_rig(drive / args.rig)
-        print(row(drive, trial, start), flush=True)
+        print(row(drive, trial, start, scores if args.sigmas else None), flush=True)
+    for name in sorted({name for one in scores for name in one}):
+        values = [one[name] for one in scores if name in one]
+        print(f"{name:12s} rms {np.sqrt(np.mean(np.square(values))):.2f}: " + " ".join(f"{one:+.2f}" for one in values))
 
 
 if __name__ == "__main__":
