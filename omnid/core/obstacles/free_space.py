@@ -110,7 +110,8 @@ class FreeSpace:
         x, y = np.floor(centre).astype(np.int64) - self._corner
         free[y, x] = True  # the robot stands there
         free &= ~self._floor.changed
-        self._floor.learn(window.cells, looks.grey, free[window.cells])
+        # What is assumed is not confirmed by looks: a plain wall looks the same as well.
+        self._floor.learn(window.cells, looks.grey, free[window.cells] & ~assumed[window.sector])
         free[window.cells] |= same
         self._seen_ns[free] = stamp_ns
         # 3. Memory along the directions; without floor in view that neither stereo nor its brightness shows.

@@ -299,3 +299,10 @@ def test_without_the_height_of_the_cameras_floor_is_free_in_view_as_long_as_ster
     step(ring, 0, pose(), floor_beside(0), view)
     assert step(ring, S, pose(), NOTHING, view).free_m[AHEAD].min() > 2.5
     np.testing.assert_allclose(step(ring, 2 * S, pose(), NOTHING, view).free_m[AHEAD], 1.0, atol=0.1)
+
+
+def test_assumed_floor_in_view_is_not_kept_by_its_looks() -> None:
+    drive = Drive(SeenFloor(plain))
+    np.testing.assert_allclose(drive.go(3, floor_beside(40)).free_m[175:185], 1.2, atol=0.1)
+    away = drive.go(30, floor_beside(40), 0.05)
+    assert drive.x_m > 0.09 and away.free_m[175:185].max() <= 0.8 + CELL_M
