@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 Greys = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-CHANGE_GREY: Final = 8.0  # mean difference over SMOOTH_CELLS^2 cells; unchanged floor: 0.8 (p95), 1.8 (p99.5)
-CHANGE_PER_NOISE: Final = 1.0  # the same where the panorama has so much noise
+CHANGE_PER_NOISE: Final = 1.0  # least mean difference over SMOOTH_CELLS^2 cells, where the panorama has so much noise
 FAINTEST_GREY: Final = 30.0  # a difference that must be told: with more noise, nothing can be compared
 SMOOTH_CELLS: Final = 3
 LEARNING: Final = 0.3  # share of the newest view in what is remembered
@@ -28,7 +27,9 @@ LEAST_GAIN: Final = 0.1
 class FloorMemory:
     """Brightness (CELLS, CELLS) of the cells of a square, NaN unknown, and which of them look otherwise now."""
 
-    def __init__(self, cells: int) -> None:
+    def __init__(self, cells: int, change_grey: float) -> None:
+        """change_grey: least mean difference over SMOOTH_CELLS^2 cells that is a change; 0: nothing is compared."""
+        self._change_grey = change_grey
         self.grey: Greys = np.full((cells, cells), np.nan, np.float32)
         self.changed: Flags = np.zeros((cells, cells), bool)
         self._gain = 1.0  # of the newest panorama, against what is remembered
@@ -46,8 +47,8 @@ class FloorMemory:
         if steady.sum() < LEAST_CELLS:
             return np.zeros_like(both)
         self._gain = gain = max(float(np.median(grey[steady] / np.maximum(before[steady], 1.0))), LEAST_GAIN)
-        limit = max(CHANGE_GREY, CHANGE_PER_NOISE * noise_grey / gain)
-        if limit > FAINTEST_GREY:
+        limit = max(self._change_grey, CHANGE_PER_NOISE * noise_grey / gain)
+        if CHANGE_PER_NOISE * noise_grey / gain > FAINTEST_GREY or not self._change_grey:
             return np.zeros_like(both)
         difference = np.where(both, grey / np.float32(gain) - before, np.float32(0.0))
         size = (SMOOTH_CELLS, SMOOTH_CELLS)

@@ -63,13 +63,15 @@ class _Window(NamedTuple):
 class FreeSpace:
     """Stamps and looks of the cells that were seen to be free, in a square around the robot of bounded size."""
 
-    def __init__(self, reach_m: float, memory_s: float) -> None:
-        """reach_m: farthest distance that is looked up; memory_s: for which a cell stays free."""
+    def __init__(self, reach_m: float, memory_s: float, change_grey: float) -> None:
+        """reach_m: farthest distance that is looked up; memory_s: for which a cell stays free; change_grey: of its
+        brightness, that shows that something hides it, 0: its brightness is not compared.
+        """
         self._memory_ns = round(memory_s * 1e9)
         steps = int(min(reach_m, (MARGIN_CELLS - 2) * CELL_M) / STEP_M)
         self._distances = STEP_M * np.arange(1, steps + 1)
         self._seen_ns = np.full((CELLS, CELLS), NEVER, np.int64)
-        self._floor = FloorMemory(CELLS)
+        self._floor = FloorMemory(CELLS, change_grey)
         self._corner = np.zeros(2, np.int64)  # cell (0, 0) in odom
         self._directions = azimuths()
         self._rest: tuple[Array, int] | None = None  # place [m] where the base stands, and since when

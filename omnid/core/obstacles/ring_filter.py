@@ -50,7 +50,7 @@ class RingFilter:
         self._settings = settings
         self._history: deque[tuple[int, RingPoints]] = deque(maxlen=PAIRS - 1)
         self._memory: RingPoints | None = None
-        self._free = FreeSpace(settings.max_range_m, settings.free_s)
+        self._free = FreeSpace(settings.max_range_m, settings.free_s, settings.change_grey)
         self._directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths())])
 
     def clear(self) -> None:

@@ -29,6 +29,10 @@ class RingSettings:
     free_s: float = knob(60.0, "floor that was seen to be free counts as free for so long where none is seen now, s",
                          low=0, high=3600)
 
+    change_grey: float = knob(8.0, "change of the floor's brightness that shows that something hides it, grey levels; "
+                              "more for mirrors that darken towards their rim; 0: not compared, and floor in view "
+                              "that stereo does not see again is free for 1.5 s", low=0, high=100)
+
     def __post_init__(self) -> None:
         """Raise OmnidError unless the heights are in order."""
         if self.heights_m[0] >= self.heights_m[1]:

@@ -198,8 +198,8 @@ PERIOD_NS = S // 10
 class Drive:
     """Pairs of a drive along x at 10 Hz over a floor that stereo sees up to 3 m, or not at all."""
 
-    def __init__(self, floor: SeenFloor) -> None:
-        self.floor, self.ring, self.x_m, self.stamp_ns = floor, RingFilter(SETTINGS), 0.0, 0
+    def __init__(self, floor: SeenFloor, settings: RingSettings = SETTINGS) -> None:
+        self.floor, self.ring, self.x_m, self.stamp_ns = floor, RingFilter(settings), 0.0, 0
 
     def go(self, pairs: int, stereo: Observation, speed_mps: float = 0.0) -> Observation:
         """Return the ring after so many pairs."""
@@ -306,3 +306,12 @@ def test_assumed_floor_in_view_is_not_kept_by_its_looks() -> None:
     np.testing.assert_allclose(drive.go(3, floor_beside(40)).free_m[175:185], 1.2, atol=0.1)
     away = drive.go(30, floor_beside(40), 0.05)
     assert drive.x_m > 0.09 and away.free_m[175:185].max() <= 0.8 + CELL_M
+
+
+def test_a_change_of_brightness_below_the_setting_hides_nothing_and_none_is_compared_at_0() -> None:
+    for change_grey, free_m in ((40.0, 2.85), (8.0, 1.05), (0.0, 2.85)):
+        drive = Drive(SeenFloor(plain), replace(SETTINGS, change_grey=change_grey))
+        drive.go(3, floor_beside(0))
+        drive.floor.pillars = [Pillar(1.3, 0.0, 0.25, grey=145.0)]
+        np.testing.assert_allclose(drive.go(1, NOTHING).free_m[177:183], free_m, atol=0.15)
+    assert drive.go(MISSED_NS // PERIOD_NS + 1, NOTHING).free_m[177:183].max() < 0.9
