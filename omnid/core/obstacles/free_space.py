@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.floor_memory import FloorMemory
@@ -38,6 +39,8 @@ RESTING_M: Final = 0.05  # within which a base stands
 END_M: Final = 0.15  # before the end of the floor that was seen: steps of 0.1 m and the noise of stereo
 VIEW_CELLS: Final = 50  # up to here the floor is compared: farther away a pixel is longer than two cells
 NEAREST_STEPS: Final = 3  # that are the nearest floor in view
+SIDE_SECTORS: Final = 25  # to each side of a near obstacle, in which stereo may miss its sides
+POSSIBLE_CELLS: Final = 5  # around a cell that was never free: the end of the floor is known to two cells
 ROBOT_M: Final = 0.25  # nearer to the middle of the base nothing can come, and a cell belongs to many directions
 MISSED_NS: Final = 1_500_000_000  # for which floor in view is free that neither stereo nor its brightness shows
 SHIFT: Final = 4  # fractional bits of the corners that are drawn
@@ -98,9 +101,9 @@ class FreeSpace:
         window = self._window(T_odom_base)
         looks = self._look(window, view)
         same = self._floor.compare(window.cells, looks.grey, looks.noise_grey)
+        self._mark_near(window, looks.in_view, along, obstacle_m)
         # A shadow lies on the floor, which both cameras still see as a plane.
         self._floor.changed[window.cells][window.distance < seen.plane_m[window.sector]] = False
-        self._mark_near(window, looks.in_view, along, obstacle_m)
         hidden_m = self._up_to(self._floor.changed[along], math.inf)
         # 2. Floor that counts as free: seen in this pair, or too near to be seen where the base stands.
         unseen = seen.free_m <= 0
@@ -152,12 +155,23 @@ class FreeSpace:
         is_changed = self._floor.changed[rows, columns]
         is_known = np.isfinite(self._floor.grey[rows, columns])
         sees = np.asarray(shown.any(axis=1))
-        has_obstacle = obstacle_m <= self._distances[nearest[:, -1]]
-        covered = sees & is_changed.any(axis=1) & ~has_obstacle
+        nearest_m = self._distances[nearest[:, -1]]
+        has_obstacle = obstacle_m <= nearest_m
+        # What stands there or nearer hides all floor behind it, too: one changed cell of them is the edge of a thing.
+        covered = sees & is_changed.all(axis=1) & ~has_obstacle
         is_open = has_obstacle | (sees & (is_known & ~is_changed).all(axis=1))
         near = ~in_view & (window.distance < self._distances[first][window.sector])
+        # It stands where something may have stood before, or is the side of a near obstacle; only where there is
+        # neither, it may stand anywhere on the way.
+        around = np.ones((POSSIBLE_CELLS, POSSIBLE_CELLS), np.uint8)
+        possible = cv2.dilate(((self._seen_ns == NEVER) & ~square).astype(np.uint8), around) > 0
+        possible |= self._floor.changed & ~square
+        stands = possible[along] & (np.arange(len(self._distances)) < first[:, None]) & (self._distances > ROBOT_M)
+        side_m = minimum_filter1d(np.where(has_obstacle, obstacle_m, math.inf), 2 * SIDE_SECTORS + 1, mode="wrap")
+        from_m = np.minimum(self._up_to(stands, math.inf), side_m - END_M)
+        before = window.distance < np.where(np.isfinite(from_m), from_m, 0.0)[window.sector]
         changed = self._floor.changed[window.cells]
-        changed[near & covered[window.sector]] = True
+        changed[near & covered[window.sector] & ~before] = True
         changed[(near & is_open[window.sector]) | (window.distance < ROBOT_M)] = False
 
     def _stands(self, stamp_ns: int, position: Array) -> bool:

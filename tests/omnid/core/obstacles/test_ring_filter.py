@@ -270,10 +270,40 @@ def test_what_covers_the_nearest_floor_in_view_may_stand_nearer_unless_the_ring_
     box = Drive(SeenFloor())
     box.go(3, floor_beside(0))
     box.floor.pillars = [near]
-    assert box.go(1, ring_of(0.6)).free_m[173:187].max() <= ROBOT_M + CELL_M, "one pair is no vote"
+    assert box.go(2, NOTHING).free_m[173:187].max() <= ROBOT_M + CELL_M
     for stereo in (ring_of(0.6), NOTHING):
         np.testing.assert_allclose(box.go(2, stereo).free_m[175:185], 0.6, atol=0.06)
         np.testing.assert_allclose(box.go(1, stereo).ranges_m[175:185], 0.6, atol=0.01)
+
+
+def test_what_covers_the_floor_beside_a_near_obstacle_is_its_side() -> None:
+    drive = Drive(SeenFloor())
+    drive.go(3, floor_beside(0))
+    half = np.asarray((azimuths() > -0.3) & (azimuths() < -0.05))
+    drive.go(3, ring_of(0.6, half))
+    drive.floor.pillars = [Pillar(0.55, 0.0, 0.2)]
+    covered = drive.go(4, ring_of(0.6, half)).free_m[178:187]
+    np.testing.assert_allclose(covered, 0.6 - END_M, atol=CELL_M)
+
+
+def test_what_is_passed_by_covers_the_floor_from_where_it_stands() -> None:
+    drive = Drive(SeenFloor())
+    drive.floor.pillars = [Pillar(1.5, -0.6, 0.1)]
+    bearing = np.arctan2(-0.6, 1.5)
+    free = np.where(np.abs(azimuths() - bearing) < np.deg2rad(5), 1.3, 3.0).astype(np.float32)
+    drive.go(3, floor_beside(0)._replace(free_m=free))
+    beside = drive.go(50, NOTHING, 0.3)
+    assert 1.4 < drive.x_m < 1.6
+    right = beside.free_m[85:95]
+    assert right.max() < 0.8 and right.min() > 0.3, "not up to the base"
+
+
+def test_what_stands_behind_the_nearest_floor_in_view_closes_no_nearer_floor() -> None:
+    drive = Drive(SeenFloor())
+    drive.go(3, floor_beside(0))
+    drive.floor.pillars = [Pillar(1.12, 0.0, 0.2)]
+    seen = drive.go(5, NOTHING).free_m[175:185]
+    assert seen.max() <= 0.92 + CELL_M and seen.min() > 0.7
 
 
 def test_floor_that_was_hidden_for_longer_than_memory_is_learned_again() -> None:
