@@ -12,6 +12,8 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
+PATIENCE_S = 4.0  # for which somebody waits for the robot before he turns round, if his path goes back and forth
+
 
 @dataclass(frozen=True, slots=True)
 class Person:
@@ -40,6 +42,13 @@ class Person:
         x_m, y_m = (float(np.interp(along_m, reached_m, points[:, axis])) for axis in (0, 1))
         return x_m, y_m, math.atan2(ahead[1], ahead[0])
 
+    def turned(self, walked_s: float) -> float:
+        """Return the time of walking, of a path back and forth, that has the same place on the way back."""
+        lengths_m = np.linalg.norm(np.diff(np.array(self.path), axis=0), axis=1)
+        leg_s = float(lengths_m.sum()) / self.speed_mps
+        leg, on_it_s = divmod(walked_s, leg_s)
+        return (leg + 2) * leg_s - on_it_s
+
 
 class Walkers:
     """The people of a world as time passes; those who wait for the robot begin when it is near enough."""
@@ -47,6 +56,7 @@ class Walkers:
     def __init__(self, people: tuple[Person, ...]) -> None:
         self._people = people
         self._started_s: list[float | None] = [None if person.starts_within_m else person.start_s for person in people]
+        self._waited_s = [0.0] * len(people)
         self.time_s = 0.0
 
     def advance(self, time_s: float, robot: Point) -> None:
@@ -55,10 +65,21 @@ class Walkers:
         for number, person in enumerate(self._people):
             started_s = self._started_s[number]
             if person.waits_within_m and started_s is not None and self._comes_near(person, passed_s, started_s, robot):
-                self._started_s[number] = started_s + passed_s
+                self._started_s[number] = self._after_waiting(number, started_s + passed_s, passed_s)
+            else:
+                self._waited_s[number] = 0.0
             if self._started_s[number] is None and time_s >= person.start_s and (
                     math.dist(robot, person.path[-1]) <= person.starts_within_m):
                 self._started_s[number] = time_s
+
+    def _after_waiting(self, number: int, started_s: float, passed_s: float) -> float:
+        """Return when somebody would have had to start who has waited for one more step."""
+        person = self._people[number]
+        self._waited_s[number] += passed_s
+        if person.repeat != "back and forth" or self._waited_s[number] < PATIENCE_S:
+            return started_s
+        self._waited_s[number] = 0.0
+        return self.time_s - person.turned(self.time_s - started_s)
 
     def _comes_near(self, person: Person, passed_s: float, started_s: float, robot: Point) -> bool:
         """True if the last step brings a person too near to the robot."""

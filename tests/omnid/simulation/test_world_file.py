@@ -9,7 +9,7 @@ import pytest
 
 from omnid.errors import OmnidError
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.people import Walkers
+from omnid.simulation.people import PATIENCE_S, Walkers
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
 HALL = """
@@ -64,6 +64,20 @@ def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
     for tenth in range(31, 41):
         people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
     assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
+
+
+def test_people_who_have_waited_for_long_turn_round(tmp_path: Path) -> None:
+    polite = HALL.replace('repeat = "back and forth"', 'repeat = "back and forth"\nwaits_within_m = 0.8')
+    people = Walkers(load_world(write(tmp_path, polite), 1).people)
+    robot = (0.5, -1.0)  # in the way for good
+    places = []
+    for tenth in range(1, 81):
+        people.advance(0.1 * tenth, robot)
+        places.append(people.places()[0])
+    waiting = np.flatnonzero(np.abs(np.diff(places, axis=0)[:, 0]) < 1e-9)
+    assert len(waiting) == pytest.approx(10 * PATIENCE_S, abs=2)
+    x_m, _, heading_rad = places[waiting[-1] + 4]
+    assert x_m == pytest.approx(places[waiting[-1]][0] - 0.2, abs=0.11) and abs(heading_rad) == pytest.approx(np.pi)
 
 
 def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
