@@ -12,7 +12,8 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
-PATIENCE_S = 4.0  # for which somebody waits for the robot before he turns round, if his path goes back and forth
+PATIENCE_S = 4.0  # for which somebody waits for the robot, then comes nearer, and after as much turns round if he can
+IMPATIENT = 0.5  # of the distance at which he waits: this near he comes then
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,28 +65,26 @@ class Walkers:
         passed_s, self.time_s = time_s - self.time_s, time_s
         for number, person in enumerate(self._people):
             started_s = self._started_s[number]
-            if person.waits_within_m and started_s is not None and self._comes_near(person, passed_s, started_s, robot):
-                self._started_s[number] = self._after_waiting(number, started_s + passed_s, passed_s)
-            else:
-                self._waited_s[number] = 0.0
+            if person.waits_within_m and started_s is not None:
+                self._started_s[number] = self._polite(number, started_s, passed_s, robot)
             if self._started_s[number] is None and time_s >= person.start_s and (
                     math.dist(robot, person.path[-1]) <= person.starts_within_m):
                 self._started_s[number] = time_s
 
-    def _after_waiting(self, number: int, started_s: float, passed_s: float) -> float:
-        """Return when somebody would have had to start who has waited for one more step."""
-        person = self._people[number]
-        self._waited_s[number] += passed_s
-        if person.repeat != "back and forth" or self._waited_s[number] < PATIENCE_S:
+    def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
+        """Return when somebody started who waits for the robot: later by the step, if he stands."""
+        person, walked_s = self._people[number], self.time_s - started_s
+        before_m, now_m = (math.dist(person.place(at_s)[:2], robot) for at_s in (walked_s - passed_s, walked_s))
+        if now_m >= before_m or now_m >= person.waits_within_m:
+            self._waited_s[number] = 0.0
             return started_s
+        self._waited_s[number] += passed_s
+        if self._waited_s[number] >= PATIENCE_S and now_m >= IMPATIENT * person.waits_within_m:
+            return started_s
+        if self._waited_s[number] < 2 * PATIENCE_S or person.repeat != "back and forth":
+            return started_s + passed_s
         self._waited_s[number] = 0.0
-        return self.time_s - person.turned(self.time_s - started_s)
-
-    def _comes_near(self, person: Person, passed_s: float, started_s: float, robot: Point) -> bool:
-        """True if the last step brings a person too near to the robot."""
-        before_m, now_m = (math.dist(person.place(at_s - started_s)[:2], robot)
-                           for at_s in (self.time_s - passed_s, self.time_s))
-        return now_m < before_m and now_m < person.waits_within_m
+        return self.time_s - person.turned(walked_s - passed_s)
 
     def faces(self) -> list[Rectangle]:
         """Return the people's rectangles in the world now."""

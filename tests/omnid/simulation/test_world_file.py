@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from omnid.errors import OmnidError
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.people import PATIENCE_S, Walkers
+from omnid.simulation.people import IMPATIENT, PATIENCE_S, Walkers
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
 HALL = """
@@ -66,18 +67,18 @@ def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
     assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
 
 
-def test_people_who_have_waited_for_long_turn_round(tmp_path: Path) -> None:
+def test_people_who_have_waited_for_long_come_nearer_and_then_turn_round(tmp_path: Path) -> None:
     polite = HALL.replace('repeat = "back and forth"', 'repeat = "back and forth"\nwaits_within_m = 0.8')
     people = Walkers(load_world(write(tmp_path, polite), 1).people)
-    robot = (0.5, -1.0)  # in the way for good
-    places = []
-    for tenth in range(1, 81):
-        people.advance(0.1 * tenth, robot)
-        places.append(people.places()[0])
-    waiting = np.flatnonzero(np.abs(np.diff(places, axis=0)[:, 0]) < 1e-9)
-    assert len(waiting) == pytest.approx(10 * PATIENCE_S, abs=2)
-    x_m, _, heading_rad = places[waiting[-1] + 4]
-    assert x_m == pytest.approx(places[waiting[-1]][0] - 0.2, abs=0.11) and abs(heading_rad) == pytest.approx(np.pi)
+    x_m = []
+    for tenth in range(1, 120):
+        people.advance(0.1 * tenth, (0.5, -1.0))  # in the way for good
+        x_m.append(people.places()[0][0])
+    stood_at = [x for x, after in itertools.pairwise(x_m) if abs(after - x) < 1e-9]
+    first, second = stood_at[0], stood_at[-1]
+    assert first == pytest.approx(0.5 - 0.8, abs=0.06) and second == pytest.approx(0.5 - IMPATIENT * 0.8, abs=0.06)
+    assert sum(abs(x - first) < 1e-6 for x in stood_at) == pytest.approx(10 * PATIENCE_S, abs=2)
+    assert x_m[-1] < second - 0.1, "he is on his way back"
 
 
 def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
