@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
 from omnid.core.obstacles.floor_memory import FloorMemory
 from omnid.core.obstacles.floor_view import FloorView
 from omnid.core.obstacles.observation import Observation
@@ -101,7 +101,7 @@ class FreeSpace:
         window = self._window(T_odom_base)
         looks = self._look(window, view)
         same = self._floor.compare(window.cells, looks.grey, looks.noise_grey)
-        self._mark_near(window, looks.in_view, along, obstacle_m)
+        self._mark_near(window, looks.in_view, along, obstacle_m, seen.ranges_m)
         # A shadow lies on the floor, which both cameras still see as a plane.
         self._floor.changed[window.cells][window.distance < seen.plane_m[window.sector]] = False
         hidden_m = self._up_to(self._floor.changed[along], math.inf)
@@ -144,8 +144,12 @@ class FreeSpace:
         grey = np.where(in_view, seen.grey.reshape(in_view.shape), np.float32(np.nan))
         return FloorView(grey.astype(np.float32), in_view, seen.noise_grey)
 
-    def _mark_near(self, window: _Window, in_view: Flags, along: tuple[Counts, Counts], obstacle_m: Array) -> None:
-        """Mark the floor nearer than that in view where that is covered, until that is seen or the ring has it."""
+    def _mark_near(self, window: _Window, in_view: Flags, along: tuple[Counts, Counts], obstacle_m: Array,
+                   ranges_m: RangeScan) -> None:
+        """Mark the floor nearer than that in view where that is covered, until that is seen or the ring has it.
+
+        ranges_m (SECTORS,): those of this pair.
+        """
         square = np.zeros((CELLS, CELLS), bool)
         square[window.cells] = in_view
         shown = square[along]
@@ -159,6 +163,8 @@ class FreeSpace:
         has_obstacle = obstacle_m <= nearest_m
         # What stands there or nearer hides all floor behind it, too: one changed cell of them is the edge of a thing.
         covered = sees & is_changed.all(axis=1) & ~has_obstacle
+        # It would hide what is farther away as well: a range that is seen there, by votes, is of a change of the floor.
+        covered &= ~(np.isfinite(obstacle_m) & np.isfinite(ranges_m) & (ranges_m > nearest_m))
         is_open = has_obstacle | (sees & (is_known & ~is_changed).all(axis=1))
         near = ~in_view & (window.distance < self._distances[first][window.sector])
         # It stands where something may have stood before, or is the side of a near obstacle; only where there is

@@ -286,6 +286,17 @@ def test_what_covers_the_floor_beside_a_near_obstacle_is_its_side() -> None:
     np.testing.assert_allclose(covered, 0.6 - END_M, atol=CELL_M)
 
 
+def test_a_range_behind_the_nearest_floor_shows_that_nothing_stands_before_it() -> None:
+    drive = Drive(SeenFloor())
+    drive.go(3, floor_beside(0))
+    wall = ring_of(2.0)
+    drive.go(3, wall)
+    drive.floor.pillars = [Pillar(0.55, 0.0, 0.2)]
+    seen = drive.go(3, wall).free_m[175:185]
+    assert seen.min() > 0.7 and seen.max() < 1.0, "its floor looks otherwise, but not up to the base"
+    assert drive.go(1, NOTHING).free_m[175:185].max() <= ROBOT_M + CELL_M, "a remembered wall is not seen"
+
+
 def test_what_is_passed_by_covers_the_floor_from_where_it_stands() -> None:
     drive = Drive(SeenFloor())
     drive.floor.pillars = [Pillar(1.5, -0.6, 0.1)]
