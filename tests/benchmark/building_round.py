@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import NavigationFrame, PathRequest
-from omnid.simulation.demonstration import ANSWER_S, cross_track_m
+from omnid.simulation.demonstration import cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
-from omnid.tracking_state import MapState
 from tests.benchmark.route_series import (
     ASIDE_M,
     ASIDE_RAD,
@@ -36,6 +35,7 @@ from tests.benchmark.route_series import (
     START,
     UNRECOGNISED_S,
     WORLD,
+    AskedOnceLocalised,
     Driver,
     lap,
 )
@@ -79,38 +79,15 @@ class FirstDrive:
                 yield "end"
 
 
-class RoundByPath:
-    """The script of the round: driven slowly by hand until the place is known, then by a path of the map."""
+def round_by_path(line: Array, path: Array) -> AskedOnceLocalised:
+    """Return the script of the round; line: (N, 2) [m] in the world, for the hand; path: (N, 2) [m] in the map."""
 
-    def __init__(self, line: Array, path: Array) -> None:
-        """line: (N, 2) [m] in the world, for the hand; path: (N, 2) [m] in the map."""
-        self._driver, self._path, self._asked_s = Driver(line), path, math.inf
-        self.words = "time is over"
+    def asked(moment: Moment) -> Request:
+        assert moment.place is not None
+        near_m = np.linalg.norm(path[:SEEK_POINTS] - moment.place.T_map_rig[:2, 3], axis=1)
+        return PathRequest(NavigationFrame.MAP, path[int(np.argmin(near_m)):], 0.0)
 
-    def __call__(self, moment: Moment) -> Iterator[Request]:
-        """Ask for the path and wait for its end."""
-        if moment.place is None or not moment.controller.armed:
-            if moment.place is not None and math.isinf(self._asked_s):
-                yield "arm"
-            return
-        if math.isinf(self._asked_s):
-            if moment.place.state is MapState.LOCALIZED:
-                self._asked_s = moment.time_s
-                yield Setpoint(0.0)
-                near_m = np.linalg.norm(self._path[:SEEK_POINTS] - moment.place.T_map_rig[:2, 3], axis=1)
-                yield PathRequest(NavigationFrame.MAP, self._path[int(np.argmin(near_m)):], 0.0)
-            elif moment.time_s > UNRECOGNISED_S:
-                self.words = "not recognised"
-                yield "end"
-            else:
-                yield self._driver.setpoint(moment.T_world_base, SEEK_MPS) or Setpoint(0.0)
-            return
-        navigation = moment.navigation
-        if navigation is not None and moment.time_s > self._asked_s + ANSWER_S:
-            refusal = "" if navigation.answer is None else navigation.answer.refusal
-            if refusal or navigation.state.is_end:
-                self.words = f"refused: {refusal}" if refusal else f"{navigation.state} {navigation.reason}".strip()
-                yield "end"
+    return AskedOnceLocalised(line, 0, asked)
 
 
 def building_round(seed: int, size_px: int) -> RoundEnd:
@@ -123,11 +100,11 @@ def building_round(seed: int, size_px: int) -> RoundEnd:
         config = load_config(None, [f"places.map={Path(folder) / 'building.omap'}"])
         world = replace(load_world(WORLD, seed), start=(*START, 0.0), people=())
         first = simulate(world, robot, FirstDrive(line), seconds=LONGEST_S, seed=seed, config=config)
-        script = RoundByPath(line, path)
+        script = round_by_path(line, path)
         run = simulate(replace(world, start=start), robot, script, seconds=LONGEST_S, seed=seed + 1000, config=config)
     true = np.array([tick.pose for tick in run.ticks])
     stops = dict.fromkeys(line for _, line in run.lines if line.startswith("the wheels stop"))
-    return RoundEnd(script.words, math.dist(true[-1, :2], START), abs(wrap_angle(float(true[-1, 2]))),
+    return RoundEnd(script.end or "time is over", math.dist(true[-1, :2], START), abs(wrap_angle(float(true[-1, 2]))),
                     float(cross_track_m(np.vstack([line, START]), true[true_way_m(true) > 1.0, :2]).max(initial=0.0)),
                     "; ".join(stops)[:120], len(first.stamps_ns) + len(run.stamps_ns), run)
 

@@ -14,7 +14,7 @@ import math
 import random
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -114,15 +114,16 @@ class Lesson:
                 yield RouteRequest(RouteAction.FINISH)
 
 
-class Repetition:
-    """The script of a repetition: somebody drives slowly until the robot knows where it is, then it is asked for."""
+class AskedOnceLocalised:
+    """A script: somebody drives slowly until the robot knows where it is, then it is asked for something."""
 
-    def __init__(self, line: Array, begin: int) -> None:
-        self._driver, self._asked_s = Driver(line, begin), math.inf
+    def __init__(self, line: Array, begin: int, asked: Callable[[Moment], Request]) -> None:
+        """line: (N, 2) [m] in the world, driven by hand from point number begin on; asked: returns the request."""
+        self._driver, self._asked, self._asked_s = Driver(line, begin), asked, math.inf
         self.end = ""
 
     def __call__(self, moment: Moment) -> Iterator[Request]:
-        """Ask for the repetition and wait for its end."""
+        """Ask, and wait for the end."""
         if moment.place is None or not moment.controller.armed:
             if moment.place is not None and math.isinf(self._asked_s):
                 yield "arm"
@@ -131,7 +132,7 @@ class Repetition:
             if moment.place.state is MapState.LOCALIZED:
                 self._asked_s = moment.time_s
                 yield Setpoint(0.0)
-                yield RouteRequest(RouteAction.REPEAT, ROUTE)
+                yield self._asked(moment)
             elif moment.time_s > UNRECOGNISED_S:
                 self.end = "not recognised"
                 yield "end"
@@ -144,6 +145,11 @@ class Repetition:
             if refusal or navigation.state.is_end:
                 self.end = f"refused: {refusal}" if refusal else f"{navigation.state} {navigation.reason}".strip()
                 yield "end"
+
+
+def repetition(line: Array, begin: int) -> AskedOnceLocalised:
+    """Return the script of a repetition."""
+    return AskedOnceLocalised(line, begin, lambda moment: RouteRequest(RouteAction.REPEAT, ROUTE))
 
 
 def changed_world(seed: int, number: int, rng: random.Random, people: bool) -> World:
@@ -203,7 +209,7 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
             start = (x + rng.uniform(-ASIDE_M, ASIDE_M), y + rng.uniform(-ASIDE_M, ASIDE_M),
                      math.atan2(ahead_y - y, ahead_x - x) + rng.uniform(-ASIDE_RAD, ASIDE_RAD))
             world = replace(changed_world(seed, number, rng, people), start=start)
-            script = Repetition(line, begin)
+            script = repetition(line, begin)
             run = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
             yield [str(seed), f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
                    *row(taught, run, script.end or "time is over"), f"{time.process_time() - started_s:.0f}"]
