@@ -2,7 +2,8 @@
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
 optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py. The optional table
-[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s.
+[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined] is
+read by refined_rig.py.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    table.allow_only(("schema", "T_base_rig", "covariance", "times", *SIDES))
+    table.allow_only(("schema", "T_base_rig", "covariance", "times", "refined", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)
     topics = [side.text("topic") if side.has("topic") else "" for side in (lower, upper)]
@@ -83,16 +84,23 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def _write_whole(target: Path, data: bytes) -> None:
-    whole = target.is_file() or not target.exists()
-    temporary = target.with_name(f".{target.name}.{os.getpid()}") if whole else target
+    if target.exists() and not target.is_file():
+        target.write_bytes(data)
+        return
+    temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        temporary.write_bytes(data)
+        temporary.unlink(missing_ok=True)
+        with open(temporary, "xb", opener=_open_no_link) as file:
+            file.write(data)
         temporary.replace(target)
     except OSError:
-        if whole:
-            with suppress(OSError):
-                temporary.unlink()
+        with suppress(OSError):
+            temporary.unlink()
         raise
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:

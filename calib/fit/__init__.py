@@ -1,1 +1,1 @@
-"""Calibration from board views: intrinsics, rig, bundle adjustment, drift of a rig."""
+"""Fits of cameras and rigs to what they saw: least squares, boards, drives, drift and uncertainty of a rig."""

@@ -1,22 +1,23 @@
-"""The covariance of a calibrated rig, and its effect on the motion that the rig measures."""
+"""The errors of a rig with a covariance, and their effect on the motion that the rig measures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
+from calib.fit.derivatives import central_differences
 from calib.fit.parameterisation import parameterise
-from calib.fit.rig_fit import RigCalibration, has_wavefront
 from calib.models.camera import Array
+from calib.models.ocam import has_wavefront
 from calib.rig import Rig
-from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig_covariance import TRANSFORM_NAMES
 
-# Step of numeric derivatives by twists [m, rad] and by points [m]; by parameters, in sigmas.
-TWIST_STEP, POINT_STEP_M, SIGMA_STEP = 1e-6, 1e-5, 0.1
+# Steps of numeric derivatives, by points [m] and by parameters [sigmas]: small against the curvature of a projection,
+# large against its rounding.
+POINT_STEP_M, SIGMA_STEP = 1e-5, 0.1
 # The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
 # Length of the predicted drive, and its directions.
@@ -35,30 +36,6 @@ class DriveUncertainty:
     def __str__(self) -> str:
         return (f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} "
                 "degree/m")
-
-
-def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
-    """Return the covariance of a calibration's parameters for its rig; of the transform alone if the cameras are fixed.
-    """
-    names = [f"{side} {name}" for side, values in zip(("lower", "upper"), found.parameters, strict=True)
-             for name, _, _ in values]
-    J = np.eye(len(found.covariance))
-    J[len(names):, len(names):] = _transform_by_twist(found.T_upper_lower, rig)
-    return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.covariance @ J.T)
-
-
-def _transform_by_twist(T_upper_lower: Array, rig: Rig) -> Array:
-    """Return the derivatives (6, 6) of the parameters TRANSFORM_NAMES by twists of T_upper_lower."""
-    R_rect_lower = rig.T_rect_rig[:3, :3] @ rig.lower.T_cam_rig[:3, :3].T
-    R_upper_rect = T_upper_lower[:3, :3] @ R_rect_lower.T
-
-    def values(twist: Array) -> Array:
-        T_lower_upper = se3.inverse(se3.exp(twist) @ T_upper_lower)
-        turn = se3.rotation_log(R_rect_lower @ T_lower_upper[:3, :3] @ R_upper_rect)
-        x, y, z = R_rect_lower @ T_lower_upper[:3, 3]
-        return np.array([*turn, x / z, y / z, np.linalg.norm(T_lower_upper[:3, 3])])
-
-    return _differences(values, TWIST_STEP * np.ones(6))
 
 
 def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
@@ -139,7 +116,7 @@ def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tu
 
 def _pixels_by_point(rig: Rig, points: Array) -> Array:
     """Return the derivatives (N, 4, 3) of the pixels by points (N, 3) in the rectified frame."""
-    return _differences(lambda shift: _pixels(rig, points + shift), POINT_STEP_M * np.ones(3))
+    return central_differences(lambda shift: _pixels(rig, points + shift), POINT_STEP_M * np.ones(3))
 
 
 def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
@@ -151,9 +128,4 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
         return np.column_stack([mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig))
                                 for mounted in (changed.lower, changed.upper)])
 
-    return _differences(pixels, SIGMA_STEP * np.ones(len(names)))
-
-
-def _differences(function: Callable[[Array], Array], steps: Array) -> Array:
-    """Return the central differences (..., P) of a function about zero."""
-    return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)
+    return central_differences(pixels, SIGMA_STEP * np.ones(len(names)))

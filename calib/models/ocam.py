@@ -230,3 +230,13 @@ class OcamCamera:
 def project_near(camera: OmniCamera, points: Array) -> Array:
     """Return pixels (N, 2) of points (N, 3) [m] at their own distances, by a camera of any model."""
     return camera.project_near(points) if isinstance(camera, OcamCamera) else camera.project(points)
+
+
+def wavefront_of(camera: OmniCamera) -> tuple[float, ...]:
+    """Return the wavefront [m] of a camera of any model."""
+    return camera.wavefront if isinstance(camera, OcamCamera) else NO_WAVEFRONT
+
+
+def has_wavefront(camera: OmniCamera) -> bool:
+    """True if a camera's rays do not meet in one point."""
+    return any(wavefront_of(camera))

@@ -1,9 +1,8 @@
-"""Search for boards in a camera's images, with progress lines."""
+"""Search for boards in all images of a camera."""
 
 from __future__ import annotations
 
 import os
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from calib.boards.marker_board import AprilGrid, CharucoBoard
 from calib.boards.marker_finder import find_marker_board
 from calib.boards.marker_reading import seen_dictionary
 from omnid.calibration.images import Image, Images
+from omnid.calibration.progress import Progress, silent
 from omnid.errors import OmnidError
 
 AnyBoard = Board | CharucoBoard | AprilGrid
@@ -23,7 +23,7 @@ AnyBoard = Board | CharucoBoard | AprilGrid
 HINT_IMAGES = 3
 
 
-def find_boards(images: Images, board: AnyBoard, *, thorough: bool, show_progress: bool) -> list[BoardView]:
+def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Progress = silent) -> list[BoardView]:
     """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other boards."""
     views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
 
@@ -39,8 +39,7 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, show_progres
                 views.append(search.view)
             if search.grid_size != (0, 0):
                 other_grids[_sorted(search.grid_size)] += 1
-            if show_progress:
-                print(f"[{number}/{len(images)}] {name}: {_progress(search, board)}", file=sys.stderr)
+            progress(f"[{number}/{len(images)}] {name}: {_outcome(search, board)}")
     if not views:
         hint = _grid_hint(other_grids) if isinstance(board, Board) else _marker_hint(images, board)
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
@@ -51,7 +50,7 @@ def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
     return min(sides), max(sides)
 
 
-def _progress(search: BoardSearch, board: AnyBoard) -> str:
+def _outcome(search: BoardSearch, board: AnyBoard) -> str:
     view, (columns, rows) = search.view, search.grid_size
     if view is not None and isinstance(board, Board):
         return f"board found, confidence {view.confidence:.2f}"

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from calib.fit.camera_fit import CameraCalibration
+from calib.fit.boards.camera_fit import CameraCalibration
 from calib.models.camera import Mask
 from calib.models.names import model_name
 from calib.models.ocam import OcamCamera

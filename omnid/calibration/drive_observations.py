@@ -11,21 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion
+from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
 from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.log_rig_check import open_log
+from omnid.calibration.image_pairs import open_log
 from omnid.config import Config
+from omnid.core.rig.column_matches import match
 from omnid.core.rig.drive_landmarks import LANDMARKS, DriveLandmarks, PanoramaObservations, View, image_pixels
-from omnid.core.rig.rig_check import match
+from omnid.core.rig.rig_health import RigHealth
+from omnid.core.rig.rig_state import RigState
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate, Panoramas
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.odometry import OdometryStage
-from omnid.stages.rig_gate import RigGate
-from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -102,10 +103,11 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
     """Return at most so many keyframes of one drive, its landmarks, and their pixels in the images."""
     reader = open_log(log, topics, place.rig)
     try:
-        collector = DriveCollector(place)
+        front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
+        collector = DriveCollector(place, front_end.dense)
         newest = np.eye(4)
         choice = KeyframeChoice(_spacing(reader, most))
-        for update, twist in _with_twists(tracked_updates(reader, place, config, log)):
+        for update, twist in _with_twists(tracked_updates(reader, front_end, config, log)):
             newest = update.T_odom_rig
             if choice.takes(update):
                 collector.add(update, twist)
@@ -117,8 +119,8 @@ def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int
 class DriveCollector:
     """Follows the landmarks of one drive from keyframe to keyframe."""
 
-    def __init__(self, place: Geometry, landmarks: int = LANDMARKS) -> None:
-        self._place = place
+    def __init__(self, place: Geometry, dense: DenseDepths, landmarks: int = LANDMARKS) -> None:
+        self._place, self._dense = place, dense
         self._landmarks = DriveLandmarks(place.model(NOISE_PX), landmarks)
         self._T_rig_odom, self._twists, self._delays_s = list[Array](), list[Array](), list[float]()
 
@@ -131,7 +133,8 @@ class DriveCollector:
         """Take a keyframe with its twist (6,) per second, in the rig frame."""
         seen, place = update.depth.panoramas, self._place
         T_odom_rect = update.T_odom_rig @ place.T_rig_rect
-        self._landmarks.add(View(seen.lower, seen.upper, seen.visible, update.depth.disparity, T_odom_rect))
+        disparity = self._dense.of(update.depth).disparity
+        self._landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rect))
         self._T_rig_odom.append(se3.inverse(update.T_odom_rig))
         self._twists.append(twist)
         self._delays_s.append(_stamp_delay_s(seen, place.rig))
@@ -149,7 +152,7 @@ class DriveCollector:
 
 def _stamp_delay_s(seen: Panoramas, rig: Rig) -> float:
     """Return the upper minus the lower stamp of a pair; the rig's delay of the exposures is a parameter beside it."""
-    return seen.times.skew_s - rig.times.upper_delay_s if seen.times else -rig.times.upper_delay_s
+    return seen.times.skew_s - rig.times.upper_delay_s
 
 
 def _spacing(reader: LogReader, most: int) -> int:
@@ -197,21 +200,15 @@ def _twist(first: OdometryUpdate, last: OdometryUpdate) -> Array:
     return np.asarray(moved / span_s) if span_s > 0 else np.zeros(6)
 
 
-def tracked_updates(reader: LogReader, place: Geometry, config: Config, log: Path, gate: RigGate | None = None
-                    ) -> Iterator[OdometryUpdate]:
-    """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras.
-
-    gate: sees the panoramas first; None: one that warns.
-    """
-    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama, config.camera)
-    gate = RigGate(place.cylinder, "warn") if gate is None else gate
-    stereo, odometry = Stereo(place, config.stereo, gate), OdometryStage(place, config.odometry)
+def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log: Path) -> Iterator[OdometryUpdate]:
+    """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
+    pairing, health = Synchronise(front_end.geometry.rig, config.pair), front_end.health
     states: Counter[TrackingState] = Counter()
     for pair in filter(None, map(pairing.process, reader.frames())):
-        update = odometry.process(stereo.process(dewarp.process(pair)))
+        update = front_end.process(pair)
         states[update.state] += 1
-        if gate.exchanged:
-            raise OmnidError(f"{log}: {gate.warning}")
+        if health.state is RigState.EXCHANGED:
+            raise OmnidError(f"{log}: {health.warning}")
         yield update
     if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
         raise OmnidError(f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive_bundle import DriveAdjustment
+from calib.fit.drive.adjustment import DriveAdjustment
 from calib.rig import Rig
 from omnid.core.stereo.triangulation import common_perpendicular
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.fit.bundle import BundleResult
+from calib.fit.boards.bundle import BundleResult
 from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
 
 Image = NDArray[np.uint8]

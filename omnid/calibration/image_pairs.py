@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import FrameDecodeError
+from calib.rig import Rig
+from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Frame, gray
-from drivers.logs.log_formats import LOG_SUFFIXES
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.images import SUFFIXES, Image, Images, one_size, read_images
+from omnid.calibration.images import SUFFIXES, Image, Images, is_log, one_size, read_images
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
-# Number of pairs of a log that are used, evenly spread.
-TOLERANCE_NS = 10_000_000  # largest difference between the stamps of a pair: boards are held still
+# Largest difference between the stamps of a pair: boards are held still, so that 10 ms show the same instant.
+TOLERANCE_NS = 10_000_000
+# Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_PAIRS = 100
 
 
@@ -34,11 +36,10 @@ class PairedImages:
 
 def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
     """Read the images of a folder or a log; lower and upper: a log's topics. Raises OmnidError without any pair."""
-    is_log = source.suffix in LOG_SUFFIXES or (
-        source.is_dir() and any(path.suffix in LOG_SUFFIXES for path in source.iterdir()))
-    if not is_log and (lower or upper):
+    of_log = is_log(source) or (source.is_dir() and any(map(is_log, source.iterdir())))
+    if not of_log and (lower or upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
-    pairs = _of_log(source, lower, upper) if is_log else _of_folder(source)
+    pairs = _of_log(source, lower, upper) if of_log else _of_folder(source)
     if not pairs.sides[0].keys() & pairs.sides[1].keys():
         raise OmnidError(f"{source}: no pair of images: found {_counted(pairs)}; expected pairs like lower_001.png "
                          "and upper_001.png in a folder, or images with nearly equal stamps in a log")
@@ -96,3 +97,13 @@ def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Itera
             waiting = None
         else:
             waiting = frame
+
+
+def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:
+    """Open the log's two cameras: by the requested topics, by the rig's if the log has them, or by their names."""
+    rig_topics = rig.topics if rig else ("", "")
+    named = [requested or known or None for requested, known in zip(topics, rig_topics, strict=True)]
+    if rig and not any(topics):
+        with suppress(DriverError):
+            return LogReader(log, *named)
+    return LogReader(log, *topics)

@@ -31,7 +31,7 @@ LOG_FRAMES = 120
 def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
     """Read grey images of files, folders and patterns, or of a log's topic; raises OmnidError unless all are readable
     and of one size."""
-    logs = [source for source in sources if Path(source).suffix in LOG_SUFFIXES]
+    logs = [source for source in sources if is_log(Path(source))]
     if logs and len(sources) > 1:
         raise OmnidError(f"{logs[0]}: expected images, or one log alone; found {len(sources)} names")
     if topic and not logs:
@@ -39,6 +39,11 @@ def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
     images = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
     one_size(images)
     return images
+
+
+def is_log(source: Path) -> bool:
+    """True if a source of images is a log by its name."""
+    return source.suffix in LOG_SUFFIXES
 
 
 def _of_files(sources: Sequence[str]) -> Images:

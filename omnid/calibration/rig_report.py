@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.rig_fit import MOTION_NAMES, RigCalibration
+from calib.fit.boards.rig_fit import MOTION_NAMES, RigCalibration
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from omnid.calibration.figures import ARROW, Image, coverage_image, residual_image

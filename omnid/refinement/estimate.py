@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.fit.drive_bundle import DriveAdjustment, adjust_drive, observation_sigma
-from calib.fit.drive_parameters import TRANSFORM_NAMES, UPPER_DELAY, RigParameters
-from calib.fit.drive_prior import baseline_by_prior, prior_information
-from calib.fit.drive_problem import DriveObservations, DriveState
-from calib.fit.rig_fit import has_wavefront
+from calib.fit.drive.adjustment import DriveAdjustment, adjust_drive, observation_sigma
+from calib.fit.drive.observations import DriveObservations, DriveState
+from calib.fit.drive.rig_parameters import UPPER_DELAY, RigParameters
+from calib.fit.drive.rig_prior import baseline_by_prior, prior_information
+from calib.models.ocam import has_wavefront
 from calib.rig import Rig
 from calib.rig_covariance import RigCovariance
 from omnid.calibration.drive_scale import scale_change, scale_gradient
 
 Array = NDArray[np.float64]
 
-# A change counts if landmarks fit that much better, and if one parameter changes by so many sigmas. A right rig of
-# rendered rooms keeps 0.96 to 1.00 of its error, one with centres 0.3 px off has 4 to 8 times that of the new one.
-MAX_ERROR_RATIO, MIN_SIGMAS = 0.85, 5.0
-MIN_DELAY_MS = 0.5  # least change of the upper camera's delay that counts, if it has MIN_SIGMAS as well
-# Larger changes of lengths and of the upper camera's pose are told, but not applied: keyframes of before would no
-# longer fit those of after, and a rig that is so wrong was knocked, or is another one.
-MAX_APPLIED_LENGTHS, MAX_APPLIED_RAD = 0.05, np.deg2rad(1.0)
+# Error of the landmarks after a change that counts, per error before. A right rig of rendered rooms keeps 0.96 to 1.00
+# of its error; one with centres 0.3 px off has 4 to 8 times that of the new one.
+MAX_ERROR_RATIO: Final = 0.85
+# Sigmas by which one parameter of a change that counts has changed: a rig has some twenty, and none may by chance.
+MIN_SIGMAS: Final = 5.0
+# Change of the upper camera's delay that counts: at 1 m/s half a millimetre, 0.02 px at a distance of 5 m.
+MIN_DELAY_MS: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,7 @@ class RefinementRequest:
 
 @dataclass(frozen=True, slots=True)
 class RigChange:
-    """The rig that a window asks for, with its covariance, beside the one of the run; values (P,) in their own units.
+    """The rig that fits a window, with its covariance, and what changes against the run's; values (P,) in their units.
 
     The rig differs from the one of the run in what has changed significantly: geometry, or delay, or both.
     """
@@ -84,27 +85,23 @@ class RigChange:
         before, after, sigma = self.delay_ms
         return abs(after - before) > max(MIN_DELAY_MS, MIN_SIGMAS * sigma)
 
-    @property
-    def is_small(self) -> bool:
-        """True if a run may go on with the rig."""
-        moved = [abs(after - before) for name, before, after in zip(self.names, self.before, self.after, strict=True)
-                 if name in TRANSFORM_NAMES]
-        return not self.has_moved or (abs(self.lengths) <= MAX_APPLIED_LENGTHS and max(moved) <= MAX_APPLIED_RAD)
-
 
 def estimate(request: RefinementRequest) -> RigChange:
-    """Return the rig that fits a window best; CalibError where it does not tell."""
+    """Return the rig that fits a window best; CalibError where the window does not determine it."""
+    # 1. Bundle adjustment of cameras, transform, times, poses and landmarks, with the calibration as prior.
     rig, times = request.rig, (UPPER_DELAY,) if request.has_delay else ()
     parameters = RigParameters.about(rig, times=times,
                                      waves=any(has_wavefront(one.camera) for one in (rig.lower, rig.upper)))
     prior, none = prior_information(parameters, rig), np.zeros(len(parameters.names))
     found = adjust_drive(parameters, replace(request.state, steps=none), request.observations, prior)
+    # 2. What it changes, and the change of lengths that follows.
     gradient = scale_gradient(found)
     change = RigChange(rig, parameters.names, parameters.values,
                        parameters.values + found.state.steps * parameters.units, found.sigmas * parameters.units,
                        scale_change(found, rig), float(np.sqrt(gradient @ found.covariance @ gradient)),
                        observation_sigma(rig, found), found.sigma_px, len(found.state.T_rig_odom),
                        len(found.state.points))
+    # 3. Only what has changed significantly is taken over.
     refined = _with_covariance(found, rig) if change.has_moved else rig
     return replace(change, rig=replace(refined, times=found.rig.times if change.has_delay else rig.times))
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import pickle
 import sys
+from typing import Final
 
-LOWEST = 19
+# Nice value of the lowest priority.
+LOWEST: Final = 19
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Watch the rig of a run by the same landmarks seen from near and from far, which shows errors of elevation and scale.
+"""Estimate the rig's errors by the same landmarks seen from near and from far, which shows elevation and scale.
 
 Landmarks of a window of keyframes are followed in a thread of the daemon; the bundle adjustment runs in a process of
 its own at the lowest priority, because a thread would hold Python's global lock. One window at a time, then a pause.
@@ -6,56 +6,40 @@ its own at the lowest priority, because a thread would hold Python's global lock
 
 from __future__ import annotations
 
-import os
 import pickle
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import IO, TypeAlias
+from typing import IO, Final
 
 import numpy as np
 
-from calib import se3
-from calib.fit.drive_parameters import UPPER_DELAY
+from calib.errors import CalibError
+from calib.fit.drive.rig_parameters import UPPER_DELAY
 from omnid.calibration.drive_observations import DriveCollector, KeyframeChoice
 from omnid.config import RigConfig
+from omnid.diagnostics.rig_status import RefinementReport
+from omnid.engine.python_program import python, python_environment
+from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.refinement.estimate import RefinementRequest, RigChange
-from omnid.stages.geometry import Geometry, GeometryVersions
+from omnid.refinement.refined_file import RefinedRigFile
+from omnid.stages.front_end import FrontEnd
 from omnid.tracking_state import TrackingState
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
-from omnid.transport.status_names import RIG_REFINEMENT
+from omnid.transport.codec import OK, WARN
 
 PROCESS = "omnid.refinement.process"
+# Distance of keyframes: a window of 20 then covers some metres, so that landmarks come from far to near.
 KEYFRAME_M, KEYFRAME_RAD = 0.25, np.deg2rad(15)
-LANDMARKS = 200  # in view of a keyframe
-TIMEOUT_S = 300.0  # of an estimate, which takes some seconds of processor time
+# Landmarks in view of a keyframe: fewer than for a calibration, as the daemon follows them while it runs.
+LANDMARKS: Final = 200
+# Longest time of an estimate, which takes some seconds of processor time, at the lowest priority.
+TIMEOUT_S: Final = 300.0
 ADVICE = ("the landmarks of this run do not fit the rig: a camera or a mirror has moved, or the calibration was not "
           "good: run omnid calibrate drive on a recording")
-
-
 DELAY_ADVICE = ("the upper camera is exposed at other times than its stamps say: set camera.upper_delay_ms, or run "
                 "omnid calibrate drive on a recording")
-PENDING = "the landmarks of this run do not fit the rig: the refined one is used as soon as the robot stands"
-TOO_LARGE = ADVICE + "; the change is too large to be applied while the robot runs"
-APPLIED = "a refined rig is in use: not estimated again yet"
-# A robot stands if its pose stays that near for that time.
-STAND_M, STAND_RAD, STAND_S = 0.01, np.deg2rad(0.3), 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class AppliedChange:
-    """A change that the run has begun to use, when, and the file into which it was written, or why it was not."""
-
-    change: RigChange
-    stamp_ns: int
-    file: str
-
-
-Apply: TypeAlias = Callable[[RigChange], str]
 
 
 def always() -> bool:
@@ -63,24 +47,25 @@ def always() -> bool:
     return True
 
 
+def ignore(_: str) -> None:
+    """Do nothing with a line."""
+
+
 class RigRefinement:
     """A sink of poses that estimates the rig's errors; its inbox drops the oldest (policy NEWEST)."""
 
-    def __init__(self, place: Geometry | GeometryVersions, settings: RigConfig,
-                 has_time: Callable[[], bool] = always, apply: Apply | None = None, *, has_delay: bool = True) -> None:
-        """has_time: False under overload, when no keyframe is added.
+    def __init__(self, front_end: FrontEnd, settings: RigConfig, has_time: Callable[[], bool] = always,
+                 file: RefinedRigFile | None = None, report: Callable[[str], None] = ignore, *, has_delay: bool = True
+                 ) -> None:
+        """front_end: of the poses. has_time: False under overload, when no keyframe is added.
 
-        has_delay: False if the upper camera's delay is given by the configuration, and not estimated.
-        apply: takes a change that counts, once the robot stands, and begins a version of the geometry with its rig;
-        None: changes are only told.
+        file: into which a change that counts is written; None: changes are only reported. report: takes a line for the
+        log. has_delay: False if the upper camera's delay is given by the configuration, and not estimated.
         """
-        self._versions = place if isinstance(place, GeometryVersions) else GeometryVersions(place)
-        self._settings, self._has_time, self._apply, self._has_delay = settings, has_time, apply, has_delay
-        self._version = 0
-        self._standing = _Standing()
-        self._pending: RigChange | None = None  # to be applied when the robot stands
-        self._applied: AppliedChange | None = None
-        self._count = 0
+        self._place, self._dense = front_end.geometry, front_end.dense
+        self._settings, self._has_time, self._has_delay = settings, has_time, has_delay
+        self._file, self._report = file, report
+        self._outcome = ""  # what became of the newest change that counts
         self._window: DriveCollector | None = None
         self._choice = KeyframeChoice()
         self._resets = 0
@@ -88,8 +73,8 @@ class RigRefinement:
         self._newest_ns = 0
         self._child: _Estimate | None = None
         self._windows = self._failed = 0
-        self._reason = ""  # of the newest window that told nothing
-        # With its stamp, set in one assignment: status() runs in another thread.
+        self._reason = ""  # why the newest window has no result
+        # With its stamp, set in one assignment: report() runs in another thread.
         self._found: tuple[RigChange, int] | None = None
 
     @property
@@ -100,15 +85,6 @@ class RigRefinement:
     def process(self, update: OdometryUpdate) -> None:
         """Add a keyframe to the window if it is one, start the estimate of a full window, take its result."""
         self._newest_ns = update.stamp_ns
-        version = update.depth.panoramas.rig_version
-        if version != self._version:  # keyframes and estimates of the rig of before tell nothing about this one
-            self.close()
-            self._version, self._window, self._found, self._next_ns = version, None, None, update.stamp_ns
-        self._standing.observe(update)
-        if self._pending is not None and self._standing.lasts:
-            self._apply_pending(update.stamp_ns)
-        if self._versions.newest != self._version:
-            return  # the next pairs are of the new version
         if self._child is not None:
             self._take_answer()
         elif self._has_time() and not self._next_ns - self._settings.refine_s * 1e9 <= update.stamp_ns < self._next_ns:
@@ -127,17 +103,20 @@ class RigRefinement:
             self._child = None
 
     def _extend(self, update: OdometryUpdate) -> None:
+        # 1. A new window where there is none, and after a gap in the poses.
         window = self._window
         if window is None or update.state is TrackingState.LOST or update.reset_counter != self._resets:
-            window = self._window = DriveCollector(self._versions[self._version], LANDMARKS)
+            window = self._window = DriveCollector(self._place, self._dense, LANDMARKS)
             self._choice, self._resets = KeyframeChoice(1, KEYFRAME_M, KEYFRAME_RAD), update.reset_counter
+        # 2. A keyframe of it.
         if not self._choice.takes(update) or update.state is TrackingState.LOST:
             return
         window.add(update, update.velocity)
+        # 3. The estimate of a full one.
         if window.keyframes >= self._settings.refine_keyframes:
             drives = window.drives(update.T_odom_rig)
-            rig = self._versions[self._version].rig
-            self._child = _Estimate(RefinementRequest(rig, drives.state, drives.observations, self._has_delay))
+            request = RefinementRequest(self._place.rig, drives.state, drives.observations, self._has_delay)
+            self._child = _Estimate(request)
             self._window, self._next_ns = None, update.stamp_ns + self._settings.refine_s * 1e9
 
     def _take_answer(self) -> None:
@@ -149,88 +128,73 @@ class RigRefinement:
         self._child = None
         self._windows += 1
         if isinstance(answer, RigChange):
+            self._reason, self._outcome = "", self._keep(answer)
             self._found = answer, self._newest_ns
-            self._reason = ""
-            counts = self._apply is not None and answer.is_significant and answer.is_small
-            self._pending = answer if counts else None
         else:
             self._failed, self._reason = self._failed + 1, answer
 
-    def _apply_pending(self, stamp_ns: int) -> None:
-        """Let the run go on with the pending rig."""
-        assert self._apply is not None and self._pending is not None
-        change, self._pending = self._pending, None
-        self._applied = AppliedChange(change, stamp_ns, self._apply(change))
-        self._count += 1
+    def _keep(self, change: RigChange) -> str:
+        """Write the rig of a change that counts, or withdraw that of an earlier window; return what was done."""
+        if self._file is None:
+            return ""
+        try:
+            if change.is_significant:
+                outcome = f"{self._file.path}: {self._file.write(change).summary}; {self._next_start}"
+            elif self._file.withdraw():
+                outcome = f"{self._file.path}: withdrawn, as the rig of this run fits the landmarks of a later window"
+            else:
+                return ""
+        except (OmnidError, CalibError, OSError) as error:
+            outcome = f"the refined rig is not written: {error}"
+        self._report(outcome)
+        return outcome
 
-    def status(self) -> DiagnosticStatus:
-        """Return the newest estimate as a status; age_s is the time since then, by the stamps."""
-        window, found, applied = self._window, self._found, self._applied
+    @property
+    def _next_start(self) -> str:
+        return "the next start uses it" if self._settings.refine == "use" else "rig.refine = 'use' lets the next " \
+            "start use it"
+
+    def report(self) -> RefinementReport:
+        """Return the newest estimate for the status; refine_age_s is the time since then, by the stamps."""
+        window, found = self._window, self._found
         values = {"windows": str(self._windows), "windows_without_result": str(self._failed),
                   "keyframes": str(window.keyframes if window else 0),
-                  "needed_keyframes": str(self._settings.refine_keyframes), "applied": str(self._count)}
-        if applied is not None:
-            values |= _parameters(applied.change, "applied_") | {
-                "applied_age_s": f"{(self._newest_ns - applied.stamp_ns) * 1e-9:.0f}", "applied_file": applied.file}
+                  "needed_keyframes": str(self._settings.refine_keyframes), "refined_file": self._outcome,
+                  "window_problem": self._reason.replace("calibrate drive: ", "")}
         if found is None:
-            message = self._reason.replace("calibrate drive: ", "") or "not estimated yet: the robot must drive"
-            return DiagnosticStatus(RIG_REFINEMENT, OK, message if applied is None else APPLIED, values)
+            return RefinementReport(OK, "", values)
         change, stamp_ns = found
         values |= {"error_px": f"{change.error_px:.3f}", "refined_error_px": f"{change.refined_error_px:.3f}",
-                   "landmarks": str(change.landmarks), "age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
+                   "landmarks": str(change.landmarks), "refine_age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
         if not change.is_significant:
-            return DiagnosticStatus(RIG_REFINEMENT, OK, "the rig fits the landmarks of this run",
-                                    values | _lengths(change) | _delay(change))
-        values |= _parameters(change)
-        if self._pending is not None:
-            return DiagnosticStatus(RIG_REFINEMENT, WARN, PENDING, values)
-        if not change.has_moved:
-            return DiagnosticStatus(RIG_REFINEMENT, WARN, DELAY_ADVICE, values)
-        return DiagnosticStatus(RIG_REFINEMENT, WARN, ADVICE if change.is_small else TOO_LARGE, values)
+            return RefinementReport(OK, "", values | _lengths(change) | _delay(change))
+        return RefinementReport(WARN, ADVICE if change.has_moved else DELAY_ADVICE, values | _parameters(change))
 
 
-def _lengths(change: RigChange, prefix: str = "") -> dict[str, str]:
+def _lengths(change: RigChange) -> dict[str, str]:
     """Return the change of lengths, with its sigma."""
-    return {f"{prefix}lengths_percent": f"{100 * change.lengths:+.3f}",
-            f"{prefix}lengths_sigma_percent": f"{100 * change.lengths_sigma:.3f}"}
+    return {"lengths_percent": f"{100 * change.lengths:+.3f}",
+            "lengths_sigma_percent": f"{100 * change.lengths_sigma:.3f}"}
 
 
-def _delay(change: RigChange, prefix: str = "") -> dict[str, str]:
+def _delay(change: RigChange) -> dict[str, str]:
     """Return the estimated delay of the upper camera's exposures against the stamps, with its sigma."""
     if change.delay_ms is None:
         return {}
     before, after, sigma = change.delay_ms
-    return {f"{prefix}upper_delay_ms_before": f"{before:.3f}", f"{prefix}upper_delay_ms_after": f"{after:.3f}",
-            f"{prefix}upper_delay_ms_sigma": f"{sigma:.3f}"}
+    return {"upper_delay_ms_before": f"{before:.3f}", "upper_delay_ms_after": f"{after:.3f}",
+            "upper_delay_ms_sigma": f"{sigma:.3f}"}
 
 
-def _parameters(change: RigChange, prefix: str = "") -> dict[str, str]:
+def _parameters(change: RigChange) -> dict[str, str]:
     """Return every parameter before and after a change, with its sigma, and the change of lengths."""
-    values = _lengths(change, prefix) | _delay(change, prefix)
+    values = _lengths(change) | _delay(change)
     for name, before, after, sigma in zip(change.names, change.before, change.after, change.sigmas, strict=True):
         if name == UPPER_DELAY:
             continue
-        key = prefix + name.replace(" ", "_")
+        key = name.replace(" ", "_")
         values |= {f"{key}_before": f"{before:.6g}", f"{key}_after": f"{after:.6g}", f"{key}_sigma": f"{sigma:.2g}"}
     return values
-
-
-class _Standing:
-    """Time for which the robot has stood, by the poses."""
-
-    def __init__(self) -> None:
-        self._T_odom_rig, self._since_ns, self._resets = np.eye(4), 0, -1  # of the first pose since it stands
-        self.lasts = False  # True once it has stood for STAND_S
-
-    def observe(self, update: OdometryUpdate) -> None:
-        """Take a pose."""
-        moved = se3.log(se3.inverse(self._T_odom_rig) @ update.T_odom_rig)
-        stands = np.linalg.norm(moved[:3]) < STAND_M and np.linalg.norm(moved[3:]) < STAND_RAD
-        if stands and update.reset_counter == self._resets and update.state is not TrackingState.LOST:
-            self.lasts = update.stamp_ns - self._since_ns >= STAND_S * 1e9
-        else:
-            self._T_odom_rig, self._since_ns, self._resets = update.T_odom_rig, update.stamp_ns, update.reset_counter
-            self.lasts = False
 
 
 class _Estimate:
@@ -238,13 +202,12 @@ class _Estimate:
 
     def __init__(self, request: RefinementRequest) -> None:
         self._started_s = time.monotonic()
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1",
-                                    "OPENBLAS_NUM_THREADS": "1"}
+        environment = python_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
         self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed when the answer is read)
         with tempfile.TemporaryFile() as file:
             pickle.dump(request, file)
             file.seek(0)
-            self._process = subprocess.Popen([sys.executable, "-P", "-m", PROCESS], stdin=file, stdout=self._out,
+            self._process = subprocess.Popen(python("-m", PROCESS), stdin=file, stdout=self._out,
                                              stderr=subprocess.DEVNULL, env=environment, start_new_session=True)
 
     def answer(self) -> RigChange | str | None:

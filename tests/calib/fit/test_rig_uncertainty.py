@@ -9,14 +9,15 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.rig_fit import calibrate_rig
-from calib.fit.rig_uncertainty import drive_uncertainty, perturbed_rig, rig_covariance
+from calib.fit.boards.rig_covariance import rig_covariance
+from calib.fit.boards.rig_fit import fit_rig
+from calib.fit.rig_uncertainty import drive_uncertainty, perturbed_rig
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 from calib.rig_frame import rig_between
 from omnid.simulation.rendering.rigs import make_rig
-from tests.calib.fit.test_rig_fit import LOWER, ODD, RIG, UPPER, pairs
+from tests.calib.fit.boards.test_rig_fit import LOWER, ODD, RIG, UPPER, pairs
 
 
 def with_sigma(rig: Rig, name: str, sigma: float) -> Rig:
@@ -61,7 +62,7 @@ def test_covariance_describes_errors_of_noisy_corners() -> None:
     """The errors of the transform's parameters, whitened by the covariance, have a mean square of about 1."""
     squares = []
     for seed in range(8):
-        found = calibrate_rig(pairs(ODD, noise_px=0.1, seed=seed), ODD, (LOWER, UPPER))
+        found = fit_rig(pairs(ODD, noise_px=0.1, seed=seed), ODD, (LOWER, UPPER))
         rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower))
         covariance = rig_covariance(found, rig)
         assert covariance.names[:2] == ("lower xi", "lower fu") and len(covariance.names) == 16
@@ -75,6 +76,6 @@ def test_covariance_describes_errors_of_noisy_corners() -> None:
 
 
 def test_fixed_cameras_have_no_covariance() -> None:
-    found = calibrate_rig(pairs(ODD, noise_px=0.1), ODD, (LOWER, UPPER), refined=False)
+    found = fit_rig(pairs(ODD, noise_px=0.1), ODD, (LOWER, UPPER), refined=False)
     rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower))
     assert rig_covariance(found, rig).names == TRANSFORM_NAMES

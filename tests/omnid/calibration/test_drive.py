@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.fit.drive_bundle import DriveAdjustment
-from calib.fit.drive_parameters import LINE_TIME, UPPER_DELAY, RigParameters
-from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion
+from calib.fit.drive.adjustment import DriveAdjustment
+from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
+from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.models.camera import Array
 from calib.rig import Rig, ShutterTimes
-from omnid.calibration.drive import is_nominal, require_same_rig, significant_times
+from omnid.calibration.drive import significant_times
+from omnid.calibration.same_rig import is_nominal, require_same_rig
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.rigs import nominal_rig, with_real_mirrors

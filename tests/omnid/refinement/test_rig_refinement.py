@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -11,32 +12,28 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive_problem import DriveObservations, DriveState, KeyframeMotion, project
+from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion, project
 from calib.models.unified import UnifiedCamera
+from calib.refined_rig import read_refined_rig
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import tracked_updates
-from omnid.config import Config, PanoramaConfig, RigConfig, StereoConfig
+from omnid.config import Config, PanoramaConfig, RigConfig
+from omnid.core.rig.rig_health import RigContradictedError, RigHealth
 from omnid.engine.graph import Graph
 from omnid.formats.tum import read_tum
-from omnid.messages import OdometryUpdate, StereoDepth
-from omnid.refinement.estimate import RefinementRequest, RigChange, estimate
-from omnid.refinement.foreign_rig import other_rig
-from omnid.refinement.rig_application import MARK, RigApplication
-from omnid.refinement.rig_refinement import RigRefinement
-from omnid.runs.pipeline import Sinks, wire
+from omnid.messages import OdometryUpdate
+from omnid.refinement.estimate import RefinementRequest, estimate
+from omnid.refinement.other_rig import other_rig
+from omnid.refinement.refined_file import RefinedRigFile
+from omnid.refinement.rig_refinement import RigRefinement, ignore
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.rigs import make_rig
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import GeometryVersions, geometry
-from omnid.stages.odometry import OdometryStage
-from omnid.stages.rig_gate import RigContradictedError, RigGate
-from omnid.stages.stereo import Stereo
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import RIG_REFINEMENT
 from tests.simulation import build
 from tests.simulation.logs import pack_log
 from tests.simulation.paths import loop
@@ -45,7 +42,7 @@ Array = NDArray[np.float64]
 SETTINGS = RigConfig(refine_keyframes=16)
 
 
-PAIRS, STAND = 32, 24
+PAIRS = 32
 
 
 class RenderedRoom:
@@ -90,10 +87,12 @@ def shifted(mounted: MountedCamera, sign: float, off_px: float = 0.5, off_part: 
     return replace(mounted, camera=replace(camera, center=centre, focal=focal))
 
 
-def refined(folder: Path, rig: Rig, settings: RigConfig = SETTINGS) -> tuple[RigRefinement, list[OdometryUpdate]]:
+def refined(folder: Path, rig: Rig, settings: RigConfig = SETTINGS, file: RefinedRigFile | None = None,
+            report: Callable[[str], None] = ignore) -> tuple[RigRefinement, list[OdometryUpdate]]:
     """Run a log through the stages; return the refinement and the poses."""
     place, config, graph = geometry(rig, PanoramaConfig()), Config(), Graph(threaded=False)
-    refinement, kept = RigRefinement(place, settings), list[OdometryUpdate]()
+    front_end = FrontEnd(place, config, RigHealth(place.cylinder, "off"))
+    refinement, kept = RigRefinement(front_end, settings, file=file, report=report), list[OdometryUpdate]()
 
     class Collector:
         def process(self, update: OdometryUpdate) -> None:
@@ -101,9 +100,7 @@ def refined(folder: Path, rig: Rig, settings: RigConfig = SETTINGS) -> tuple[Rig
 
     frames = graph.source("log", LogReader(folder / "log.mcap").frames)
     pairs = graph.stage("pair", Synchronise(rig, config.pair), frames)
-    panoramas = graph.stage("dewarp", Dewarp(place, config.panorama), pairs)
-    depth = graph.stage("stereo", Stereo(place, config.stereo, RigGate(place.cylinder, "off")), panoramas)
-    poses = graph.stage("odometry", OdometryStage(place, config.odometry), depth)
+    poses = graph.stage("odometry", front_end.poses, graph.stage("dewarp", front_end.dewarp, pairs))
     graph.sink("refine", refinement, poses)
     graph.sink("kept", Collector(), poses)
     graph.run()
@@ -114,8 +111,8 @@ def test_a_disturbed_rig_is_reported_with_its_sigmas(rooms: Path) -> None:
     truth = read_rig(rooms / "rig.toml")
     wrong = replace(truth, lower=shifted(truth.lower, 1.0), upper=shifted(truth.upper, -1.0))
     refinement, _ = refined(rooms, wrong)
-    status = refinement.status()
-    assert (status.name, status.level) == (RIG_REFINEMENT, 1) and "omnid calibrate drive" in status.message
+    status = refinement.report()
+    assert status.level == 1 and "omnid calibrate drive" in status.message
     assert refinement.found is not None and refinement.found.is_significant
     assert float(status.values["refined_error_px"]) < 0.5 * float(status.values["error_px"])
     assert abs(float(status.values["lengths_percent"])) > 4 * float(status.values["lengths_sigma_percent"]) > 0
@@ -126,23 +123,24 @@ def test_a_disturbed_rig_is_reported_with_its_sigmas(rooms: Path) -> None:
 
 def test_a_right_rig_is_not_reported(rooms: Path) -> None:
     refinement, poses = refined(rooms, read_rig(rooms / "rig.toml"))
-    status = refinement.status()
-    assert (status.level, status.message) == (0, "the rig fits the landmarks of this run")
+    status = refinement.report()
+    assert status.level == 0 and float(status.values["error_px"]) > 0
     assert abs(float(status.values["lengths_percent"])) < 0.5 and "lower_pu_after" not in status.values
-    waiting = RigRefinement(geometry(read_rig(rooms / "rig.toml"), PanoramaConfig()), SETTINGS, lambda: False)
+    place = geometry(read_rig(rooms / "rig.toml"), PanoramaConfig())
+    waiting = RigRefinement(FrontEnd(place, Config()), SETTINGS, lambda: False)
     for update in poses[:3]:
         waiting.process(update)
-    assert waiting.status().values["keyframes"] == "0", "no keyframe under overload"
+    assert waiting.report().values["keyframes"] == "0", "no keyframe under overload"
 
 
 def test_a_gap_begins_a_new_window_and_a_running_estimate_is_ended(rooms: Path) -> None:
     rig = read_rig(rooms / "rig.toml")
     refinement, poses = refined(rooms, rig, RigConfig(refine_keyframes=80))
-    assert refinement.found is None and refinement.status().message.startswith("not estimated yet")
-    assert int(refinement.status().values["keyframes"]) > 15
+    assert refinement.found is None and refinement.report().level == 0
+    assert int(refinement.report().values["keyframes"]) > 15
     refinement.process(replace(poses[-1], reset_counter=1, T_odom_rig=np.eye(4)))
-    assert refinement.status().values["keyframes"] == "1"
-    busy = RigRefinement(geometry(rig, PanoramaConfig()), RigConfig(refine_keyframes=15))
+    assert refinement.report().values["keyframes"] == "1"
+    busy = RigRefinement(FrontEnd(geometry(rig, PanoramaConfig()), Config()), RigConfig(refine_keyframes=15))
     for update in poses:
         busy.process(update)
         if busy._child is not None:
@@ -150,106 +148,46 @@ def test_a_gap_begins_a_new_window_and_a_running_estimate_is_ended(rooms: Path) 
     assert busy._child is not None
     process = busy._child._process
     busy.close()
-    assert process.returncode is not None and busy.status().values["windows"] == "0"
+    assert process.returncode is not None and busy.report().values["windows"] == "0"
 
 
-@pytest.fixture(scope="module")
-def stop_and_go(room: RenderedRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a log of a round, of a stand at its end, and of the beginning of a second round."""
-    numbers = np.concatenate([np.arange(PAIRS), np.full(STAND, PAIRS - 1), np.arange(12)])
-    return room.write(tmp_path_factory.mktemp("stop_and_go"), numbers)
+def disturbed(truth: Rig) -> Rig:
+    """Return a rig whose cameras are slightly off."""
+    lower, upper = (shifted(side, sign, 0.2, 5e-4) for side, sign in ((truth.lower, 1.0), (truth.upper, -1.0)))
+    return replace(truth, lower=lower, upper=upper)
 
 
-class Patient:
-    """A sink that waits for each estimate, as a run in real time does by itself."""
-
-    def __init__(self, refinement: RigRefinement) -> None:
-        self.refinement, self.poses, self.statuses = refinement, list[OdometryUpdate](), list[DiagnosticStatus]()
-
-    def process(self, update: OdometryUpdate) -> None:
-        """Take a pose."""
-        self.refinement.process(update)
-        if self.refinement._child is not None:
-            self.refinement._child.wait()
-        self.poses.append(replace(update, depth=StereoDepth(update.depth.panoramas, update.depth._compute)))
-        self.statuses.append(self.refinement.status())
+def path_error(poses: list[OdometryUpdate], truth: Path) -> float:
+    """Return the relative error of the length of a path."""
+    return abs(path_m(np.array([update.T_odom_rig for update in poses])) / path_m(read_tum(truth).T[:len(poses)]) - 1)
 
 
-def applied(folder: Path, rig: Rig, path: Path | None) -> tuple[Patient, GeometryVersions, list[Rig]]:
-    """Run a log with a rig that is refined and applied."""
-    place, graph = geometry(rig, PanoramaConfig()), Graph(threaded=False)
-    config = Config(stereo=StereoConfig(rig_check="off"))
-    versions, published, lines = GeometryVersions(place), list[Rig](), list[str]()
-    application = RigApplication(versions, path, published.append, lines.append)
-    settings = RigConfig(refine="apply", refine_keyframes=16, refine_s=1e5)
-    sink = Patient(RigRefinement(versions, settings, apply=application))
-    frames = graph.source("log", LogReader(folder / "log.mcap").frames)
-    pairs = graph.stage("pair", Synchronise(rig, config.pair), frames)
-    wire(graph, pairs, place, config, Sinks(poses={"refine": sink}, versions=versions))
-    graph.run()
-    assert len(lines) == len(published)
-    return sink, versions, published
-
-
-def test_a_disturbed_rig_is_replaced_at_the_first_stand(stop_and_go: Path, tmp_path: Path) -> None:
-    truth = read_rig(stop_and_go / "rig.toml")
-    lower, upper = (shifted(side, sign, 0.3, 1e-3) for side, sign in ((truth.lower, 1.0), (truth.upper, -1.0)))
-    wrong = replace(truth, lower=lower, upper=upper)
-    path = tmp_path / "rig.toml"
-    write_rig(path, wrong)
-    calibration = path.read_bytes()
-    sink, versions, published = applied(stop_and_go, read_rig(path), path)
-    # 1. Once, while the robot stood; poses go on from where they were.
-    assert versions.newest == 1 and len(published) == 1
-    number = next(k for k, update in enumerate(sink.poses) if update.depth.panoramas.rig_version == 1)
-    assert PAIRS + 19 <= number < PAIRS + STAND
-    before, after = sink.poses[number - 1], sink.poses[number]
-    assert np.linalg.norm(after.T_odom_rig[:3, 3] - before.T_odom_rig[:3, 3]) < 1e-3
-    assert {update.reset_counter for update in sink.poses} == {0}
-    assert (np.diag(after.covariance) >= 0.99 * np.diag(before.covariance)).all()
-    # 2. Steps afterwards have the right length, those before had not.
-    T_world_rig = read_tum(stop_and_go / "truth.txt").T
-    errors = [abs(_path_m(np.array([sink.poses[k].T_odom_rig for k in part])) / _path_m(T_world_rig[part]) - 1)
-              for part in (np.arange(31), np.arange(number, len(sink.poses)))]
-    assert errors[1] < 0.6 * errors[0]
-    # 3. Status, and the file with what was there before.
-    statuses = [status.message for status in sink.statuses]
-    assert any("as soon as the robot stands" in message for message in statuses)
-    values = sink.statuses[-1].values
-    assert values["applied"] == "1" and values["applied_file"] == str(path) and sink.statuses[-1].level == 0
-    assert float(values["applied_lower_pu_before"]) > float(values["applied_lower_pu_after"])
-    assert path.read_text().startswith(MARK) and (tmp_path / "rig.original.toml").read_bytes() == calibration
-    written = read_rig(path)
-    assert written.lower.camera == versions[1].rig.lower.camera and written.covariance is not None
-
-
-def _path_m(T: Array) -> float:
+def path_m(T: Array) -> float:
+    """Return the length of a path [m]."""
     return float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
 
 
-def test_a_file_that_somebody_changed_is_left_alone(rooms: Path, tmp_path: Path) -> None:
-    path, rig = tmp_path / "rig.toml", read_rig(rooms / "rig.toml")
-    write_rig(path, rig)
-    lines = list[str]()
-    application = RigApplication(GeometryVersions(geometry(rig, PanoramaConfig())), path, lambda _: None, lines.append)
-    names, zero = ("lower pu", "r_x"), np.zeros(2)
-    change = RigChange(rig, names, zero, np.array([0.1, 0.0]), np.full(2, 0.01), 0.01, 1e-3, 0.2, 0.1, 20, 500)
-    assert application(change) == str(path) and application(change) == str(path)
-    assert (tmp_path / "rig.previous.toml").read_bytes() == path.read_bytes()
-    write_rig(path, rig)
-    calibration = path.read_bytes()
-    assert "was changed" in application(change) and path.read_bytes() == calibration
-    assert len(lines) == 3 and "not written" in lines[-1]
-    fresh = RigApplication(GeometryVersions(geometry(rig, PanoramaConfig())), tmp_path, lambda _: None, lines.append)
-    assert "not written" in fresh(change)
-
-
-def test_a_large_change_is_not_small(rooms: Path) -> None:
-    names, zero, sigmas = ("lower pu", "r_x"), np.zeros(2), np.full(2, 1e-3)
-    change = RigChange(read_rig(rooms / "rig.toml"), names, zero, np.array([3.0, 0.01]), sigmas, 0.01, 1e-3, 0.2, 0.1,
-                       20, 500)
-    assert change.is_significant and change.is_small
-    assert not replace(change, lengths=-0.06).is_small and not replace(change, after=np.array([0.0, 0.02])).is_small
+def test_a_refined_rig_is_written_and_the_next_start_uses_it(rooms: Path, tmp_path: Path) -> None:
+    calibration, path = tmp_path / "rig.toml", tmp_path / "rig.refined.toml"
+    write_rig(calibration, disturbed(read_rig(rooms / "rig.toml")))
+    content, settings = calibration.read_bytes(), RigConfig(refine="use", refine_keyframes=16, refine_s=1e5)
+    # 1. The first run has the calibration to its end, and writes the refined rig.
+    file, lines = RefinedRigFile(path, read_rig(calibration), calibration), list[str]()
+    rig = file.start(lambda _, line: lines.append(line), is_wanted=True)
+    first, poses = refined(rooms, rig, settings, file, lines.append)
+    assert file.used is None and len(lines) == 1 and f"{path}: refined" in lines[0] and "next start uses" in lines[0]
+    values = first.report().values
+    assert values["refined_file"] == lines[0] and float(values["lower_pu_before"]) > float(values["lower_pu_after"])
+    assert calibration.read_bytes() == content and [each.name for each in sorted(tmp_path.iterdir())] == [
+        "rig.refined.toml", "rig.toml"]
+    # 2. The second one begins with it, and its lengths are better.
+    file = RefinedRigFile(path, read_rig(calibration), calibration)
+    rig = file.start(lambda _, line: lines.append(line), is_wanted=True)
+    assert str(path) in lines[-1] and str(calibration) in lines[-1] and rig.covariance is not None
+    second, better = refined(rooms, rig, settings, file, lines.append)
+    assert path_error(better, rooms / "truth.txt") < 0.6 * path_error(poses, rooms / "truth.txt")
+    assert second.report().level == 0 and len(lines) == 2, "the refined rig fits, and its file stays"
+    assert read_refined_rig(path) is not None
 
 
 @pytest.mark.parametrize("offset_ms", [0.0, 7.0])
@@ -270,7 +208,7 @@ def test_a_late_upper_camera_is_found_where_there_is_one(offset_ms: float) -> No
     state = DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion(twist, np.full(keyframes, 5e-3)))
     observations = DriveObservations(keyframe[seen], landmark[seen], camera[seen], pixels[seen])
     change = estimate(RefinementRequest(truth, state, observations, has_delay=True))
-    assert change.delay_ms is not None and not change.has_moved and change.is_small
+    assert change.delay_ms is not None and not change.has_moved
     before, after, sigma = change.delay_ms
     assert before == 0 and abs(after - offset_ms) < max(5 * sigma, 0.1) and 0 < sigma < 0.2
     assert change.has_delay is change.is_significant is (offset_ms > 0)
@@ -284,7 +222,7 @@ def test_another_mirror_is_no_rig_of_a_log_and_a_replay_writes_nothing(rooms: Pa
     other = replace(right, lower=other_mirror(right.lower), upper=other_mirror(right.upper))
     write_rig(tmp_path / "other.toml", other)
     options = ReplayOptions(rig=tmp_path / "other.toml", tum=tmp_path / "a.tum", record=tmp_path / "a.mcap")
-    with pytest.raises(RigContradictedError, match=r"xi would change from 0.75 to .*rig_check=warn"):
+    with pytest.raises(RigContradictedError, match=r"xi would change from 0.75 to .*rig.check=warn"):
         run_log(rooms / "log.mcap", Config(), options)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other.toml"]
 
@@ -300,6 +238,6 @@ def other_mirror(mounted: MountedCamera) -> MountedCamera:
 def test_a_rig_that_can_be_corrected_is_not_refused(rooms: Path) -> None:
     right, config = read_rig(rooms / "rig.toml"), Config()
     rig = replace(right, lower=shifted(right.lower, 1), upper=shifted(right.upper, -1))
-    place = geometry(rig, config.panorama)
+    front_end = FrontEnd(geometry(rig, config.panorama), config)
     with closing(LogReader(rooms / "log.mcap")) as reader:
-        assert other_rig(tracked_updates(reader, place, config, rooms), place) == ""
+        assert other_rig(tracked_updates(reader, front_end, config, rooms), front_end) == ""

@@ -1,0 +1,219 @@
+"""Bundle adjustment of one camera and the poses of a board, with a Huber kernel.
+
+Every image has its own pose, which is a block of six unknowns of the normal equations (`least_squares.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy import sparse
+
+from calib import se3
+from calib.errors import CalibError
+from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
+from calib.fit.least_squares import ArrowSystem, Ending, minimise, robust_sigma
+from calib.models.camera import Array
+
+# A damped step hardly moves along a flat direction, such as xi against the focal length: so the search ends only with a
+# nearly undamped step that lowers the cost in its ninth digit. The number of steps is a bound that is never reached by
+# good data.
+ENDING = Ending(steps=60, gain=1e-9, damping=1e-7)
+# Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
+# these on the width.
+KERNEL_ROUNDS = 3
+# Width of Huber's kernel in standard deviations of one coordinate: 1 of 23 normal residuals (2-D) is longer.
+HUBER_WIDTH = 2.5
+# Least standard deviation assumed for a coordinate: exact corners would make the kernel's width 0.
+MIN_SIGMA_PX = 0.02
+# Residual of a corner that the model cannot project: larger than any residual of a corner in the image.
+LOST_PX = 300.0
+# Step of numeric derivatives. Parameters are scaled so that one unit moves the image by about a pixel; points are moved
+# by this part of their distance.
+DIFFERENCE_STEP = 1e-4
+
+
+class Projection(Protocol):
+    """A camera, or several combined, that projects points."""
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3), NaN for points without an image."""
+
+
+CameraFactory = Callable[[Array], Projection]
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Observed corners: pixels (K, N, 2) in K images, NaN for unknown corners, of board points (N, 3) [m]."""
+
+    pixels: Array
+    points: Array
+    cameras: int = 1  # the points of a view are equal parts of so many cameras
+
+    def select(self, chosen: Array) -> Observations:
+        """Return the images of an index or mask."""
+        return replace(self, pixels=self.pixels[chosen])
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Independent normal distributions of the parameters before the adjustment; sigma infinite: none."""
+
+    center: Array  # (P,)
+    sigma: Array  # (P,)
+
+    def weights(self, kernel_px: float) -> Array:
+        """Return the weights (P,) of squared differences beside squared residuals, for a width of Huber's kernel."""
+        return np.asarray((kernel_px / HUBER_WIDTH / self.sigma) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
+class BundleResult:
+    """The result of a bundle adjustment; residuals are measured minus modelled [px], NaN without a measurement."""
+
+    parameters: Array  # (P,)
+    T_cam_board: Array  # (K, 4, 4)
+    residuals: Array  # (K, N, 2)
+    covariance: Array  # (P, P), with the misfit of the model
+    misfit_px: float = 0.0  # size of the smooth error of the model, most of which the parameters absorb
+
+    @property
+    def errors_px(self) -> Array:
+        """Return the length (K, N) of every residual."""
+        return np.asarray(np.linalg.norm(self.residuals, axis=2))
+
+    @property
+    def mean_px(self) -> float:
+        """Return the mean length of the residuals, which is OCamCalib's reprojection error."""
+        return float(np.nanmean(self.errors_px))
+
+
+def residuals(camera: Projection, T_cam_board: Array, observed: Observations) -> Array:
+    """Return measured minus modelled pixels (K, N, 2); NaN without a measurement, LOST_PX without a projection."""
+    cast = camera.project(se3.apply(T_cam_board, observed.points).reshape(-1, 3)).reshape(observed.pixels.shape)
+    lost = np.isnan(cast) & np.isfinite(observed.pixels)
+    return np.where(lost, LOST_PX, observed.pixels - cast)
+
+
+def adjust_bundle(camera_of: CameraFactory, parameters: Array, T_cam_board: Array, observed: Observations, *,
+                  kernel_rounds: int = KERNEL_ROUNDS, prior: Prior | None = None) -> BundleResult:
+    """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
+
+    kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
+    """
+    parameters = np.asarray(parameters, float)
+    none = Prior(np.zeros(len(parameters)), np.full(len(parameters), np.inf))
+    problem = _BoardProblem(camera_of, observed, prior or none, np.inf)
+    state = problem.state(parameters, np.asarray(T_cam_board, float))
+    sigma = np.inf
+    for _ in range(kernel_rounds):
+        sigma = min(sigma, robust_sigma(state.residuals, MIN_SIGMA_PX))
+        problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
+        state = minimise(problem, state, ENDING)
+    return _bundle_result(problem, state)
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """One iterate of the optimisation, with its residuals."""
+
+    parameters: Array  # (P,)
+    poses: Array  # (K, 4, 4)
+    residuals: Array  # (K, N, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class _BoardProblem:
+    """The robust reprojection error of a camera that saw boards, for one width of the kernel."""
+
+    camera_of: CameraFactory
+    observed: Observations
+    prior: Prior
+    kernel_px: float
+
+    def state(self, parameters: Array, poses: Array) -> _State:
+        """Return the iterate with these parameters and poses; CalibError if there is no such camera."""
+        return _State(parameters, poses, residuals(self.camera_of(parameters), poses, self.observed))
+
+    def scale(self, state: _State) -> float:
+        """Return the width of Huber's kernel [px], which stays during a search."""
+        return self.kernel_px
+
+    def moved(self, state: _State, common: Array, blocks: Array) -> _State | None:
+        """Return the state after a step; None if the parameters are not those of a camera."""
+        try:
+            return self.state(state.parameters + common, se3.exp(blocks) @ state.poses)
+        except (CalibError, np.linalg.LinAlgError):
+            return None
+
+    def cost(self, state: _State, scale: float) -> float:
+        """Return the sum of Huber's function over the corners, and of the prior."""
+        length = np.linalg.norm(state.residuals, axis=2)
+        huber = np.where(length <= scale, length**2, scale * (2 * length - scale))
+        return float(np.nansum(huber) + self.prior.weights(scale) @ (state.parameters - self.prior.center) ** 2)
+
+    def normal_equations(self, state: _State, scale: float, fields: Array | None = None) -> ArrowSystem:
+        """Return the normal equations; fields (K, N, 2, F): further unknowns after the parameters, 0 now."""
+        residual, weight = _huber_weights(state.residuals, scale)
+        J_in, J_pose = self._jacobians(state)
+        K, rows = len(residual), 2 * residual.shape[1]
+        root = np.sqrt(weight)[..., None, None]
+        J_in, J_pose = ((root * J).reshape(K, rows, J.shape[-1]) for J in (J_in, J_pose))
+        r = (root[..., 0] * residual).reshape(K, -1)
+        prior = self.prior.weights(scale)
+        to_prior = prior * (state.parameters - self.prior.center)
+        if fields is not None:
+            J_in = np.concatenate([J_in, (root * fields).reshape(K, rows, -1)], axis=2)
+            prior, to_prior = (np.pad(part, (0, fields.shape[3])) for part in (prior, to_prior))
+        between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
+        return ArrowSystem(
+            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=sparse.csr_matrix(between),
+            C=J_pose.swapaxes(1, 2) @ J_pose, a=np.einsum("kri,kr->i", J_in, r) - to_prior,
+            c=np.einsum("kri,kr->ki", J_pose, r).ravel())
+
+    def _jacobians(self, state: _State) -> tuple[Array, Array]:
+        """Return derivatives of the modelled pixels by parameters (K, N, 2, P) and left twists of poses (K, N, 2, 6).
+        """
+        points = se3.apply(state.poses, self.observed.points)
+        flat = points.reshape(-1, 3)
+        columns = []
+        for step in DIFFERENCE_STEP * np.eye(len(state.parameters)):
+            ahead, behind = (self.camera_of(state.parameters + sign * step).project(flat) for sign in (1, -1))
+            columns.append((ahead - behind) / (2 * DIFFERENCE_STEP))
+        by_parameter = np.nan_to_num(np.stack(columns, axis=-1)) if columns else np.zeros((len(flat), 2, 0))
+        by_point = _by_point(self.camera_of(state.parameters), flat)
+        by_pose = np.concatenate([by_point, -by_point @ se3.hat(flat)], axis=-1)
+        shape = points.shape[:2]
+        return by_parameter.reshape(*shape, 2, len(columns)), by_pose.reshape(*shape, 2, 6)
+
+
+def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
+    """Return residuals with 0 for missing ones, and Huber's weights (K, N)."""
+    length = np.linalg.norm(residual, axis=2)
+    weight = np.where(np.isfinite(length), np.minimum(1.0, kernel_px / np.maximum(length, 1e-12)), 0.0)
+    return np.nan_to_num(residual), weight
+
+
+def _by_point(camera: Projection, points: Array) -> Array:
+    """Return the derivative (N, 2, 3) of the pixels by the points."""
+    reach = DIFFERENCE_STEP * np.linalg.norm(points, axis=1, keepdims=True)
+    columns = [(camera.project(points + reach * axis) - camera.project(points - reach * axis)) / (2 * reach)
+               for axis in np.eye(3)]
+    return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
+
+
+def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
+    """Return the result with the covariance of the parameters, in which the model's misfit is counted."""
+    residual, weight = _huber_weights(state.residuals, problem.kernel_px)
+    freedom = 2 * float(weight.sum()) - state.parameters.size - 6 * len(residual)
+    variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
+    if not state.parameters.size:
+        return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
+    fields = smooth_fields(problem.observed.pixels, problem.observed.cameras)
+    system = problem.normal_equations(state, problem.kernel_px, fields).reduced()
+    covariance, misfit_px = covariance_with_misfit(*system, state.parameters.size, variance)
+    return BundleResult(state.parameters, state.poses, state.residuals, covariance, misfit_px)

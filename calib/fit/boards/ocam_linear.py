@@ -1,0 +1,159 @@
+"""Linear initialisation of an `ocam` camera and board poses: Scaramuzza, Martinelli and Siegwart 2006, section IV.
+
+Frame of the toolbox: x down the rows, y along the columns, rays (x, y, f(rho)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib import se3
+from calib.fit.boards.bundle import Observations
+from calib.models.camera import Array
+from calib.models.ocam import View
+
+# Grid search for the centre: start half width in parts of the image, points per axis, factor per round, end width.
+SEARCH_PART = 0.16
+SEARCH_SIDE = 5
+SEARCH_SHRINK = 0.55
+SEARCH_END_PX = 0.5
+# Errors are capped, so that one bad image does not determine the centre.
+CAP_RAD = 0.05
+# Guards against division by zero: distance of a corner from the axis [m], squared coefficient of t3.
+MIN_ACROSS_M, MIN_SQUARED = 1e-9, 1e-300
+
+
+@dataclass(frozen=True, slots=True)
+class LinearCamera:
+    """A camera with identity affine, its polynomial in rho / scale_px without linear term, and board poses."""
+
+    coefficients: Array  # (D,) of powers 0, 2, 3 ... of rho / scale_px [px]
+    scale_px: float
+    center: tuple[float, float]  # (row, column) [px]
+    T_cam_board: Array  # (K, 4, 4)
+    errors_rad: Array  # (K,) mean angle between modelled and measured rays
+
+
+def powers(degree: int) -> Array:
+    """Return the polynomial's powers of rho: 0, 2, 3 ... The slope of a smooth mirror is 0 on its axis."""
+    return np.array([0, *range(2, degree + 1)])
+
+
+def solve_linear(observed: Observations, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
+    """Find the camera and poses of least ray error, with a search over the centre; size (width, height) [px]."""
+    width, height = size
+    problem = _LinearProblem(observed, degree, min(size) / 2)
+    center, reach = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size)
+    while reach > SEARCH_END_PX:
+        steps = np.linspace(-reach, reach, SEARCH_SIDE)
+        trials = [center + np.array([row, column]) for row in steps for column in steps]
+        center = min(trials, key=lambda trial: float(np.nanmean(problem.solve(trial).errors_rad)))
+        reach *= SEARCH_SHRINK
+    return _with_proper_poses(problem.solve(center), view)
+
+
+def _with_proper_poses(solution: LinearCamera, view: View) -> LinearCamera:
+    """Return the solution with rigid poses in the camera's frame; for a mirror z is negated."""
+    T = solution.T_cam_board.copy()
+    if view == "mirror":
+        T[:, 2, [0, 1, 3]] *= -1
+    left, _, right = np.linalg.svd(T[:, :3, :2], full_matrices=False)
+    first = left @ right
+    R = np.concatenate([first, np.cross(first[..., 0], first[..., 1])[..., None]], axis=-1)
+    return LinearCamera(solution.coefficients, solution.scale_px, solution.center,
+                        se3.transform(R, T[:, :3, 3]), solution.errors_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class _LinearProblem:
+    observed: Observations
+    degree: int
+    scale_px: float
+
+    def solve(self, center: Array) -> LinearCamera:
+        """Solve for poses and polynomial at a given centre (row, column)."""
+        xy = self.observed.pixels[..., ::-1] - center
+        T = _partial_poses(xy, self.observed.points)
+        across = np.linalg.norm(se3.apply(T, self.observed.points)[..., :2], axis=2)
+        rho = np.linalg.norm(xy, axis=2)
+        height = self.observed.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)
+        T[:, 2, :2] *= _signs(rho, across, height.T, self.scale_px)[:, None]
+        height = (self.observed.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
+        coefficients, T[:, 2, 3] = _polynomial(rho, across, height, self.basis(rho))
+        f = self.basis(rho) @ coefficients
+        errors = np.minimum(_angles(np.dstack([xy, f]), se3.apply(T, self.observed.points)), CAP_RAD)
+        return LinearCamera(coefficients, self.scale_px, (float(center[0]), float(center[1])), T,
+                            np.nanmean(errors, axis=1))
+
+    def basis(self, rho: Array) -> Array:
+        """Return the powers (..., D) of the scaled radius."""
+        return np.asarray((rho[..., None] / self.scale_px) ** powers(self.degree))
+
+
+def _partial_poses(xy: Array, points: Array) -> Array:
+    """Return poses (K, 4, 4) up to t3 and the sign of (r31, r32), from (x, y) || (P1, P2): eq. (11) to (14)."""
+    X, Y = points[:, 0], points[:, 1]
+    known = np.isfinite(xy[..., :1])
+    x, y = np.nan_to_num(xy[..., 0]), np.nan_to_num(xy[..., 1])
+    rows = np.stack([-y * X, -y * Y, -y, x * X, x * Y, x], axis=-1) * known
+    scale = np.linalg.norm(rows, axis=1, keepdims=True)
+    h = np.linalg.svd(rows / scale, full_matrices=False)[2][:, -1] / scale[:, 0]
+    T = np.tile(np.eye(4), (len(h), 1, 1))
+    T[:, :2, [0, 1, 3]] = h.reshape(-1, 2, 3)
+    across = se3.apply(T, points)[..., :2]
+    T[:, :2, [0, 1, 3]] *= np.sign(np.nansum(across * xy, axis=(1, 2)))[:, None, None]
+    T[:, 2, :2] = _third_row(T[:, :2, :2])
+    T[:, :3, [0, 1, 3]] /= np.linalg.norm(T[:, :3, :1], axis=1, keepdims=True)
+    return T
+
+
+def _third_row(R: Array) -> Array:
+    """Return (r31, r32) (K, 2) that make the two columns of R (K, 2, 2) equally long and orthogonal."""
+    product = -(R[:, :, 0] * R[:, :, 1]).sum(axis=1)
+    gap = (R[:, :, 1] ** 2).sum(axis=1) - (R[:, :, 0] ** 2).sum(axis=1)
+    root = np.hypot(gap, 2 * product)
+    first = np.sqrt(np.maximum(0, (root + gap) / 2))
+    second = np.sqrt(np.maximum(0, (root - gap) / 2)) * np.where(product < 0, -1, 1)
+    return np.column_stack([first, second])
+
+
+def _signs(rho: Array, across: Array, height: Array, scale_px: float) -> Array:
+    """Return the sign (K,) of (r31, r32) for which each image's parabola f has a0 < 0; -f fits equally well."""
+    A, b, _ = _eliminate_depths(rho, across, height, (rho[..., None] / scale_px) ** powers(2))
+    parabolas = np.linalg.pinv(A) @ b[..., None]
+    return np.where(parabolas[:, 0, 0] > 0, -1.0, 1.0)
+
+
+def _polynomial(rho: Array, across: Array, height: Array, basis: Array) -> tuple[Array, Array]:
+    """Solve f(rho) * across = rho * (height + t3) for coefficients (D,) and t3 (K,), eq. (15) to (18)."""
+    A, b, shifts = _eliminate_depths(rho, across, height, basis)
+    flat = A.reshape(-1, A.shape[-1])
+    size = np.linalg.norm(flat, axis=0)
+    coefficients = np.linalg.lstsq(flat / size, b.ravel(), rcond=None)[0] / size
+    return coefficients, shifts(coefficients)
+
+
+def _eliminate_depths(rho: Array, across: Array, height: Array, basis: Array
+                    ) -> tuple[Array, Array, Callable[[Array], Array]]:
+    """Eliminate t3: return equations (K, N, D), right sides (K, N), and a function from coefficients to t3 (K,).
+
+    Every t3 occurs in its own image's equations only: these are projected onto the complement of its column.
+    """
+    known, weight = np.isfinite(rho), 1 / np.maximum(across, MIN_ACROSS_M)
+    A = np.where(known[..., None], basis * (across * weight)[..., None], 0.0)
+    b, shift = (np.where(known, side * rho * weight, 0.0) for side in (height, -1.0))
+    squared = np.maximum((shift**2).sum(axis=1), MIN_SQUARED)
+    along_A, along_b = ((shift[:, None] @ side)[:, 0] / squared[:, None] for side in (A, b[..., None]))
+
+    def shifts(coefficients: Array) -> Array:
+        return np.asarray(along_b[:, 0] - along_A @ coefficients)
+
+    return A - shift[..., None] * along_A[:, None], b - shift * along_b, shifts
+
+
+def _angles(rays: Array, points: Array) -> Array:
+    """Return angles (K, N) [rad] between rays and points (K, N, 3)."""
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(rays, points), axis=2), (rays * points).sum(axis=2)))

@@ -1,0 +1,283 @@
+"""Joint bundle adjustment of two cameras, the transform between them, and the boards that they saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.boards.board import BoardView, CalibrationBoard
+from calib.boards.corner_refinement import refine_with_camera
+from calib.errors import CalibError
+from calib.fit.boards.bundle import BundleResult, Observations, Prior, adjust_bundle
+from calib.fit.boards.camera_fit import RejectedView, outlier_views
+from calib.fit.boards.cross_validation import cross_validated_px
+from calib.fit.boards.relative_pose import RelativePoseInitialisation, ViewPair, initialise_relative_pose
+from calib.fit.parameterisation import WAVEFRONT_NAMES, CameraParameterisation, parameterise
+from calib.fit.residual_structure import ResidualStructure, residual_structure
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import has_wavefront, project_near
+
+# One pair determines the transform; with four the consensus of most shows which pair is wrong.
+MIN_PAIRS = 4
+# A bound for the loop. Each round rejects at most a third of the views, so it ends earlier for lack of pairs.
+MAX_REJECTIONS = 10
+# Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong.
+MAX_MEAN_PX = 3.0
+# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
+MIRROR_NAMES, MIRROR_SIGMA_STEPS = ("s1", "s2", *WAVEFRONT_NAMES), 1.0
+MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
+Images = Mapping[str, NDArray[np.uint8]]
+# The lower and the upper camera.
+Sides = tuple[OmniCamera, OmniCamera]
+
+
+@dataclass(frozen=True, slots=True)
+class PairView:
+    """The views of a board at one instant by both cameras, or by only one of them."""
+
+    name: str
+    seen: ViewPair  # by the lower and the upper camera
+
+
+@dataclass(frozen=True, slots=True)
+class RigCalibration:
+    """A calibrated pair of cameras; fit has residuals (K, 2N, 2), the lower camera's first, and T_lower_board."""
+
+    lower: OmniCamera
+    upper: OmniCamera
+    T_upper_lower: Array  # (4, 4)
+    board: CalibrationBoard
+    views: tuple[PairView, ...]
+    fit: BundleResult
+    parameters: tuple[tuple[tuple[str, float, float], ...], ...]  # of lower and upper: name, value, sigma
+    motion_sigma: Array  # (6,) sigmas of T_upper_lower, translation [m] and rotation [rad], in the upper frame
+    baseline_sigma_m: float
+    covariance: Array  # (P, P) of the cameras' parameters, if refined, and of T_upper_lower (as motion_sigma)
+    rejected: tuple[RejectedView, ...] = ()
+
+    @property
+    def baseline_m(self) -> float:
+        """Return the distance of the viewpoints [m]."""
+        return float(np.linalg.norm(self.T_upper_lower[:3, 3]))
+
+    @property
+    def pairs(self) -> int:
+        """Return the number of instants at which both cameras saw the board."""
+        return sum(map(_is_pair, self.views))
+
+    def side_errors_px(self, side: int) -> Array:
+        """Return the mean error (K,) of every view in the lower (0) or upper (1) camera; NaN without a view."""
+        errors = np.split(self.fit.errors_px, 2, axis=1)[side]
+        known = np.isfinite(errors)
+        return np.where(known.any(axis=1), np.nansum(errors, axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+
+    def structure(self, side: int) -> ResidualStructure:
+        """Return the structure of the lower (0) or upper (1) camera's residuals."""
+        views = [view.seen[side] for view in self.views]
+        seen = [k for k, view in enumerate(views) if view is not None]
+        pixels = np.array([view.pixels for view in views if view is not None])
+        camera = (self.lower, self.upper)[side]
+        residuals = np.split(self.fit.residuals, 2, axis=1)[side][seen]
+        return residual_structure(pixels, residuals, self.board.points, camera.center)
+
+
+@dataclass(frozen=True, slots=True)
+class _PairCamera:
+    """Both cameras as one: of every 2N points of a view the lower camera projects the first N, the upper the others."""
+
+    lower: OmniCamera
+    upper: OmniCamera
+    T_upper_lower: Array
+    corners: int
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (M, 2) of points (M, 3) in the lower camera's frame."""
+        both = points.reshape(-1, 2, self.corners, 3)
+        lower = project_near(self.lower, both[:, 0].reshape(-1, 3))
+        upper = project_near(self.upper, se3.apply(self.T_upper_lower, both[:, 1].reshape(-1, 3)))
+        return np.stack([pixels.reshape(-1, self.corners, 2) for pixels in (lower, upper)], axis=1).reshape(-1, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class _RigParameterisation:
+    """Parameterisation of a rig: steps of both cameras, if they are refined, and of the transform between them."""
+
+    parameterisations: tuple[CameraParameterisation, CameraParameterisation]
+    refined: bool
+    T_upper_lower: Array
+    units: Array  # (6,) one step of the transform [m, rad]
+    corners: int
+
+    @property
+    def ends(self) -> tuple[int, int, int]:
+        """Return the end indices of the lower camera's, the upper camera's and the transform's steps."""
+        lower, upper = (len(side.names) if self.refined else 0 for side in self.parameterisations)
+        return lower, lower + upper, lower + upper + 6
+
+    @property
+    def prior(self) -> Prior:
+        """Return the prior of the terms of real mirrors, about 0."""
+        center, sigma = np.zeros(self.ends[-1]), np.full(self.ends[-1], np.inf)
+        for side, first in zip(self.parameterisations if self.refined else (), (0, self.ends[0]), strict=False):
+            for k, name in enumerate(side.names):
+                if name in MIRROR_NAMES:
+                    center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
+        return Prior(center, sigma)
+
+    def camera(self, steps: Array) -> _PairCamera:
+        """Return both cameras at the steps."""
+        lower_end, upper_end, _ = self.ends
+        lower, upper = self.parameterisations
+        T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
+        if not self.refined:
+            return _PairCamera(lower.base, upper.base, T_upper_lower, self.corners)
+        return _PairCamera(lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]),
+                           T_upper_lower, self.corners)
+
+
+def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, refined: bool = True
+                  ) -> RigCalibration:
+    """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
+
+    cameras: start values, or the fixed cameras if not refined. The terms of real mirrors (MIRROR_NAMES) are fitted if a
+    start value has a wavefront. Raises CalibError if fewer than MIN_PAIRS pairs are
+    consistent, or if the order of the board's corners is ambiguous.
+    """
+    # 1. Relative pose initialisation; inconsistent views are rejected.
+    _require(sum(_is_pair(view) for view in views), "instants at which both cameras saw the board")
+    initial = initialise_relative_pose([view.seen for view in views], board, cameras)
+    rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
+    good, T_lower_board = _reordered_views(views, initial, refined)
+    # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
+    fit, unknowns = _solve(good, board, (cameras, refined), (initial.T_upper_lower, T_lower_board))
+    for _ in range(MAX_REJECTIONS):
+        bad = outlier_views(fit)
+        if not bad.any():
+            break
+        rejected += [_rejected_view(good[k], fit, k) for k in np.flatnonzero(bad).tolist()]
+        good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
+        _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
+        found = unknowns.camera(fit.parameters)
+        fit, unknowns = _solve(good, board, ((found.lower, found.upper) if refined else cameras, refined),
+                               (found.T_upper_lower, fit.T_cam_board[~bad]))
+    if fit.mean_px > MAX_MEAN_PX:
+        raise CalibError(f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
+                         "at most; did the cameras see the board at the same time, are their files the right ones?")
+    return _rig_calibration(good, board, (fit, unknowns), rejected)
+
+
+def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images], refined: bool = True
+                           ) -> RigCalibration:
+    """Refine the corners with the calibrated cameras, and calibrate the rig again; images by the views' names.
+
+    An instant that only one camera saw needs no image of the other.
+    """
+    cameras = (found.lower, found.upper)
+    poses = (found.fit.T_cam_board, found.T_upper_lower @ found.fit.T_cam_board)
+    views = []
+    for k, view in enumerate(found.views):
+        lower, upper = (
+            seen and _refined_view(seen, images[side][view.name], cameras[side], (poses[side][k], found.board))
+            for side, seen in enumerate(view.seen))
+        views.append(PairView(view.name, (lower, upper)))
+    again = fit_rig(views, found.board, cameras, refined)
+    return replace(again, rejected=found.rejected + again.rejected)
+
+
+def _refined_view(seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera,
+                  posed_board: tuple[Array, CalibrationBoard]) -> BoardView:
+    T_cam_board, board = posed_board
+    return replace(seen, pixels=refine_with_camera(image, camera, T_cam_board, (board, seen.pixels)))
+
+
+def _is_pair(view: PairView) -> bool:
+    return None not in view.seen
+
+
+def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:
+    if count < MIN_PAIRS:
+        left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
+        raise CalibError(f"calibrate rig: expected at least {MIN_PAIRS} {what}, found {count}{left_out}; hold the "
+                         "board where both cameras see it whole, on all sides and tilted")
+
+
+def _reordered_views(views: Sequence[PairView], initial: RelativePoseInitialisation, refined: bool
+                     ) -> tuple[list[PairView], Array]:
+    """Return the consistent views, upper corners in the order of the lower ones, and the board poses (K, 4, 4).
+
+    Views by one camera alone are kept only if the cameras are refined: they do not depend on the relative pose.
+    """
+    kept = [k for k in initial.T_lower_board if refined or _is_pair(views[k])]
+    good = [_with_reordered_upper(views[k], initial.orders.get(k)) for k in kept]
+    _require(sum(map(_is_pair, good)), "consistent pairs of views",
+             [RejectedView(views[k].name, reason) for k, reason in initial.rejected])
+    return good, np.array([initial.T_lower_board[k] for k in kept])
+
+
+def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> PairView:
+    lower, upper = view.seen
+    if upper is None or order is None:
+        return view
+    return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
+
+
+def _solve(good: Sequence[PairView], board: CalibrationBoard, given: tuple[Sides, bool], start: tuple[Array, Array]
+           ) -> tuple[BundleResult, _RigParameterisation]:
+    """Adjust both cameras, the transform between them, and one pose of the board for every view."""
+    T_upper_lower, T_lower_board = start
+    unknowns = _unknowns(board, given, T_upper_lower, T_lower_board)
+    fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, _observations(good, board),
+                        prior=unknowns.prior)
+    return fit, unknowns
+
+
+def _unknowns(board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+              ) -> _RigParameterisation:
+    (lower, upper), refined = given
+    reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
+    # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
+    units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
+    sides = [parameterise(camera, wavefront=has_wavefront(camera)) for camera in (lower, upper)]
+    return _RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
+
+
+def _observations(good: Sequence[PairView], board: CalibrationBoard) -> Observations:
+    """Return the corners (K, 2N, 2) of both cameras, the lower one's first."""
+    none = np.full((len(board.points), 2), np.nan)
+    pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen])
+                       for view in good])
+    return Observations(pixels, np.tile(board.points, (2, 1)), cameras=2)
+
+
+def rig_held_out_px(found: RigCalibration) -> float:
+    """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
+    unknowns = _unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
+    return cross_validated_px(unknowns.camera, unknowns.ends[-1], found.fit.T_cam_board,
+                              _observations(found.views, found.board), unknowns.prior)
+
+
+def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
+    errors = np.nanmedian(fit.errors_px, axis=1)
+    return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
+
+
+def _rig_calibration(good: Sequence[PairView], board: CalibrationBoard,
+                     solved: tuple[BundleResult, _RigParameterisation], rejected: Sequence[RejectedView]
+                     ) -> RigCalibration:
+    fit, unknowns = solved
+    found, (lower, upper, _) = unknowns.camera(fit.parameters), unknowns.ends
+    sigma = np.sqrt(np.maximum(0, np.diag(fit.covariance)))
+    parts = ((0, lower), (lower, upper))
+    parameters = tuple(tuple(side.values(fit.parameters[a:b], sigma[a:b])) if unknowns.refined else ()
+                       for side, (a, b) in zip(unknowns.parameterisations, parts, strict=True))
+    units = np.concatenate([*(side.units for side in unknowns.parameterisations if unknowns.refined), unknowns.units])
+    covariance = fit.covariance * np.outer(units, units)
+    motion = covariance[upper:, upper:]
+    along = found.T_upper_lower[:3, 3] / np.linalg.norm(found.T_upper_lower[:3, 3])
+    return RigCalibration(found.lower, found.upper, found.T_upper_lower, board, tuple(good), fit, parameters,
+                          np.sqrt(np.maximum(0, np.diag(motion))), float(np.sqrt(along @ motion[:3, :3] @ along)),
+                          covariance, tuple(rejected))

@@ -1,0 +1,1 @@
+"""Rigs from landmarks of a drive: parameters, prior, observations, bundle adjustment, choice of the terms."""

@@ -1,0 +1,119 @@
+"""Calibration of one camera by images of a board: `omnid.calibrate_camera`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.camera_file import CameraFile, Quality, camera_toml
+from calib.fit.boards.camera_fit import CameraCalibration
+from calib.fit.boards.camera_selection import (
+    ModelChoice,
+    SelectedCalibration,
+    camera_structure,
+    refine_selection,
+    select_calibration,
+)
+from calib.fit.residual_structure import ResidualStructure
+from calib.masks.stack_mask import find_mask
+from calib.models.camera import Mask
+from calib.models.ocam import View
+from calib.rig_file import write_file
+from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
+from omnid.calibration.camera_report import camera_report_html
+from omnid.calibration.images import Images, is_log, read_images
+from omnid.calibration.progress import Progress, silent
+
+# A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
+MAX_LOG_VIEWS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class CameraResult:
+    """A calibrated camera, with the images that it was fitted to."""
+
+    selected: SelectedCalibration
+    mask: Mask | None  # rim, hub and struts, if they were searched
+    images: Images
+
+    @property
+    def calibration(self) -> CameraCalibration:
+        """The camera, its parameters with standard deviations, the poses and residuals of all views."""
+        return self.selected.calibration
+
+    @property
+    def is_misfit(self) -> bool:
+        """True if the camera model leaves more than noise."""
+        return camera_structure(self.calibration).is_misfit
+
+    @property
+    def warnings(self) -> list[str]:
+        """Limits of the result, one line each."""
+        found = self.calibration
+        return [*misfit_warning("camera", camera_structure(found)), *found.warnings,
+                *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)]
+
+    def __str__(self) -> str:
+        found = self.calibration
+        (width, height), (u, v) = found.camera.size, found.camera.center
+        corners = int(np.isfinite(found.fit.errors_px).sum())
+        return (f"{'MISFIT: ' if self.is_misfit else ''}model {self.selected.model}, {width}x{height}, centre {u:.2f} "
+                f"{v:.2f}, mean reprojection error {found.fit.mean_px:.3f} px over {corners} corners of "
+                f"{len(found.views)} views")
+
+    def save(self, path: Path, mask_path: Path | None = None) -> None:
+        """Write the camera.toml, and the mask to a PNG in the same folder, which the camera.toml names."""
+        if mask_path is not None and self.mask is not None and self.mask.image is not None:
+            write_file(mask_path, cv2.imencode(".png", self.mask.image)[1].tobytes())
+        found = self.calibration
+        quality = Quality(found.fit.mean_px, len(found.views), found.parameters)
+        file = CameraFile(found.camera, self.mask)
+        write_file(path, camera_toml(file, quality, mask_path.name if mask_path else "").encode())
+
+    def save_report(self, path: Path) -> None:
+        """Write an HTML page with residuals and coverage."""
+        seen = {view.name for view in self.calibration.views} | {bad.name for bad in self.calibration.rejected}
+        missing = sorted(set(self.images) - seen)
+        write_file(path, camera_report_html(self.calibration, self.images, missing, self.mask).encode())
+
+
+def calibrate_camera(sources: Sequence[str], board: AnyBoard, *, topic: str | None = None, model: ModelChoice = "auto",
+                     view: View = "mirror", with_mask: bool = False, progress: Progress = silent) -> CameraResult:
+    """Calibrate a camera by images of a board that it saw at several places.
+
+    sources: files, folders and patterns of images, or one log, with the topic of the camera in it. model: "auto" fits
+    every model and selects by cross-validation. view: the world is seen in a mirror or directly; images of a flat board
+    do not distinguish the two. with_mask: also search rim, hub and struts. progress receives one line for each image
+    and each model. Raises OmnidError or CalibError where the images do not suffice.
+    """
+    # 1. Read the images.
+    images = read_images(sources, topic)
+    many = any(is_log(Path(source)) for source in sources)
+    # 2. Find the board in each. Of a log the views that differ most are used.
+    views = find_boards(images, board, thorough=not many, progress=progress)
+    views = select_diverse_views(views, MAX_LOG_VIEWS) if many else views
+    # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
+    height, width = images[views[0].name].shape
+    selected = select_calibration(views, board, (width, height), model, view)
+    report_scores(selected, "camera", progress)
+    # 4. Refine the corners with the camera, and fit it again.
+    selected = refine_selection(selected, images, view)
+    # 5. Find what never shows the world.
+    center = selected.calibration.camera.center
+    return CameraResult(selected, find_mask(list(images.values()), center) if with_mask else None, images)
+
+
+def report_scores(selected: SelectedCalibration, name: str, progress: Progress) -> None:
+    """Report the score of each model that was fitted to a camera."""
+    for score in selected.scores:
+        progress(f"{name}: {'selected' if score.model == selected.model else 'compared'} {score}")
+
+
+def misfit_warning(name: str, structure: ResidualStructure) -> list[str]:
+    """Return a warning if the residuals of the camera of that name are more than noise, else none."""
+    words = "the camera model does not describe this camera: {}; do not use it where accuracy matters"
+    return [f"{name}: {words.format(structure)}"] if structure.is_misfit else []

@@ -1,0 +1,255 @@
+"""Calibration of a rig by a board that both cameras see at once: `omnid.calibrate_rig`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import se3
+from calib.boards.board import BoardView
+from calib.boards.marker_board import AprilGrid
+from calib.camera_file import CameraFile
+from calib.fit.boards.camera_fit import RejectedView
+from calib.fit.boards.camera_selection import ModelChoice, refine_selection, select_calibration
+from calib.fit.boards.rig_covariance import rig_covariance
+from calib.fit.boards.rig_fit import PairView, RigCalibration, Sides, fit_rig, refine_rig_calibration
+from calib.fit.boards.rig_selection import select_rig
+from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.masks.rim import find_rim
+from calib.masks.stack_mask import find_mask
+from calib.models.camera import Mask
+from calib.models.ocam import OcamCamera, View
+from calib.models.unified import UnifiedCamera
+from calib.rig import Rig
+from calib.rig_file import write_file, write_rig
+from calib.rig_frame import rig_between
+from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
+from omnid.calibration.camera import MAX_LOG_VIEWS, misfit_warning, report_scores
+from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
+from omnid.calibration.images import Images
+from omnid.calibration.progress import Progress, silent
+from omnid.calibration.rig_report import rig_report_html
+from omnid.errors import OmnidError
+
+# The board scales the rig: a baseline outside this range, from smaller than any mirror to larger than any vehicle,
+# shows a wrong length of the board.
+BASELINE_RANGE_M = (0.01, 3.0)
+# Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
+REFUSED_PART, WARNING_PART = 0.1, 0.02
+GivenCameras = tuple[CameraFile, CameraFile]
+
+
+@dataclass(frozen=True, slots=True)
+class RigResult:
+    """A calibrated rig with its masks and covariance, and the images that it was fitted to."""
+
+    rig: Rig
+    calibration: RigCalibration
+    images: PairedImages
+    notes: tuple[str, ...]  # about the baseline and masks that were not found
+
+    @property
+    def is_misfit(self) -> bool:
+        """True if a camera model leaves more than noise."""
+        return any(self.calibration.structure(side).is_misfit for side in range(len(SIDES)))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Limits of the result, one line each."""
+        misfit = [line for side, name in enumerate(SIDES)
+                  for line in misfit_warning(f"{name} camera", self.calibration.structure(side))]
+        return [*misfit, *self.notes, *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected)]
+
+    def __str__(self) -> str:
+        found = self.calibration
+        rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(found.T_upper_lower[:3, :3])))
+        sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
+        single_views = len(found.views) - found.pairs
+        uncertainty = drive_uncertainty(self.rig) if any(found.parameters) else None
+        return (f"{'MISFIT: ' if self.is_misfit else ''}baseline {found.baseline_m * 1e3:.2f} mm (sigma "
+                f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
+                f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
+                + (f", {single_views} views of one camera alone" if single_views else "")
+                + (f"; drives: {uncertainty}" if uncertainty else ""))
+
+    def save(self, path: Path) -> None:
+        """Write the rig.toml, and masks with struts to PNGs in the same folder."""
+        write_rig(path, self.rig)
+
+    def save_report(self, path: Path) -> None:
+        """Write an HTML page with residuals, coverage and panoramas."""
+        write_file(path, rig_report_html(self.calibration, self.images, self.rig).encode())
+
+
+def calibrate_rig(source: Path, board: AnyBoard, *, topics: tuple[str | None, str | None] = (None, None),
+                  cameras: GivenCameras | None = None, refine_cameras: bool = False, model: ModelChoice = "auto",
+                  view: View = "mirror", with_struts: bool = False, expected_baseline_m: float | None = None,
+                  progress: Progress = silent) -> RigResult:
+    """Calibrate two cameras and the transform between them by images of a board.
+
+    source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
+    upper_*. cameras: known cameras, which stay as they are unless refine_cameras. model, view, progress: as in
+    `calibrate_camera`. with_struts: masks with hub and struts, not only the rim. expected_baseline_m: by ruler; a
+    result that differs by a tenth is refused. Raises OmnidError or CalibError where the images do not suffice.
+    """
+    # 1. Read the images.
+    images = read_pairs(source, *topics)
+    _require_sizes(images, cameras)
+    # 2. Find the board in all of them.
+    views = _find_views(images, board, progress)
+    # 3. Fit each camera to all its views, unless the cameras are known.
+    single = _FittedCameras.known(cameras, views) if cameras else _fit_cameras(views, images, board, (model, view),
+                                                                              progress)
+    # 4. Fit the transform between the cameras, and the cameras with it.
+    refined = cameras is None or refine_cameras
+    if refined:
+        selected = select_rig(single.views, board, single.cameras, single.polynomials)
+        for number, score in enumerate(selected.scores):
+            progress(f"rig: {'compared' if number else 'selected'} {score}")
+        found = selected.calibration
+    else:
+        found = fit_rig(single.views, board, single.cameras, refined)
+    # 5. Refine the corners with the cameras, and fit the rig again.
+    found = refine_rig_calibration(found, images.sides, refined)
+    alone = () if refined else _views_of_one_camera(views)
+    found = replace(found, rejected=(*single.rejected, *alone, *found.rejected))
+    # 6. Compare the baseline with what it can be, and build the rig with masks and covariance.
+    notes = _check_baseline(found, board, expected_baseline_m)
+    rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
+    return RigResult(replace(rig, covariance=rig_covariance(found, rig)), found, images, (*notes, *unmasked))
+
+
+@dataclass(frozen=True, slots=True)
+class _FittedCameras:
+    """Both cameras, each by its own views; polynomials: cameras from which the terms of real mirrors are fitted."""
+
+    cameras: Sides
+    polynomials: tuple[OcamCamera, OcamCamera] | None
+    views: list[PairView]  # without the rejected ones
+    rejected: tuple[RejectedView, ...]
+
+    @staticmethod
+    def known(files: GivenCameras, views: list[PairView]) -> _FittedCameras:
+        """Return cameras that are known before."""
+        return _FittedCameras((files[0].camera, files[1].camera), None, views, ())
+
+
+def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
+    """Raise OmnidError if known cameras are not those of the images."""
+    if cameras is None:
+        return
+    if _is_mirror(cameras[0]) != _is_mirror(cameras[1]):
+        raise OmnidError("calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
+                         "calibrate both with the same --view")
+    for name, side, file in zip(SIDES, images.sides, cameras, strict=True):
+        height, width = next(iter(side.values())).shape
+        if (width, height) != tuple(file.camera.size):
+            raise OmnidError(f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
+                             f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera")
+
+
+def _is_mirror(file: CameraFile) -> bool:
+    camera = file.camera
+    if isinstance(camera, UnifiedCamera):
+        return camera.focal[0] * camera.focal[1] < 0
+    return isinstance(camera, OcamCamera) and camera.view == "mirror"
+
+
+def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
+    """Find the board in the images of both cameras; of a log's many pairs the most diverse ones are selected."""
+    of_log = bool(images.topics[0])
+    found = [_find_side(side, board, name, progress, thorough=not of_log)
+             for name, side in zip(SIDES, images.sides, strict=True)]
+    both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
+    selected = set(images.names)
+    if of_log and both:
+        selected = {view.name for view in select_diverse_views(both, MAX_LOG_VIEWS)}
+    seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names if name in selected]
+    return [view for view in seen if any(view.seen)]
+
+
+def _find_side(images: Images, board: AnyBoard, name: str, progress: Progress, *, thorough: bool
+               ) -> dict[str, BoardView]:
+    """Return the views of the board by the camera of that name, by the names of the images."""
+    try:
+        views = find_boards(images, board, thorough=thorough, progress=progress)
+    except OmnidError as error:
+        raise OmnidError(f"{name} camera: {error}") from error
+    return {view.name: view for view in views}
+
+
+def _fit_cameras(views: list[PairView], images: PairedImages, board: AnyBoard, choice: tuple[ModelChoice, View],
+                 progress: Progress) -> _FittedCameras:
+    """Fit each camera to all its views; views that do not fit their camera are rejected."""
+    model, direction = choice
+    cameras, polynomials, rejected = [], list[OcamCamera](), list[RejectedView]()
+    for side, name in enumerate(SIDES):
+        seen = [own for view in views if (own := view.seen[side]) is not None]
+        height, width = images.sides[side][seen[0].name].shape if seen else (0, 0)
+        selected = select_calibration(seen, board, (width, height), model, direction)
+        report_scores(selected, f"{name} camera", progress)
+        found = refine_selection(selected, images.sides[side], direction).calibration
+        cameras.append(found.camera)
+        if selected.polynomial is not None:
+            polynomials.append(selected.polynomial)
+        rejected += [RejectedView(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
+        views = _without(views, side, {bad.name for bad in found.rejected})
+    general = (polynomials[0], polynomials[1]) if model == "auto" and len(polynomials) == len(SIDES) else None
+    return _FittedCameras((cameras[0], cameras[1]), general, views, tuple(rejected))
+
+
+def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:
+    """Remove one camera's views of the named instants; the other camera's views are kept."""
+    kept = [view if view.name not in names else
+            replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None)) for view in views]
+    return [view for view in kept if any(view.seen)]
+
+
+def _views_of_one_camera(views: list[PairView]) -> list[RejectedView]:
+    """Return the views that a fit of known cameras cannot use."""
+    return [RejectedView(view.name, f"only the {name} camera saw the board; with given cameras pairs are needed")
+            for view in views for name, other in zip(SIDES, view.seen[::-1], strict=True) if other is None]
+
+
+def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
+    """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
+    baseline_mm, (low, high) = found.baseline_m * 1e3, BASELINE_RANGE_M
+    option, length_mm = ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else (
+        "--square-mm", board.square_m * 1e3)
+    if not low <= found.baseline_m <= high:
+        raise OmnidError(f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found "
+                         f"{baseline_mm:.4g} mm; it is proportional to {option}, which is {length_mm:g}: "
+                         "measure the board")
+    if expected_m is None:
+        return []
+    expected_mm = expected_m * 1e3
+    off = baseline_mm / expected_mm - 1
+    if abs(off) > REFUSED_PART:
+        raise OmnidError(f"calibrate rig: expected a baseline of {expected_mm:g} mm, found {baseline_mm:.1f} mm; "
+                         f"{option} {length_mm * expected_mm / baseline_mm:.2f} would explain it: measure the board "
+                         f"({option} is {length_mm:g}) and the distance of the mirrors")
+    if abs(off) > WARNING_PART:
+        return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected_mm:g} mm"]
+    return []
+
+
+def _masked_rig(found: RigCalibration, images: PairedImages, cameras: GivenCameras | None, *, with_struts: bool
+                ) -> tuple[Rig, list[str]]:
+    """Return the rig with its masks, and warnings about mirrors without a rim in the images."""
+    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
+    masks = [_mask(camera.center, side, file, with_struts=with_struts) for camera, side, file in zip(
+        (found.lower, found.upper), images.sides, cameras or (None, None), strict=True)]
+    warnings = [f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
+                f"add [{name}.mask] by hand" for name, mask in zip(SIDES, masks, strict=True) if mask is None]
+    return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings
+
+
+def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, *, with_struts: bool) -> Mask | None:
+    """Return the mask with hub and struts, or that of the camera's file, or the rim in the maximum of all images."""
+    if with_struts:
+        return find_mask(list(images.values()), center)
+    if file is not None and file.mask is not None:
+        return file.mask
+    return find_rim(np.max(list(images.values()), axis=0), center)

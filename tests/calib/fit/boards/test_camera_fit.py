@@ -1,0 +1,190 @@
+"""Calibration of a camera: exact and noisy corners, standard deviations, rejected views, rendered boards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.boards.board import Board, BoardView
+from calib.errors import CalibError
+from calib.fit.boards.bundle import Observations
+from calib.fit.boards.camera_fit import CameraCalibration, fit_camera, refine_camera_calibration
+from calib.fit.boards.camera_models import Model
+from calib.fit.boards.ocam_linear import solve_linear
+from calib.fit.boards.unified_fit import unified_from_ocam
+from calib.models.camera import Array, Mask, OmniCamera
+from calib.models.ocam import OcamCamera, View
+from calib.models.unified import UnifiedCamera
+from omnid.simulation.rendering.sensor import Sensor
+from tests.simulation.boards import BoardRenderer, board_poses_around_camera
+
+BOTH: tuple[Model, Model] = ("ocam", "omni")
+BOARD = Board(7, 6, 0.03)
+MASK = Mask((394.2, 380.9), 60.0, 372.0)
+SIZE = (780, 768)
+OMNI = UnifiedCamera(0.93, (-205.0, 206.2), MASK.center, SIZE)
+BENT = UnifiedCamera(1.1, (-230.0, 231.0), MASK.center, SIZE, (-0.02, 0.004, 1e-3, -2e-3))
+LENS = UnifiedCamera(1.4, (330.0, 331.5), MASK.center, SIZE)
+OCAM = OcamCamera((-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE)
+DIRECT = OcamCamera((-190.0, 0.0, 1.2e-3, -2e-7, 4e-10), (380.9, 394.2), (1.001, -3e-4, -3e-4), SIZE, "direct")
+
+
+def seen_by(camera: OmniCamera, count: int = 10, noise_px: float = 0.0, seed: int = 0) -> list[BoardView]:
+    axis = camera.lift(np.array([camera.center]))[0]
+    elevation = (35.0, 100.0) if axis[2] > 0 else (95.0, 150.0)
+    if camera is LENS:
+        elevation = (10.0, 75.0)
+    rng = np.random.default_rng(seed)
+    poses = board_poses_around_camera(camera, BOARD, MASK, count, seed=seed, distance_m=(0.12, 0.3),
+                                      elevation_deg=elevation)
+    return [BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
+            for k, T in enumerate(poses)]
+
+
+def turned_apart_rad(one: OmniCamera, other: OmniCamera) -> float:
+    """Return the largest angle between two cameras' rays after alignment of their frames."""
+    pixels = np.array([(394 + r * np.cos(a), 381 + r * np.sin(a)) for r in np.linspace(80, 340, 9)
+                       for a in np.arange(0, 6.2, 0.5)])
+    a, b = one.lift(pixels), other.lift(pixels)
+    seen = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
+    a, b = a[seen], b[seen]
+    left, _, right = np.linalg.svd(a.T @ b)
+    return float(np.linalg.norm(a - b @ (left @ right).T, axis=1).max())
+
+
+@pytest.mark.parametrize("truth", [OCAM, DIRECT])
+def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
+    found = fit_camera(seen_by(truth), BOARD, SIZE, "ocam", truth.view).camera
+    assert isinstance(found, OcamCamera) and found.view == truth.view
+    assert found.center_row_column == pytest.approx(truth.center_row_column, abs=1e-3)
+    assert found.affine == pytest.approx(truth.affine, abs=1e-6)
+    assert found.polynomial[0] == pytest.approx(truth.polynomial[0], rel=1e-5)
+    assert turned_apart_rad(found, truth) < 1e-5
+
+
+@pytest.mark.parametrize(("truth", "view"), [(OMNI, "mirror"), (BENT, "mirror"), (LENS, "direct")])
+def test_recovers_the_omni_camera_from_exact_corners(truth: UnifiedCamera, view: View) -> None:
+    found = fit_camera(seen_by(truth), BOARD, SIZE, "omni", view).camera
+    assert isinstance(found, UnifiedCamera)
+    assert found.xi == pytest.approx(truth.xi, abs=1e-3)
+    assert found.focal == pytest.approx(truth.focal, rel=1e-3)
+    assert found.center == pytest.approx(truth.center, abs=0.01)
+    assert found.distortion == pytest.approx(truth.distortion, abs=3e-4)
+    assert turned_apart_rad(found, truth) < 1e-5
+
+
+@pytest.mark.slow
+def test_recovers_board_poses_and_selects_mirror_or_lens_by_view() -> None:
+    poses = board_poses_around_camera(OMNI, BOARD, MASK, 6, distance_m=(0.12, 0.3))
+    views = [BoardView(str(k), OMNI.project(se3.apply(T, BOARD.points))) for k, T in enumerate(poses)]
+    found = fit_camera(views, BOARD, SIZE, "omni")
+    np.testing.assert_allclose(found.fit.T_cam_board, poses, atol=1e-4)
+    lens = fit_camera(views, BOARD, SIZE, "omni", "direct")
+    assert isinstance(lens.camera, UnifiedCamera) and lens.camera.focal[0] > 0
+    # The images do not distinguish a mirror from a lens.
+    assert lens.fit.mean_px == pytest.approx(found.fit.mean_px, abs=1e-4)
+
+
+def test_linear_solution_is_close() -> None:
+    views = seen_by(OCAM, noise_px=0.2)
+    linear = solve_linear(Observations(np.array([view.pixels for view in views]), BOARD.points), SIZE, 4, "mirror")
+    assert linear.center == pytest.approx(OCAM.center_row_column, abs=2.5)
+    assert linear.coefficients[0] == pytest.approx(-131.6, rel=0.02)
+
+
+@pytest.mark.slow
+def test_sigmas_are_consistent_with_errors() -> None:
+    """Errors divided by their sigmas are about normal, over parameters and repetitions."""
+    truth = {"a0": -131.6, "a2": 1.9e-3, "center_row": 380.9, "center_column": 394.2, "c": 0.998, "d = e": 2e-4}
+    ratios = []
+    for seed in range(4):
+        found = fit_camera(seen_by(OCAM, noise_px=0.2, seed=seed), BOARD, SIZE)
+        known = {name: (value, sigma) for name, value, sigma in found.parameters}
+        ratios += [(known[name][0] - value) / known[name][1] for name, value in truth.items()]
+        assert found.fit.mean_px == pytest.approx(0.2 * np.sqrt(np.pi / 2), rel=0.1)
+    assert 0.6 < np.std(ratios) < 1.6 and np.abs(ratios).max() < 4
+
+
+def spoilt(views: list[BoardView]) -> list[BoardView]:
+    rng = np.random.default_rng(1)
+    shaken = replace(views[2], pixels=views[2].pixels + rng.normal(0, 3, (42, 2)))
+    nonsense = replace(views[6], pixels=rng.uniform(100, 600, (42, 2)))
+    return [*views[:2], shaken, *views[3:6], nonsense, *views[7:]]
+
+
+@pytest.mark.slow
+def test_rejects_outlier_views_by_name() -> None:
+    found = fit_camera(spoilt(seen_by(OMNI, noise_px=0.1)), BOARD, SIZE, "omni")
+    assert sorted(bad.name for bad in found.rejected) == ["view2", "view6"]
+    assert all("off" in bad.reason for bad in found.rejected)
+    assert len(found.views) == len(found.fit.T_cam_board) == 8
+    assert turned_apart_rad(found.camera, OMNI) < 5e-3
+
+
+def test_hidden_corners_have_no_effect() -> None:
+    views = seen_by(OMNI)
+    holed = [replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
+             for k, view in enumerate(views)]
+    assert turned_apart_rad(fit_camera(holed, BOARD, SIZE, "omni").camera, OMNI) < 1e-5
+
+
+@pytest.mark.slow
+def test_one_outlier_corner_has_little_effect() -> None:
+    views = seen_by(OMNI, noise_px=0.05)
+    pixels = views[0].pixels.copy()
+    pixels[20] += (9.0, -7.0)
+    clean = fit_camera(views, BOARD, SIZE, "omni")
+    strayed = fit_camera([replace(views[0], pixels=pixels), *views[1:]], BOARD, SIZE, "omni")
+    assert strayed.camera.center == pytest.approx(clean.camera.center, abs=0.05)
+    assert len(strayed.views) == 10
+
+
+def test_refuses_too_few_views() -> None:
+    views = seen_by(OMNI)
+    with pytest.raises(CalibError, match="expected at least 4 views of the board, found 3; take more"):
+        fit_camera(views[:3], BOARD, SIZE)
+    with pytest.raises(CalibError, match="expected at least 4 consistent views, found 3; left out view6"):
+        fit_camera([views[0], views[4], spoilt(views)[6], views[8]], BOARD, SIZE)
+
+
+def test_warns_of_views_on_one_side_only() -> None:
+    assert any("directions only" in line for line in fit_camera(seen_by(OMNI)[:4], BOARD, SIZE).warnings)
+    assert fit_camera(seen_by(OMNI), BOARD, SIZE).warnings == ()
+
+
+def rendered() -> tuple[CameraCalibration, CameraCalibration]:
+    """Calibrate an ocam and an omni camera by rendered images."""
+    from calib.boards.board_finder import find_board
+
+    renderer = BoardRenderer.of(BOARD, OMNI, MASK)
+    poses = board_poses_around_camera(OMNI, BOARD, MASK, 8, seed=3, distance_m=(0.12, 0.28))
+    images = {str(k): renderer.render_board(T, seed=k, sensor=Sensor(noise_sigma=1.0)).image
+              for k, T in enumerate(poses)}
+    views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
+    assert len(views) == 8
+    both = []
+    for model in BOTH:
+        first = fit_camera([view for view in views if view], BOARD, SIZE, model)
+        both.append(refine_camera_calibration(first, images, model, "mirror"))
+    return both[0], both[1]
+
+
+@pytest.mark.slow
+def test_recovers_scale_and_centre_from_rendered_boards() -> None:
+    ocam, omni = rendered()
+    assert isinstance(omni.camera, UnifiedCamera) and isinstance(ocam.camera, OcamCamera)
+    assert max(ocam.fit.mean_px, omni.fit.mean_px) < 0.03
+    for found in (ocam, omni):
+        assert found.camera.center == pytest.approx(OMNI.center, abs=0.1)
+    assert omni.camera.focal == pytest.approx(OMNI.focal, rel=5e-4)
+    pixels = MASK.center + np.linspace(80, 340, 20)[:, None] * np.array([[0.6, 0.8]])
+    angles: list[Array] = []
+    for camera in (ocam.camera, OMNI):
+        axis = camera.lift(np.array([camera.center]))[0]
+        angles.append(np.arccos(camera.lift(pixels) @ axis))
+    assert np.abs(angles[0] / angles[1] - 1).max() < 1e-3
+    difference = omni.camera.lift(pixels) - ocam.camera.lift(pixels) @ unified_from_ocam(ocam.camera)[:3, :3].T
+    assert np.linalg.norm(difference, axis=1).max() < 1e-3

@@ -1,0 +1,233 @@
+"""Bundle adjustment of a rig from a drive: exact observations give the exact rig, noisy ones an honest sigma."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.errors import CalibError
+from calib.fit.drive.adjustment import adjust_drive, adjust_pairs, held_out_error, observation_sigma
+from calib.fit.drive.camera_terms import DISTORTIONS, DriveModelScore, best_model
+from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion, project
+from calib.fit.drive.problem import DriveProblem
+from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.models.camera import Array
+from calib.models.unified import UnifiedCamera
+from calib.rig import Rig
+from omnid.simulation.rendering.rigs import make_rig
+from tests.simulation.paths import loop, vibrate
+
+KEYFRAMES, LANDMARKS = 14, 150
+NOISE_PX = 0.03
+PRIOR = np.eye(15) / 3.0**2  # sigmas of 3 pixels, or of what moves the image by about so many
+
+
+@pytest.fixture(scope="module")
+def truth() -> Rig:
+    return make_rig(size=512, baseline_m=0.22, misaligned_deg=(0.6, -0.4, 0.5), lower_misaligned_deg=(0.3, 0.2, 0.0))
+
+
+def drive(truth: Rig, seed: int, noise_px: float = NOISE_PX) -> tuple[DriveState, DriveObservations]:
+    """Return keyframes of a round through a room, landmarks on its walls, and where both cameras see them."""
+    rng = np.random.default_rng(seed)
+    poses = vibrate(loop(seed, KEYFRAMES), seed)
+    T_rig_odom = se3.inverse(se3.inverse(poses[0]) @ poses)
+    azimuth, range_m = rng.uniform(-np.pi, np.pi, LANDMARKS), rng.uniform(1.6, 4.0, LANDMARKS)
+    points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(-1.0, 1.2, LANDMARKS)])
+    points -= [*poses[0][:2, 3].tolist(), 0.0]
+    keyframe, landmark, camera = (part.ravel() for part in np.mgrid[:KEYFRAMES, :LANDMARKS, :2])
+    in_rig = se3.apply(T_rig_odom, points)[keyframe, landmark]
+    pixels = project(truth, camera, in_rig) + noise_px * rng.standard_normal((len(keyframe), 2))
+    seen = np.isfinite(pixels).all(axis=1) & (np.linalg.norm(in_rig, axis=1) > 0.7)
+    return DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion.still(KEYFRAMES)), DriveObservations(
+        keyframe[seen], landmark[seen], camera[seen], pixels[seen])
+
+
+def disturbed(rig: Rig, rng: np.random.Generator) -> Rig:
+    """Return a rig whose parameters are off by about a pixel each."""
+    parameters = RigParameters.about(rig)
+    return parameters.at(rng.uniform(-1, 1, len(parameters.names)))
+
+
+def start(state: DriveState, parameters: RigParameters, rng: np.random.Generator) -> DriveState:
+    """Return a state whose poses and landmarks are off by centimetres, as odometry with a wrong rig gives them."""
+    turned = se3.exp(0.01 * rng.standard_normal((KEYFRAMES, 6))) @ state.T_rig_odom
+    turned[0] = state.T_rig_odom[0]
+    points = state.points * (1 + 0.02 * rng.standard_normal((LANDMARKS, 1)))
+    return replace(state, T_rig_odom=turned, points=points, steps=np.zeros(len(parameters.names)))
+
+
+def rays_apart_deg(a: Rig, b: Rig) -> Array:
+    """Return the angles between the rays of both rigs' lower and upper cameras, in the rig frame."""
+    angles = np.linspace(-np.pi, np.pi, 60)
+    radii = np.array([60.0, 120.0, 180.0])
+    grid = (radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).reshape(-1, 2) + 255.5
+    apart = []
+    for side in ("lower", "upper"):
+        one, other = (getattr(rig, side).camera.lift(grid) @ getattr(rig, side).T_cam_rig[:3, :3] for rig in (a, b))
+        apart.append(np.arccos(np.clip((one * other).sum(axis=1), -1, 1)))
+    return np.rad2deg(np.concatenate(apart))
+
+
+def test_a_disturbed_rig_becomes_the_true_one(truth: Rig) -> None:
+    rng = np.random.default_rng(1)
+    state, observations = drive(truth, 1)
+    rig = disturbed(truth, rng)
+    parameters = RigParameters.about(rig)
+    found = adjust_drive(parameters, start(state, parameters, rng), observations, PRIOR)
+    assert np.median(rays_apart_deg(rig, truth)) > 0.1
+    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
+    assert found.rig.baseline_m == pytest.approx(truth.baseline_m, rel=1e-9)
+    assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
+    assert found.seen.all()
+    assert observation_sigma(rig, found) > 3 * found.sigma_px
+
+
+def test_sigmas_are_those_of_the_errors(truth: Rig) -> None:
+    """Errors over said sigmas are of order one, over all parameters of some drives."""
+    parameters = RigParameters.about(truth)
+    ratios = []
+    for seed in range(2):
+        state, observations = drive(truth, seed)
+        begin = replace(state, steps=np.zeros(len(parameters.names)))
+        found = adjust_drive(parameters, begin, observations, PRIOR)
+        ratios.append(found.state.steps / found.sigmas)
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.8
+
+
+def test_landmarks_that_move_are_left_out(truth: Rig) -> None:
+    rng = np.random.default_rng(3)
+    state, observations = drive(truth, 3)
+    wandering = observations.landmark < 30
+    pixels = observations.pixels + np.where(wandering[:, None], rng.uniform(-4, 4, observations.pixels.shape), 0.0)
+    parameters = RigParameters.about(truth)
+    begin = replace(state, steps=np.zeros(len(parameters.names)))
+    found = adjust_drive(parameters, begin, replace(observations, pixels=pixels), PRIOR)
+    assert len(found.state.points) <= LANDMARKS - 30
+    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
+
+
+def test_pixels_at_random_are_refused(truth: Rig) -> None:
+    state, observations = drive(truth, 4)
+    pixels = np.random.default_rng(4).uniform(0, 511, observations.pixels.shape)
+    parameters = RigParameters.about(truth)
+    begin = replace(state, steps=np.zeros(len(parameters.names)))
+    with pytest.raises(CalibError, match="px off any rig and path"):
+        adjust_drive(parameters, begin, replace(observations, pixels=pixels), PRIOR)
+
+
+def test_tangential_terms_are_found_and_chosen_by_landmarks_held_out(truth: Rig) -> None:
+    """Cameras with decentring terms, calibrated from a file that has none."""
+    state, observations = drive(truth, 5)
+    assert isinstance(truth.lower.camera, UnifiedCamera)
+    camera = replace(truth.lower.camera, distortion=(0.0, 0.0, 0.004, 0.002))
+    points = problem_points(truth, state, observations)
+    bent, straight = (project(rig, observations.camera, points)
+                      for rig in (replace(truth, lower=replace(truth.lower, camera=camera)), truth))
+    observations = replace(observations, pixels=observations.pixels + bent - straight)
+    parameters = RigParameters.about(truth, ("p1", "p2"))
+    prior = np.eye(len(parameters.names)) / 3.0**2
+    found = adjust_drive(parameters, replace(state, steps=np.zeros(len(prior))), observations, prior)
+    assert held_out_error(parameters, found, prior) < 0.8 * held_out_error(RigParameters.about(truth), found, PRIOR)
+    lower = found.rig.lower.camera
+    assert isinstance(lower, UnifiedCamera)
+    assert lower.distortion[2:] == pytest.approx((0.004, 0.002), abs=3e-4)
+
+
+def problem_points(truth: Rig, state: DriveState, observations: DriveObservations) -> Array:
+    """Return the landmark of each observation in the rig frame."""
+    parameters = RigParameters.about(truth)
+    problem = DriveProblem(parameters, observations, PRIOR, np.zeros(1, int))
+    return problem.in_rig(replace(state, steps=np.zeros(15)), np.zeros(15))
+
+
+def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
+    """The upper camera is exposed 12 ms late, rows follow by 30 us; the rig turns and drives at changing speed."""
+    rng = np.random.default_rng(6)
+    state, observations = drive(truth, 6)
+    twist = np.column_stack([rng.uniform(-0.7, 0.7, (KEYFRAMES, 2)), np.zeros((KEYFRAMES, 3)),
+                             rng.uniform(-0.8, 0.8, KEYFRAMES)])
+    motion = KeyframeMotion(twist, np.full(KEYFRAMES, 5e-3))
+    delay_s = np.where(observations.camera == 1, 12e-3, 0.0) + 30e-6 * observations.pixels[:, 1]
+    points = problem_points(truth, state, observations)
+    moving = np.array([se3.apply(se3.exp(-t * v), p[None])[0]
+                       for t, v, p in zip(delay_s, twist[observations.keyframe], points, strict=True)])
+    pixels = project(truth, observations.camera, moving) + NOISE_PX * rng.standard_normal((len(points), 2))
+    seen = np.isfinite(pixels).all(axis=1)
+    kept, used = replace(observations, pixels=pixels).only(seen)
+    parameters = RigParameters.about(truth, times=(UPPER_DELAY, LINE_TIME))
+    begin = replace(state, points=state.points[used], steps=np.zeros(17), motion=motion)
+    found = adjust_drive(parameters, begin, kept, np.diag([*np.diag(PRIOR), 1 / 9, 1 / 36]))
+    times = parameters.times_at(found.state.steps)
+    assert times.upper_delay_s == pytest.approx(7e-3, abs=3e-4)
+    assert times.line_time_s == pytest.approx(30e-6, abs=1e-6)
+    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
+
+
+def test_rays_of_both_cameras_meet_after_adjusting_pairs(truth: Rig) -> None:
+    """Points that are seen once by both cameras, from a rig that is off by some pixels; a tenth of them are wrong."""
+    rng = np.random.default_rng(7)
+    count = 400
+    azimuth, range_m = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.8, 4.0, count)
+    points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(-0.8, 0.8, count)])
+    landmark, camera = (part.ravel() for part in np.mgrid[:count, :2])
+    pixels = project(truth, camera, points[landmark]) + NOISE_PX * rng.standard_normal((2 * count, 2))
+    pixels[:count // 5] += rng.uniform(-5, 5, (count // 5, 2))
+    seen = np.isfinite(pixels).all(axis=1)
+    seen &= np.isin(landmark, np.flatnonzero(np.bincount(landmark[seen], minlength=count) == 2))
+    observed, used = DriveObservations(0 * landmark, landmark, camera, pixels).only(seen)
+    parameters = RigParameters.about(disturbed(truth, rng))
+    state = DriveState(np.eye(4)[None], points[used] * rng.uniform(0.9, 1.1, (len(used), 1)),
+                       np.zeros(len(parameters.names)), KeyframeMotion.still(1))
+    before = ray_gaps_px(parameters.rig, observed)
+    after = ray_gaps_px(parameters.at(adjust_pairs(parameters, state, observed, PRIOR)), observed)
+    assert np.median(after) < 1.5 * NOISE_PX < 0.3 * np.median(before)
+
+
+def ray_gaps_px(rig: Rig, observed: DriveObservations) -> Array:
+    """Return the distances of upper pixels from the epipolar planes of the lower ones, in pixels of the horizon."""
+    lower, upper = (mounted.camera.lift(observed.pixels[observed.camera == side]) @ mounted.T_cam_rig[:3, :3]
+                    for side, mounted in enumerate((rig.lower, rig.upper)))
+    normal = np.cross(rig.upper.viewpoint - rig.lower.viewpoint, lower)
+    sines = (normal * upper).sum(axis=1) / np.linalg.norm(normal, axis=1)
+    return np.abs(sines) * 138.0
+
+
+def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
+    """Wavefronts of a millimetre, which near and far landmarks show; the cameras are exact at 1.5 m."""
+    state, observations = drive(truth, 8)
+    waves = np.array([[4e-4, 8e-4, -1.2e-3, -1.4e-3, 6e-4], [-3e-4, 1e-3, -4e-4, -1e-3, 5e-4]])
+    points = problem_points(truth, state, observations)
+    pixels = observations.pixels + project(truth, observations.camera, points, waves) - project(
+        truth, observations.camera, points)
+    observations = replace(observations, pixels=pixels)
+    parameters = RigParameters.about(truth, waves=True)
+    prior = np.diag([*np.diag(PRIOR), *np.ones(10)])
+    found = adjust_drive(parameters, replace(state, steps=np.zeros(25)), observations, prior)
+    assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
+    np.testing.assert_allclose(parameters.wavefronts_at(found.state.steps), waves, atol=3e-4)
+    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
+
+
+@pytest.mark.parametrize(("held_out", "expected"), [
+    ((0.2, 0.05, 0.0499), ("p1", "p2")), ((0.2, 0.199, 0.1985), ()), ((0.2, 0.1, 0.05), ("k1", "p1", "p2")),
+])
+def test_the_fewest_terms_that_no_more_improve_are_chosen(held_out: tuple[float, ...], expected: tuple[str, ...]
+                                                          ) -> None:
+    scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=True)]
+    assert best_model(scores).distortion == expected
+
+
+def test_observations_that_are_alike_leave_more_to_the_prior(truth: Rig) -> None:
+    """A prior half as strong as the drive, about a centre that is off, weighs ten times as much."""
+    state, observations = drive(truth, 9)
+    parameters = RigParameters.about(disturbed(truth, np.random.default_rng(9)))
+    begin = replace(state, steps=np.zeros(15))
+    free = adjust_drive(parameters, begin, observations, PRIOR)
+    prior = np.diag(1 / (2 * np.diag(free.covariance)))
+    once, ten = (np.abs(adjust_drive(parameters, begin, observations, prior, alike=alike).state.steps).sum()
+                 for alike in (1.0, 10.0))
+    assert ten < 0.7 * once < 0.7 * np.abs(free.state.steps).sum()

@@ -1,0 +1,47 @@
+"""`omnid.calibrate_camera`: one call from images to a camera that prints itself and is saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+import omnid
+from calib.camera_file import read_camera
+from calib.models.camera import Mask
+from calib.models.unified import UnifiedCamera
+from omnid.calibration.camera import CameraResult
+from tests.simulation.boards import BoardRenderer, board_poses_around_camera
+
+BOARD = omnid.Board(6, 5, 0.03)
+CAMERA = UnifiedCamera(0.9, (-110.0, 110.5), (178.3, 181.1), (360, 362))
+MASK = Mask(CAMERA.center, 30.0, 172.0)
+lines: list[str] = []
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> CameraResult:
+    """Calibrate by five rendered images."""
+    folder = tmp_path_factory.mktemp("images")
+    renderer = BoardRenderer.of(BOARD, CAMERA, MASK)
+    for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, 5, distance_m=(0.14, 0.25))):
+        cv2.imwrite(str(folder / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
+    return omnid.calibrate_camera([str(folder)], BOARD, model="omni", progress=lines.append)
+
+
+def test_the_result_prints_itself_in_one_line(found: CameraResult) -> None:
+    line = str(found)
+    assert line.startswith("model omni, 360x362, centre 178.") and line.endswith("corners of 5 views")
+    assert "\n" not in line and not found.is_misfit and found.mask is None
+
+
+def test_progress_has_a_line_for_each_image_and_model(found: CameraResult) -> None:
+    assert [line.split()[0] for line in lines] == [f"[{k}/5]" for k in range(1, 6)] + ["camera:"]
+
+
+def test_what_is_saved_is_the_camera(found: CameraResult, tmp_path: Path) -> None:
+    found.save(tmp_path / "camera.toml")
+    read = read_camera(tmp_path / "camera.toml").camera
+    assert read == found.calibration.camera
+    assert read.center == pytest.approx(CAMERA.center, abs=0.3)
