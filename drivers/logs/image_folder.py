@@ -7,9 +7,11 @@ whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -87,11 +89,11 @@ class ImageFolder:
             yield LoggedImage(file.topic, file.stamp_ns, partial(_read, file))
 
     def attachments(self) -> dict[str, bytes]:
-        """Return the rig.toml beside the folders, if there is one of at most 16 MiB."""
+        """Return the rig.toml beside the folders, if there is a regular file of at most 16 MiB."""
         try:
-            with (self._path / ATTACHMENT).open("rb") as file:
-                data = file.read(_MAX_ATTACHMENT_BYTES + 1)
-        except OSError:
+            _require_own_files(self._path, [self._path / ATTACHMENT])
+            data = _read_regular(self._path / ATTACHMENT, _MAX_ATTACHMENT_BYTES + 1)
+        except (OSError, DriverError):
             return {}
         return {ATTACHMENT: data} if len(data) <= _MAX_ATTACHMENT_BYTES else {}
 
@@ -108,6 +110,7 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
     """Yield the images of a folder with their stamps; raise DriverError where one has none."""
     topic = folder.relative_to(top).as_posix()
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    _require_own_files(top, paths)
     lines = _stamp_lines(folder)
     if lines is not None and len(lines) != len(paths):
         raise DriverError(f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
@@ -120,6 +123,28 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
             raise DriverError(f"{str(path)!r} {where} {text[:40]!r}; expected a stamp: nanoseconds of 16 digits or "
                               f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}")
         yield _StampedFile(stamp_ns, topic, path)
+
+
+def _require_own_files(top: Path, paths: Sequence[Path]) -> None:
+    """Raise DriverError, in one line, where a path is no regular file below the folder `top`.
+
+    A pipe or a device would be waited for without an end, and a link could lead to any file of the machine.
+    """
+    real_top = os.path.realpath(top)
+    others = [path for path in paths if not path.is_file()
+              or os.path.commonpath([real_top, os.path.realpath(path)]) != real_top]
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise DriverError(f"{str(others[0])!r}{more}: no regular file of the folder {str(top)!r}, but a pipe, a "
+                          "device, a folder, or a link out of it: remove it, or copy what it leads to")
+
+
+def _read_regular(path: Path, most_bytes: int) -> bytes:
+    """Return at most so many bytes of a file; raise OSError for what is none, without waiting for a pipe."""
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        return file.read(most_bytes)
 
 
 def _stamp_lines(folder: Path) -> list[str] | None:
@@ -170,8 +195,7 @@ def _parse_date(text: str) -> int | None:
 
 def _read(file: _StampedFile) -> RosImage:
     try:
-        with file.path.open("rb") as opened:
-            data = opened.read(MAX_RECORD_BYTES)
+        data = _read_regular(file.path, MAX_RECORD_BYTES)
     except OSError as error:
         raise RecordError(f"{str(file.path)!r} cannot be read: {error.strerror}") from error
     return RosImage(file.stamp_ns, image_encoding(data), memoryview(data))

@@ -49,7 +49,6 @@ class RotatingLog:
         self.state = RotatingLogState()
         self._folder, self._rotation, self._on_event = folder, rotation, on_event
         self._attachments = dict(attachments)
-        self._begun_with: Mapping[str, bytes] = self._attachments  # those of the current file
         self._writer: LogWriter | None = None
         self._path = folder.path
         self._number = 1
@@ -77,10 +76,6 @@ class RotatingLog:
             else:
                 self._stop(error)
 
-    def attach(self, name: str, data: bytes) -> None:
-        """Replace or add an attachment; the next message begins a file with it. From any thread."""
-        self._attachments = {**self._attachments, name: data}
-
     def close(self) -> None:
         """Complete the file and end the recording."""
         self._end()
@@ -88,8 +83,7 @@ class RotatingLog:
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
         """Return the file for a message with this stamp, None where none can be created."""
-        outdated = self._attachments is not self._begun_with
-        if self._writer is not None and (outdated or self._is_full(self._writer, stamp_ns)):
+        if self._writer is not None and self._is_full(self._writer, stamp_ns):
             self._end()
         if self._writer is None and time.monotonic() >= self._retry_at_s:
             self._begin(stamp_ns)
@@ -120,8 +114,7 @@ class RotatingLog:
             path, number = self._folder.unused_path(stamp_ns, self._number)
             self._number, self._path = number + 1, path
             try:
-                self._begun_with = self._attachments
-                writer = LogWriter(path, self._begun_with, compression="none", exclusive=True)
+                writer = LogWriter(path, self._attachments, compression="none", exclusive=True)
             except DriverError as error:
                 if isinstance(error.__cause__, FileExistsError):
                     continue

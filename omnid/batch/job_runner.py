@@ -11,7 +11,6 @@ import math
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -19,11 +18,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from omnid.batch.jobs import Job, file_system, is_url, one_line
+from drivers.logs.log_formats import LOG_SUFFIXES
+from omnid.batch.jobs import Job, file_system, is_url
+from omnid.engine.python_program import python, python_environment
+from omnid.plain_text import one_line
 
 RESULT_FILE: Final = "result.json"
 LOG_FILE: Final = "messages.txt"
 _ATTEMPT: Final = ".attempt-"
+_FETCHED: Final = "fetched"  # name of a log from an address, without its suffix
 _END_S: Final = 10.0  # for a program to end after SIGTERM
 _MAX_MESSAGES: Final = 64 * 1024  # bytes of a program's messages that are kept
 # One thread for each program: as many programs run as there are cores.
@@ -75,7 +78,7 @@ def run_job(job: Job) -> JobResult:
         values = _attempt(job, attempt)
         result = JobResult(name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=job.key(),
                            **values)
-        (attempt / RESULT_FILE).write_text(json.dumps(plain(result), indent=1) + "\n")
+        (attempt / RESULT_FILE).write_text(json.dumps(row_values(result), indent=1) + "\n")
         _replace(attempt, job.folder)
         return result
     finally:
@@ -93,7 +96,7 @@ def stored_result(job: Job) -> JobResult | None:
     return result if result.key == job.key() and result.status in (OK, NO_POSE) else None
 
 
-def plain(result: JobResult) -> dict[str, Any]:
+def row_values(result: JobResult) -> dict[str, Any]:
     """Return a row by names, with None in place of NaN."""
     values = {name: getattr(result, name) for name in JobResult.__slots__}
     return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in values.items()}
@@ -121,20 +124,23 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def _local(log: str, folder: Path) -> Path:
-    """Return the path of a log; one at an address is fetched into the folder."""
+    """Return the path of a log; one at an address is fetched into the folder.
+
+    Its name there is not that of the object, which a stranger may have chosen: the folder is where programs run.
+    """
     if not is_url(log):
         return Path(log)
-    path = folder / log.rpartition("/")[2]
+    suffix = next((suffix for suffix in LOG_SUFFIXES if log.endswith(suffix)), LOG_SUFFIXES[0])
+    path = folder / f"{_FETCHED}{suffix}"
     file_system(log).get_file(log, str(path))
     return path
 
 
 def _omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | None, str]:
     """Run omnid in a folder; return its exit code, None after the time, and what it printed."""
-    command = [sys.executable, "-m", "omnid", *words]
     with (folder / LOG_FILE).open("ab") as messages:
-        process = subprocess.Popen(command, cwd=folder, env={**os.environ, **_ENVIRONMENT}, stdin=subprocess.DEVNULL,
-                                   stdout=subprocess.PIPE, stderr=messages, text=True)
+        process = subprocess.Popen(python("-m", "omnid", *words), cwd=folder, env=python_environment(**_ENVIRONMENT),
+                                   stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=messages, text=True)
         _RUNNING.add(process)
         try:
             text, _ = process.communicate(timeout=timeout_s)

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES, parts_in_order
 from omnid.errors import OmnidError
+from omnid.plain_text import one_line
 from omnid.version import __version__
 
 MAX_LOGS: Final = 100_000
@@ -71,7 +72,9 @@ def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
     paths = [PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
              for log in logs]
     common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path("/")
-    names = _distinct(_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))) for path in paths)
+    # Without a dot at the beginning: names such as ".." and those of this program's own files are no folders of logs.
+    names = _distinct(_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log"
+                      for path in paths)
     return [Job(name, log, out / name, options) for name, log in zip(names, logs, strict=True)]
 
 
@@ -108,7 +111,8 @@ def _of_path(path: Path) -> Iterator[Path]:
         yield path
         return
     yield from inside
-    for folder in sorted(folder for folder in path.iterdir() if folder.is_dir()):
+    # Links to folders are not followed: they may form circles.
+    for folder in sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.is_symlink()):
         yield from _of_path(folder)
 
 
@@ -136,11 +140,6 @@ def file_system(name: str) -> Any:
         return fsspec.core.url_to_fs(name)[0]
     except (ValueError, ImportError) as error:
         raise OmnidError(f"batch: {name!r}: {one_line(error)}") from error
-
-
-def one_line(error: object) -> str:
-    """Return a message without line breaks, of at most 300 characters."""
-    return " ".join(str(error).split())[:300]
 
 
 def _files(path: Path) -> Iterator[tuple[Path, os.stat_result]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
@@ -12,7 +11,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from omnid.batch.job_runner import OK, JobResult, plain
+from omnid.batch.job_runner import OK, JobResult, row_values
+from omnid.formats.whole_file import write_whole
+from omnid.plain_text import plain
 from omnid.report.page import page, table
 
 CSV_FILE: Final = "results.csv"
@@ -22,30 +23,24 @@ COLUMNS: Final = tuple(name for name in JobResult.__slots__ if name != "key")
 _STYLE: Final = "body{max-width:none}.bad{color:#a40}"
 _HEAD: Final = ("log", "", "status", "pairs", "length", "tracking", "degraded", "lost", "resets", "ATE", "length error",
                 "time")
-_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")  # first characters that spreadsheets execute
+_FORMULA: Final = ("=", "+", "-", "@")  # first characters that spreadsheets execute
+MOST_CHARACTERS: Final = 5000  # of a cell, which may contain the path of a log
 
 
 def write_tables(results: Sequence[JobResult], out: Path) -> list[Path]:
     """Write the tables into a folder, Parquet only where pyarrow is installed; return their paths."""
     ordered = sorted(results, key=lambda result: result.name)
     written = [out / CSV_FILE, out / INDEX_FILE]
-    _write(written[0], _csv(ordered))
-    _write(written[1], page("omnid batch", _index(ordered, out), _STYLE))
+    write_whole(written[0], _csv(ordered).encode())
+    write_whole(written[1], page("omnid batch", _index(ordered, out), _STYLE).encode())
     try:
         import pyarrow as arrow
         import pyarrow.parquet as parquet
     except ImportError:
         return written
-    rows = [{name: plain(result)[name] for name in COLUMNS} for result in ordered]
+    rows = [_cells(result) for result in ordered]
     parquet.write_table(arrow.Table.from_pylist(rows), out / PARQUET_FILE)
     return [*written, out / PARQUET_FILE]
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file that is complete at any time."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(text, "utf-8", newline="")
-    os.replace(part, path)
 
 
 def _csv(results: Sequence[JobResult]) -> str:
@@ -55,14 +50,20 @@ def _csv(results: Sequence[JobResult]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for result in results:
-        values = plain(result)
-        writer.writerow(["" if values[name] is None else _safe(values[name]) for name in COLUMNS])
+        writer.writerow(["" if cell is None else _no_formula(cell) for cell in _cells(result).values()])
     return text.getvalue()
 
 
-def _safe(value: object) -> object:
-    """Return a cell that a spreadsheet does not execute: names of logs may come from anywhere."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+def _cells(result: JobResult) -> dict[str, object]:
+    """Return the cells of a row by their columns: names of logs may come from anywhere, and be no text."""
+    values = row_values(result)
+    return {name: plain(value, MOST_CHARACTERS) if isinstance(value := values[name], str) else value
+            for name in COLUMNS}
+
+
+def _no_formula(cell: object) -> object:
+    """Return a cell that a spreadsheet does not execute."""
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(_FORMULA) else cell
 
 
 def _index(results: Sequence[JobResult], out: Path) -> list[str]:
@@ -78,7 +79,7 @@ def _row(result: JobResult, out: Path) -> tuple[str, ...]:
     name = escape(result.name)
     links = " ".join(f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES
                      if (out / result.name / file).is_file())
-    outcome = escape(f"{result.status}: {result.error}" if result.error else result.status)
+    outcome = escape(plain(f"{result.status}: {result.error}" if result.error else result.status))
     status = outcome if result.status == OK else f"<span class='bad'>{outcome}</span>"
     return (name, links, status, str(result.pairs), _metres(result.length_m), str(result.tracking),
             str(result.degraded), str(result.lost), str(result.resets), _metres(result.ate_rmse_m, 4),

@@ -10,8 +10,9 @@ from importlib import import_module
 from typing import Any, Final
 
 from omnid.batch.job_runner import FAILED, KILLED, JobResult, end_programs, run_job
-from omnid.batch.jobs import Job, one_line
+from omnid.batch.jobs import Job
 from omnid.errors import OmnidError
+from omnid.plain_text import one_line
 
 MAX_ATTEMPTS: Final = 2  # of a job whose program was killed
 _CONNECT_S: Final = 10.0

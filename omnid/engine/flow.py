@@ -39,23 +39,6 @@ class Stage(Protocol[In_contra, Out_co]):
         """Return the result of the message, None without one."""
 
 
-class Chain(Generic[In, Mid, Out]):
-    """Two stages as one: the second takes each result of the first, in the same thread. Neither may have `finish`."""
-
-    def __init__(self, first: Stage[In, Mid], second: Stage[Mid, Out]) -> None:
-        self._first, self._second = first, second
-
-    def process(self, message: In, /) -> Out | None:
-        """Return the result of both stages, None without one."""
-        between = self._first.process(message)
-        return None if between is None else self._second.process(between)
-
-    def after(self) -> None:
-        """Do what both stages have left to do for the last message."""
-        for stage in (self._first, self._second):
-            getattr(stage, "after", nothing)()
-
-
 class Sink(Protocol[In_contra]):
     """An end of the flow; may also have `finish() -> None`."""
 

@@ -4,7 +4,11 @@ A folder holds the code of one file in one state, of one version of numba and Py
 in a folder of another name, which gets its name when it is complete, and its files are checked by their digests
 before they are read: a power cut, a full disk or two programs at once cannot leave code that is half written. Folders
 of other states are removed, the oldest first.
-"""
+
+What is read here is run. The digests protect from damage only: they are in the same folder as the code, so anyone who
+can write the code can write its digests. Other users are kept out by owner and mode alone: the folder of all states
+and that of each belong to this user, and neither group nor others can write to them. A program of the same user is
+not kept out: it could change this program as well."""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ import json
 import logging
 import os
 import platform
+import random
 import re
 import shutil
 import sys
@@ -105,10 +110,14 @@ def _compile_first(folders: Mapping[str, Path], reason: str, report: Report) -> 
     started_s = time.monotonic()
     count = sum(1 for name in folders for _ in _functions_of(name))
     report(logging.INFO, f"compiling {count} functions for this processor, once; takes half a minute to two")
-    for name, folder in folders.items():
+    # In any order: two programs that start at once begin with other files, and each reads what the other has made.
+    for name, folder in random.sample(list(folders.items()), len(folders)):
         if not reason:
             try:
-                _compile_and_publish(name, folder)
+                if _is_intact(folder):
+                    _compile_into(name, folder)
+                else:
+                    _compile_and_publish(name, folder)
                 continue
             except OSError as error:
                 reason = error.strerror or str(error)

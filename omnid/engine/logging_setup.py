@@ -17,6 +17,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TextIO
 
+from omnid.plain_text import one_line
+
 LOGGER: Final = logging.getLogger("omnid")
 
 # Levels of logging and the priorities of syslog and journald (RFC 5424, section 6.2.1).
@@ -75,7 +77,7 @@ class StderrHandler(logging.Handler):
         text = record.getMessage()
         if record.name != LOGGER.name:
             text = f"{record.name}: {text}"
-        line = _single_line(text)
+        line = one_line(text, _MAX_LENGTH)
         if getattr(record, "unlimited", False):
             self._write(record.levelno, line)
         else:
@@ -88,7 +90,7 @@ class StderrHandler(logging.Handler):
             stream = self._stream or sys.stderr
             with suppress(OSError, ValueError):
                 columns = os.get_terminal_size(stream.fileno()).columns or _COLUMNS
-                self._shown = _fitting(_single_line(line), max(0, columns - 1))  # a wrapped line could not be erased
+                self._shown = _fitting(one_line(line, _MAX_LENGTH), max(0, columns - 1))  # of one row
                 stream.write(f"{_ERASE}{self._shown}")
                 stream.flush()
         finally:
@@ -125,7 +127,7 @@ class StderrHandler(logging.Handler):
 
     def _write(self, level: int, line: str) -> None:
         stream = self._stream or sys.stderr
-        prefix = f"<{priority(level)}>" if _is_journal(stream) else f"omnid: {_label(level)}"
+        prefix = f"<{priority(level)}>" if is_journal(stream) else f"omnid: {_label(level)}"
         with suppress(OSError, ValueError):  # a closed stream or a full disk must not end the program
             erase = _ERASE if self._shown else ""
             stream.write(f"{erase}{prefix}{line}\n{self._shown}")
@@ -144,15 +146,11 @@ def _fitting(line: str, columns: int) -> str:
     return line[: columns + 1].rpartition(", ")[0] or line[:columns]
 
 
-def _single_line(text: str) -> str:
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text[:_MAX_LENGTH]).split())
-
-
 def _label(level: int) -> str:
     return "warning: " if level == logging.WARNING else ""
 
 
-def _is_journal(stream: TextIO) -> bool:
+def is_journal(stream: TextIO) -> bool:
     """True if journald reads the stream: $JOURNAL_STREAM is then its device and inode (systemd.exec(5))."""
     expected = os.environ.get("JOURNAL_STREAM")
     try:

@@ -28,6 +28,7 @@ CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23
 LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
                       "realtime.lock_memory = false")
+FILES: Final = 4096  # open at once
 _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
 # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
@@ -148,3 +149,11 @@ def priority_advice(priority: int) -> str:
     """Return advice on how to allow a real-time priority."""
     return (f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
             "realtime.motor_priority = 0 and realtime.capture_priority = 0")
+
+
+def raise_file_limit() -> None:
+    """Raise this process's limit of open files to FILES, or to what it may: connections of others need some."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

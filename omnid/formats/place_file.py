@@ -6,19 +6,17 @@ whole. What is read is checked: the schema by its text, each row by its checksum
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Iterator, Set
 from contextlib import closing
-from glob import escape
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.bounded_sqlite import bound_work, open_bounded
 from omnid.core.places.map_tags import MAX_VIEWS, TagView
 from omnid.core.places.place_map import UNUSED, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
@@ -26,6 +24,7 @@ from omnid.core.places.tags import MAX_TAG
 from omnid.errors import OmnidError
 from omnid.formats import place_rows
 from omnid.formats.place_rows import BadRowError
+from omnid.formats.whole_file import replacement
 
 VERSION: Final = 3  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
@@ -36,7 +35,7 @@ MAX_VALUE_BYTES: Final = 1 << 20  # of one value in the database
 MAX_KEYFRAMES: Final = 100_000
 MAX_LINKS: Final = 1_000_000
 MAX_TAG_VIEWS: Final = 100_000
-MAX_STEPS: Final = 50  # blocks of a million instructions that SQLite may take to read a map
+MAX_INSTRUCTIONS: Final = 50_000_000  # that SQLite may take to read a map
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
                 "missed INTEGER, T_map_rect BLOB, "
@@ -61,16 +60,9 @@ def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
     """
     path = Path(path)
     try:
-        partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-        try:
-            _remove_abandoned(path)
+        with replacement(path) as partial:
             _write(partial, places, rig)
             read_places(partial)  # no map is replaced by one that would be refused
-            _sync(partial)
-            os.replace(partial, path)
-            _sync(path.parent)
-        finally:
-            partial.unlink(missing_ok=True)
     except (OSError, ValueError, sqlite3.Error) as error:
         raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
@@ -84,7 +76,7 @@ def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMa
     path = Path(path)
     version = _version_of(path)
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)) as database:
+        with closing(open_bounded(path, MAX_VALUE_BYTES, unchanging=True)) as database:
             return _read(_Reader(database, version), PlaceMap() if into is None else into)
     except BadRowError as error:
         raise OmnidError(f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
@@ -140,33 +132,13 @@ def _insert(database: sqlite3.Connection, table: str, rows: Iterable[place_rows.
     database.executemany(f"INSERT INTO {table} VALUES ({marks})", ((*row, place_rows.checksum(row)) for row in rows))
 
 
-def _remove_abandoned(path: Path) -> None:
-    """Remove temporary files of writers of this map that were killed."""
-    for part in path.parent.glob(f".{escape(path.name)}.*.part"):
-        process = part.name.split(".")[-2]
-        if process.isdecimal() and not Path("/proc", process).exists():
-            part.unlink(missing_ok=True)
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
-    number = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)
-
-
 class _Reader:
     """Rows of a database that may be hostile: bounded work, no code of the file, checked sums."""
 
     def __init__(self, database: sqlite3.Connection, version: int) -> None:
-        self._database, self._steps, self.version = database, 0, version
+        self._database, self.version = database, version
         schema = SCHEMA if version == VERSION else SCHEMA_2
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
-        database.set_progress_handler(self._too_long, 1_000_000)
-        for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
-            database.execute(f"PRAGMA {setting}")
+        bound_work(database, MAX_INSTRUCTIONS)
         found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
         if found != schema:
             raise BadRowError("its tables are not those of a map")
@@ -179,11 +151,6 @@ class _Reader:
             if place_rows.checksum(row[:-1]) != row[-1]:
                 raise BadRowError(f"the checksum of row {number + 1} of {table} is wrong")
             yield row[:-1]
-
-    def _too_long(self) -> bool:
-        """True ends the query."""
-        self._steps += 1
-        return self._steps > MAX_STEPS
 
 
 def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import pwd
+import re
+import shlex
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,17 +12,18 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from calib.errors import CalibError
-from calib.rig_file import write_file
 from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
+from omnid.plain_text import plain
+from omnid.service.file_below import text_below, write_below
 from omnid.settings_dump import dump_minimal
 
 USER: Final = "omnid"
 SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # in the unit
 HIDDEN: Final = ("/home", "/root", "/tmp", "/run/user")  # from the unit: ProtectHome=, PrivateTmp=
 ADD_USER: Final = ("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
-MODE: Final = 0o644
+_REFUSED: Final = frozenset("\"'\\")
+_PLAIN: Final = re.compile(r"[\w./+-]+")  # a path that needs no quotes
 
 
 class Step(NamedTuple):
@@ -61,14 +63,15 @@ class Installation:
         return ("Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
                 "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
                 "  sudo udevadm control --reload && sudo udevadm trigger\n"
-                f"  sudo {self.program} doctor --config /etc/omnid/omnid.toml\n"
+                f"  sudo {shlex.quote(str(self.program))} doctor --config /etc/omnid/omnid.toml\n"
                 f"  sudo systemctl daemon-reload && sudo systemctl enable --now {units}")
 
     def _steps(self) -> Iterator[Step]:
-        unit = service_file("omnid.service").replace(SHIPPED_PROGRAM, str(self.program))
+        program = exec_word(self.program)
+        unit = service_file("omnid.service").replace(SHIPPED_PROGRAM, program)
         yield from self._file("etc/systemd/system/omnid.service", unit, replace=True)
         if self.page:
-            page = service_file("omnid-web.service").replace(SHIPPED_PROGRAM, str(self.program))
+            page = service_file("omnid-web.service").replace(SHIPPED_PROGRAM, program)
             yield from self._file("etc/systemd/system/omnid-web.service", page, replace=True)
         yield from self._file("etc/udev/rules.d/90-omnid.rules", service_file("90-omnid.rules"), replace=False)
         yield from self._file("etc/omnid/omnid.toml", dump_minimal(Config(), FIRST_SETTINGS), replace=False)
@@ -76,20 +79,26 @@ class Installation:
             yield Step(f"add the system user {USER}", _add_user)
 
     def _file(self, name: str, text: str, *, replace: bool) -> Iterator[Step]:
-        path = self.root / name
-        if path.exists() and (not replace or path.read_text() == text):
+        found = text_below(self.root, name)
+        if found is not None and (not replace or found == text):
             return
-        verb = "replace" if path.exists() else "write"
-        yield Step(f"{verb} {path}", lambda: _write(path, text))
+        verb = "write" if found is None else "replace"
+        yield Step(f"{verb} {self.root / name}", lambda: write_below(self.root, name, text))
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, text.encode())
-        os.chmod(path, MODE)
-    except (OSError, CalibError) as error:
-        raise OmnidError(f"{path} cannot be written; run this command with sudo, or name another --root") from error
+def exec_word(program: Path) -> str:
+    """Return a program's path as the first word of ExecStart=; OmnidError for one that no unit can contain.
+
+    systemd.service(5), "Command lines", and systemd.unit(5), "Specifiers": a path with blanks is written in double
+    quotes, and a percent sign is doubled. A line ends at its line feed, whatever the quotes. Quotes and backslashes are
+    refused: systemd 252 does not start a program whose name has them.
+    """
+    path = str(program)
+    if not path.isprintable() or not _REFUSED.isdisjoint(path):
+        raise OmnidError(f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
+                         f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}")
+    escaped = path.replace("%", "%%")
+    return escaped if _PLAIN.fullmatch(path) else f'"{escaped}"'
 
 
 def _user_exists() -> bool:

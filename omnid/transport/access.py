@@ -2,7 +2,8 @@
 
 Every connected program may subscribe, query, and stop the wheels. Other commands, and the release of a stop, may be
 written by those only that the configuration names; nothing else can be written. zenoh applies the rules where a link
-enters the session, so that refused messages never reach the daemon.
+enters the session, so that refused messages never reach the daemon. Where users or certificates are configured, only
+the robot itself declares liveliness tokens below its name.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ def access_control(config: BusConfig) -> dict[str, Any]:
     commanders += [_subject(f"user-{i}", usernames=[user]) for i, user in enumerate(config.command_users)]
     everybody = _subject("everybody")
     allowed = [subject["id"] for subject in commanders] or [everybody["id"]]
+    names = ["own names"] if config.users_file or config.tls_mutual else []
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -32,10 +34,11 @@ def access_control(config: BusConfig) -> dict[str, Any]:
             _rule("query", "ingress", _ALWAYS, list(_EVERYTHING)),
             _rule("stop", "ingress", ("put",), stop_keys(config)),
             _rule("command", "ingress", ("put",), command_keys(config)),
+            _rule("own names", "ingress", ("liveliness_token",), [f"{config.robot}/**"], permission="deny"),
         ],
         "subjects": [everybody, *commanders],
         "policies": [
-            {"id": "all", "rules": ["subscribe", "query", "stop"], "subjects": [everybody["id"]]},
+            {"id": "all", "rules": ["subscribe", "query", "stop", *names], "subjects": [everybody["id"]]},
             {"id": "some", "rules": ["command"], "subjects": allowed},
         ],
     }
@@ -57,5 +60,6 @@ def _subject(name: str, **properties: list[str]) -> dict[str, Any]:
     return {"id": name, **properties}
 
 
-def _rule(name: str, flow: str, messages: tuple[str, ...], keys: list[str]) -> dict[str, Any]:
-    return {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": keys}
+def _rule(name: str, flow: str, messages: tuple[str, ...], keys: list[str], permission: str = "allow"
+          ) -> dict[str, Any]:
+    return {"id": name, "permission": permission, "flows": [flow], "messages": list(messages), "key_exprs": keys}

@@ -1,32 +1,36 @@
 """The zenoh bus: publishes CDR messages below the robot's name, answers queries and receives commands.
 
-Bus starts no thread of its own. `publish` may block for up to zenoh's drop time (1 ms, 50 ms for fragmented messages),
-so only sinks with a bounded inbox of their own, and tickers, call it.
+`publish` may block for up to zenoh's drop time (1 ms, 50 ms for fragmented messages), so only sinks with a bounded
+inbox of their own, and tickers, call it. Two threads take what others send, within budgets: commands, and queries.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from typing import Final
 
 import zenoh
 
+from omnid.engine.poller import Poller
 from omnid.errors import OmnidError
-from omnid.transport import ros2, status_names
+from omnid.transport import status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.command_intake import PERIOD_S, CommandCallback, CommandIntake
+from omnid.transport.intake import QUERY, Intake, floods
+from omnid.transport.namesakes import Namesakes
 from omnid.transport.publishers import RosGraph, TopicPublisher
 from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
-from omnid.transport.topics import PUBLISHED
+from omnid.transport.stop_datagram import StopListener
+from omnid.transport.topics import PUBLISHED, STOP
 
 __all__ = ["Bus", "BusConfig"]
 
-ALIVE: Final = "alive"  # liveliness token below the robot's name; exists as long as the daemon runs
-_ALIVE_TIMEOUT_S: Final = 1.0  # of the search for a robot of the same name
-# Key from `cmd` on, payload, identity of the sender, time of sending [ns of Unix time].
-CommandCallback = Callable[[str, bytes, str, int], None]
+QUERY_PERIOD_S: Final = 0.01
+SEARCH_S: Final = 5.0  # between two searches for a robot of the same name that was found behind a router
+FLOOD_S: Final = 10.0  # for which the status warns of a flood that has ended
 
 
 class Bus:
@@ -38,19 +42,27 @@ class Bus:
     def __init__(self, config: BusConfig, warn: Callable[[str], None] = lambda _: None) -> None:
         """Open the session, or that of a client with the first `connect`.
 
-        Raise OmnidError for a wrong configuration, and where a robot of the same name is on the bus already. Later ones
-        are reported by one call of warn, in a zenoh thread, and in the status.
+        Raise OmnidError for a wrong configuration. Robots of the same name are reported by one call of warn and in the
+        status; each time that the name is no longer unique, the subscriber of commands receives a stop.
         """
         self._config, self._warn = checked(config), warn
-        self._namesakes: set[str] = set()  # keys of the liveliness tokens of other robots of the same name
+        self._namesakes: Namesakes | None = None
+        self._searched_s = 0.0
         self._warned = False
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
         self._on_command: CommandCallback | None = None
         self._command_topics: Mapping[str, str] = {}
+        self._is_stopped: Callable[[], bool] = lambda: False
+        self._stop_listener: StopListener | None = None
         self._graph: RosGraph | None = None
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
+        self._commands: CommandIntake | None = None
+        self._queries: dict[str, Intake[zenoh.Query]] = {}  # by name
+        self._pollers: list[Poller] = []
+        self._flooded = 0  # messages above the budgets, when they were counted last
+        self._flooded_s = -FLOOD_S
         self._closed = False
         self.lost = 0
         if not self.needs_router:
@@ -72,10 +84,22 @@ class Bus:
         level, message = OK, "open"
         if self._session is None:
             level, message = WARN, f"no router yet at {', '.join(self._config.connect)}"
-        elif self._namesakes:
+        elif not self.is_unique:
             level, message = ERROR, self._same_name
-        values = {"mode": self._config.mode, "lost": str(self.lost), "same_name": str(len(self._namesakes))}
+        counts = floods([*(self._commands.intakes if self._commands else ()), *self._queries.values()])
+        if counts.total() > self._flooded:
+            self._flooded, self._flooded_s = counts.total(), time.monotonic()
+        if level == OK and time.monotonic() < self._flooded_s + FLOOD_S:
+            level, message = WARN, f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
+        values = {"mode": self._config.mode, "lost": str(self.lost),
+                  status_names.SAME_NAME_COUNT: str(len(self._namesakes or ())),
+                  **{f"flooded, {key}": str(count) for key, count in sorted(counts.items())}}
         return DiagnosticStatus(status_names.BUS, level, message, values)
+
+    @property
+    def is_unique(self) -> bool:
+        """True while no other robot on the bus has this one's name."""
+        return not self._namesakes
 
     def publish(self, topic: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Send CDR bytes as `<robot>/<topic>`, and under the key that ROS 2 expects; dropped in congestion.
@@ -101,18 +125,24 @@ class Bus:
         if is_new and self._session is not None:
             self._declare_queryable(self._session, name)
 
-    def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str]) -> None:
-        """Call callback(key, payload, sender, sent_ns) for each message on `<robot>/cmd/...`, in a zenoh thread.
+    def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str],
+                           is_stopped: Callable[[], bool] = lambda: False) -> None:
+        """Call callback(key, payload, sender, sent_ns) for messages on `<robot>/cmd/...`, in a thread of the bus.
 
         key: from `cmd` on. sender: empty where the message does not name it. sent_ns: 0 where it does not
-        say it. topics: with their types, for ROS 2.
+        say it. topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
+        is_stopped: True if a stop holds, which confirms stops that come as datagrams; they are passed on as others.
         """
-        self._on_command, self._command_topics = callback, topics
+        self._on_command, self._command_topics, self._is_stopped = callback, topics, is_stopped
         if self._session is not None:
             self._declare_subscribers(self._session, callback)
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
+        for poller in self._pollers:
+            poller.close()
+        if self._stop_listener is not None:
+            self._stop_listener.close()
         if not self._closed and self._session is not None:
             with suppress(zenoh.ZError):  # raised for such a subscriber; nothing of ours is lost
                 self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
@@ -120,8 +150,8 @@ class Bus:
 
     @property
     def _same_name(self) -> str:
-        return (f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands; "
-                "change bus.robot of one of them")
+        return (f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands: this "
+                "one is not armed before the other has gone; change bus.robot of one of them")
 
     def _open_peer(self) -> None:
         """Open the session of a peer; where ROS 2's router (rmw_zenohd) holds the endpoints, that of its client."""
@@ -138,14 +168,9 @@ class Bus:
 
     def _open(self) -> None:
         session = open_session(self._config)
-        if self._finds_same_name(session):
-            if not self.needs_router:
-                session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-                raise OmnidError(self._same_name)
-            self._report_same_name()
-        self._watch_names(session)
+        self._namesakes = Namesakes(session, self._config, self._report_same_name)
+        self._searched_s = time.monotonic()
         self._graph = graph = RosGraph(session, self._config)
-        self._declared.append(session.liveliness().declare_token(f"{self._config.robot}/{ALIVE}"))
         self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
         for name in {*self._newest, *(name for name, topic in PUBLISHED.items() if topic.latched)}:
             self._declare_queryable(session, name)
@@ -155,98 +180,41 @@ class Bus:
         if self._on_command is not None:
             self._declare_subscribers(session, self._on_command)
         self._session = session
-
-    def _finds_same_name(self, session: zenoh.Session) -> bool:
-        """True if a robot of this name is on the bus; peers that share a router only see it as a client."""
-        if _is_alive(session, self._config.robot):
-            return True
-        if self.needs_router or not self._config.connect:
-            return False
-        try:
-            client = open_session(replace(self._config, mode="client", listen=()), guarded=False)
-        except OmnidError:  # no router yet
-            return False
-        try:
-            return _is_alive(client, self._config.robot)
-        finally:
-            client.close()  # type: ignore[no-untyped-call]
-
-    def _watch_names(self, session: zenoh.Session) -> None:
-        """Declare a token with the session's identity, and watch those of other robots of the same name."""
-        own = f"{self._config.robot}/{ALIVE}/{session.zid()}"
-
-        def on_token(sample: zenoh.Sample) -> None:
-            key = str(sample.key_expr)
-            if sample.kind == zenoh.SampleKind.DELETE:
-                self._namesakes.discard(key)
-            elif key != own:
-                self._namesakes.add(key)
-                self._report_same_name()
-
-        liveliness = session.liveliness()
-        self._declared.append(liveliness.declare_token(own))
-        names = f"{self._config.robot}/{ALIVE}/*"
-        self._declared.append(liveliness.declare_subscriber(names, on_token, history=True))
+        self._pollers.append(Poller(self._answer_queries, QUERY_PERIOD_S, "bus queries"))
 
     def _report_same_name(self) -> None:
+        """Warn once, and stop the wheels: two robots that obey one operator are not what the operator expects."""
         if not self._warned:
             self._warned = True
             self._warn(self._same_name)
+        if self._on_command is not None:
+            self._on_command(STOP, b"", "", 0)
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = f"{self._config.robot}/{name.removeprefix('/')}"
+        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(QUERY.burst))
+        self._declared.append(queryable)
+        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY)
 
-        def on_query(query: zenoh.Query) -> None:
-            if name in self._newest:
-                payload, encoding, attachment = self._newest[name]
-                query.reply(key, payload, encoding=encoding, attachment=attachment)
-
-        self._declared.append(session.declare_queryable(key, on_query))
+    def _answer_queries(self) -> None:
+        """Answer the queries that have come, and search again for a robot of the same name behind a router."""
+        for name, intake in list(self._queries.items()):
+            for query in intake.messages():
+                if name in self._newest:
+                    payload, encoding, attachment = self._newest[name]
+                    key = f"{self._config.robot}/{name.removeprefix('/')}"
+                    query.reply(key, payload, encoding=encoding, attachment=attachment)
+        if self._namesakes and self._namesakes.behind_router and time.monotonic() > self._searched_s + SEARCH_S:
+            self._namesakes.search()
+            self._searched_s = time.monotonic()
 
     def _declare_subscribers(self, session: zenoh.Session, callback: CommandCallback) -> None:
-        plain = f"{self._config.robot}/cmd/**"
-        prefix_length = len(self._config.robot) + 1
-        self._declared.append(session.declare_subscriber(plain, _sample_callback(callback, prefix_length)))
-        if self._config.ros2 == "rmw_zenoh":
-            key = f"{self._config.ros2_domain}/{plain}"
-            prefix_length += len(str(self._config.ros2_domain)) + 1
-            on_sample = _sample_callback(callback, prefix_length, suffix_parts=2)  # message type and its hash
-            self._declared.append(session.declare_subscriber(key, on_sample))
+        if not self.is_unique:
+            callback(STOP, b"", "", 0)
+        self._commands = CommandIntake(session, self._config, self._command_topics, callback)
+        self._pollers.append(Poller(self._commands.process, PERIOD_S, "bus commands"))
+        self._stop_listener = StopListener(self._config, lambda: callback(STOP, b"", "", 0), self._is_stopped)
+        self._pollers.append(Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"))
         if self._graph is not None:
             for name, schema in self._command_topics.items():
                 self._graph.subscription(name, schema)
-
-
-def _is_alive(session: zenoh.Session, robot: str) -> bool:
-    replies = session.liveliness().get(f"{robot}/{ALIVE}", timeout=_ALIVE_TIMEOUT_S)
-    return any(reply.ok is not None for reply in replies)
-
-
-def _sample_callback(
-    callback: CommandCallback, prefix_length: int, suffix_parts: int = 0
-) -> Callable[[zenoh.Sample], None]:
-    """Return a zenoh callback that passes on the key without its first characters and last parts, payload and sender.
-    """
-
-    def on_sample(sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)[prefix_length:]
-        topic = key.rsplit("/", suffix_parts)[0] if suffix_parts else key
-        callback(topic, sample.payload.to_bytes(), _sender(sample), _sent_ns(sample))
-
-    return on_sample
-
-
-def _sender(sample: zenoh.Sample) -> str:
-    """Return the identity of the program that sent a sample, empty where it names none.
-
-    Programs with omnid.client give the source of their messages, those of rmw_zenoh the gid of their publisher; zenoh
-    itself adds nothing. No proof: permissions are those of the access rules.
-    """
-    if sample.source_info is not None:
-        return str(sample.source_info.source_id.zid)
-    return "" if sample.attachment is None else ros2.gid_in(sample.attachment.to_bytes())
-
-
-def _sent_ns(sample: zenoh.Sample) -> int:
-    """Return the time of sending that rmw_zenoh attaches to a sample, 0 without."""
-    return 0 if sample.attachment is None else ros2.sent_ns_in(sample.attachment.to_bytes())

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol
 
@@ -25,22 +25,18 @@ from omnid.transport.codec import (
     stamp_from_cdr,
     twist_from_cdr,
 )
+from omnid.transport.stamps import ADVICE, RefusedStamp, StampRule
 from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
-MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
 
 
 MALFORMED: Final = "malformed"
-UNSTAMPED: Final = "no stamp"
-TOO_OLD, EARLY = "too old", "stamp in the future"
-_CLOCKS: Final = 'synchronise the clocks, or set bus.command_clock = "arrival"'
-_ADVICE: Final = {
+SAME_NAME: Final = "another robot has this name"
+_ADVICE: Final = ADVICE | {
     MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, as CDR",
-    UNSTAMPED: f"fill in the stamp (`ros2 topic pub` needs `header: auto`), or {_CLOCKS.partition(', or ')[2]}",
-    TOO_OLD: _CLOCKS,
-    EARLY: _CLOCKS,
+    SAME_NAME: "change bus.robot of one of them",
     "wrong frame": "give base_link for twist, odom for heading, or none",
     "unknown topic": "see controller.sources.names",
 }
@@ -107,19 +103,15 @@ class CommandReceiver:
     Stops are always obeyed. The controller decides which of several sources and senders drives.
     """
 
-    def __init__(self, target: CommandTarget, stale_s: float, *, sources: Sequence[str] = (OPERATOR, PLANNER),
-                 synchronised: bool = True, report: Callable[[str], None] | None = None) -> None:
-        """stale_s: largest difference of a command's stamp from this machine's clock, before and after.
+    def __init__(self, target: CommandTarget, stamps: StampRule, *, sources: Sequence[str] = (OPERATOR, PLANNER),
+                 report: Callable[[str], None] | None = None, is_unique: Callable[[], bool] = lambda: True) -> None:
+        """stamps: the rule for the stamps; where the clocks differ, a plain Twist without stamp is accepted.
 
-        sources: names; the first has the short topics cmd/twist and cmd/heading, too. synchronised: False where senders
-        have other clocks. The stamps of each topic must then rise, so that a stream that was recorded earlier is
-        refused; a request to arm lets them begin again, and needs a stamp that none of the last ones had. A plain Twist
-        without stamp is accepted. report: takes lines for the log, one for each refusal.
+        sources: names; the first has the short topics cmd/twist and cmd/heading, too. report: takes lines for the log,
+        one for each refusal. is_unique: False while another robot has this one's name, which is then not armed.
         """
-        self._report = report
-        self._target, self._stale_ns, self._synchronised = target, round(stale_s * 1e9), synchronised
-        self._newest_ns: dict[str, int] = {}  # stamp of the newest command that was accepted, by topic
-        self._arm_stamps_ns: deque[int] = deque(maxlen=MOST_ARM_STAMPS)
+        self._report, self._is_unique = report, is_unique
+        self._target, self._stamps = target, stamps
         self._stop_ns = 0  # arrival of the newest stop
         parsers = {TWIST: twist_command, HEADING: heading_command}
         self._topics = {f"cmd/{name}": (sources[0], parser) for name, parser in parsers.items()}
@@ -144,7 +136,7 @@ class CommandReceiver:
                 self._arm(payload, arrival_ns)
             else:
                 self._drive(key, payload, arrival_ns, sender, sent_ns)
-        except RefusedCommand as refusal:
+        except (RefusedCommand, RefusedStamp) as refusal:
             self._refuse(key, str(refusal))
         except OmnidError:
             self._refuse(key, MALFORMED)
@@ -158,14 +150,12 @@ class CommandReceiver:
     def _arm(self, payload: bytes, arrival_ns: int) -> None:
         _check_length(payload)
         stamp_ns = stamp_from_cdr(payload)
-        if self._synchronised:
-            age_ns = self._checked_age_ns(stamp_ns)
-            if arrival_ns - age_ns <= self._stop_ns:
-                raise RefusedCommand(OLDER_THAN_STOP)
-        elif stamp_ns in self._arm_stamps_ns:
-            raise RefusedCommand("stamp was used before")
-        self._arm_stamps_ns.append(stamp_ns)
-        self._newest_ns.clear()
+        age_ns = self._stamps.check_arm(stamp_ns)
+        if not self._is_unique():
+            raise RefusedCommand(SAME_NAME)
+        if self._stamps.synchronised and arrival_ns - age_ns <= self._stop_ns:
+            raise RefusedCommand(OLDER_THAN_STOP)
+        self._stamps.accept_arm(stamp_ns)
         self.arms += 1
         self._target.arm(ArmRequest(arrival_ns, stamp_ns))
 
@@ -176,28 +166,10 @@ class CommandReceiver:
         source, parser = self._topics[key]
         command = parser(payload)
         stamp_ns = command.stamp_ns or sent_ns
-        if self._synchronised:
-            if not stamp_ns:
-                raise RefusedCommand(UNSTAMPED)
-            self._checked_age_ns(stamp_ns)
-        elif stamp_ns or not is_plain_twist(payload):
-            self._check_order(key, stamp_ns)
+        if stamp_ns or self._stamps.synchronised or not is_plain_twist(payload):
+            self._stamps.check(key, stamp_ns)
         self.accepted += 1
         self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, sender))
-
-    def _checked_age_ns(self, stamp_ns: int) -> int:
-        """Return the age of a stamp. Raise RefusedCommand where it is too old or from the future."""
-        age_ns = time.time_ns() - stamp_ns
-        if age_ns > self._stale_ns:
-            raise RefusedCommand(TOO_OLD)
-        if age_ns < -self._stale_ns:
-            raise RefusedCommand(EARLY)
-        return age_ns
-
-    def _check_order(self, key: str, stamp_ns: int) -> None:
-        if key in self._newest_ns and stamp_ns <= self._newest_ns[key]:
-            raise RefusedCommand("stamp does not rise")
-        self._newest_ns[key] = stamp_ns
 
 
 def _check_length(payload: bytes) -> None:

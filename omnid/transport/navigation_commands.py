@@ -2,11 +2,13 @@
 
 goal is a geometry_msgs/msg/PoseStamped, path a nav_msgs/msg/Path, both in the frame map or odom; a quaternion of zeros
 asks for no heading. navigation and route are std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME [replace]",
-"finish", "repeat NAME [reverse] [loops=N]", "stop".
+"finish", "repeat NAME [reverse] [loops=N]", "stop". A String has no stamp of its own: its time of sending is in the
+attachment, or it is the last word, stamp=NANOSECONDS.
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -29,27 +31,27 @@ from omnid.core.navigation.requests import (
 from omnid.errors import OmnidError
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.navigation_codec import goal_from_cdr, path_from_cdr, string_from_cdr
+from omnid.transport.stamps import ADVICE, RefusedStamp, StampRule
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
 from omnid.transport.topics import GOAL, NAVIGATION, NAVIGATION_TOPICS, PATH
 
 LONGEST_PAYLOAD: Final = 1 << 20  # bytes
 LONGEST_TEXT_PAYLOAD: Final = 4096
 MOST_WAITING: Final = 64  # requests
-_CLOCKS: Final = 'synchronise the clocks, or set bus.command_clock = "arrival"'
+_STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
 
 
 class NavigationReceiver:
     """Passes valid requests on and counts the others; called from threads of the bus, never raises.
 
-    A halt (cancel, pause, stop) is obeyed whatever its age. A goal or a path needs a stamp of the sender's clock,
-    unless clocks are not synchronised: one that waited in a network must not start a drive minutes later.
+    What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a request
+    that waited in a network must not start a drive minutes later.
     """
 
-    def __init__(self, target: Callable[[NavigationCommand], None], stale_s: float, *, synchronised: bool = True,
+    def __init__(self, target: Callable[[NavigationCommand], None], stamps: StampRule, *,
                  report: Callable[[str], None] | None = None) -> None:
-        """target: may be called from any thread. stale_s: as of CommandReceiver. report: takes lines for the log."""
-        self._target, self._stale_ns, self._synchronised = target, round(stale_s * 1e9), synchronised
-        self._report = report
+        """target: may be called from any thread. stamps: as of CommandReceiver. report: takes lines for the log."""
+        self._target, self._stamps, self._report = target, stamps, report
         self.accepted = 0
         self.refused: Counter[str] = Counter()  # by topic
 
@@ -68,11 +70,12 @@ class NavigationReceiver:
         try:
             request, stamp_ns = self._parsed(key, payload)
             if not _is_halt(request):
-                self._check_age(stamp_ns or sent_ns, needed=key in (GOAL, PATH))
+                self._stamps.check(key, stamp_ns or sent_ns)
         except OmnidError as error:
             self.refused[key] += 1
             if self._report is not None:
-                self._report(f"a request on {key} is refused: {error}")
+                advice = f"; {ADVICE[str(error)]}" if isinstance(error, RefusedStamp) else ""
+                self._report(f"a request on {key} is refused: {error}{advice}")
             return
         self.accepted += 1
         self._target(NavigationCommand(request, arrival_ns, stamp_ns))
@@ -89,17 +92,14 @@ class NavigationReceiver:
             path = path_from_cdr(payload)
             _check_near(*path.xy.ravel())
             return PathRequest(_frame(path.frame), path.xy, path.heading_rad), path.stamp_ns
-        text = string_from_cdr(payload)
-        return (navigation_verb(text) if key == NAVIGATION else route_request(text)), 0
+        text, stamp_ns = _stamp_of(string_from_cdr(payload))
+        return (navigation_verb(text) if key == NAVIGATION else route_request(text)), stamp_ns
 
-    def _check_age(self, stamp_ns: int, *, needed: bool) -> None:
-        if not self._synchronised or not (stamp_ns or needed):
-            return
-        if not stamp_ns:
-            raise OmnidError("it has no stamp: fill in the stamp (`ros2 topic pub` needs `header: auto`), or set "
-                             'bus.command_clock = "arrival"')
-        if not abs(time.time_ns() - stamp_ns) <= self._stale_ns:
-            raise OmnidError(f"its stamp differs from this clock by more than {self._stale_ns * 1e-9:g} s: {_CLOCKS}")
+
+def _stamp_of(text: str) -> tuple[str, int]:
+    """Return a text without the stamp at its end, and that stamp, 0 where there is none."""
+    found = _STAMPED.fullmatch(text)
+    return (found[1], int(found[2])) if found else (text, 0)
 
 
 def _is_halt(request: Request) -> bool:

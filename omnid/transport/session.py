@@ -13,6 +13,7 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
+from omnid.transport.topics import PATH, command_topics
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
@@ -24,6 +25,7 @@ _MAX_RECEIVED_BYTES: Final = 1 << 20  # zenoh collects fragments up to its limit
 # zenoh's defaults are 100 places and 10 s.
 _MAX_PENDING: Final = 1000
 _ACCEPT_TIMEOUT_MS: Final = 1000
+_MAX_COMMAND_BYTES: Final = 16_384  # of all but paths
 _MAX_SESSIONS: Final = 128  # each holds received fragments in memory
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
@@ -135,7 +137,17 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
         yield "transport/unicast/accept_pending", _MAX_PENDING, ""
         yield "transport/unicast/accept_timeout", _ACCEPT_TIMEOUT_MS, ""
         yield "transport/unicast/max_sessions", _MAX_SESSIONS, ""
+        yield "low_pass_filter", _size_limits(config), ""
         yield "access_control", access_control(config), "command_names" if config.command_names else "command_users"
+
+
+def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
+    """Return the rule that bounds commands in size: many of them wait at once."""
+    short = [f"{config.robot}/{topic}" for topic in command_topics(()) if topic != PATH]
+    plain = [*short, f"{config.robot}/cmd/*/*"]
+    ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain] if config.ros2 == "rmw_zenoh" else []
+    return [{"id": "commands", "flows": ["ingress"], "messages": ["put"], "key_exprs": plain + ros,
+             "size_limit": _MAX_COMMAND_BYTES}]
 
 
 def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:

@@ -13,8 +13,10 @@ import ipaddress
 import os
 import re
 import secrets
+import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -28,6 +30,11 @@ _MAX_FILE_BYTES: Final = 4096
 _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 _OTHER_SITES: Final = ("cross-site", "same-site")
 _READING: Final = ("GET", "HEAD")
+_STOPPING: Final = ("stop", "logout")  # last parts of the addresses to which the token for stops may post
+COOKIE_S: Final = 30 * 86_400  # for which a browser keeps the cookie
+MOST_ENDED: Final = 1000  # sessions
+_COOKIE: Final = re.compile(r"(?P<id>[0-9a-f]{16})\.(?P<role>all|stop)\.(?P<end_s>[0-9]{1,12})\."
+                            r"(?P<proof>[0-9a-f]{64})")
 
 
 class Refusal(NamedTuple):
@@ -40,9 +47,17 @@ class Refusal(NamedTuple):
 
 _NO_TOKEN: Final = Refusal(401, "no token", "a token is needed: open the address that `omnid web` printed")
 _WRONG_TOKEN: Final = Refusal(401, "wrong token", "the token is not that of this server")
+_STOP_ONLY: Final = Refusal(403, "stop only", "this token may see and stop, nothing else")
 _OTHER_ORIGIN: Final = Refusal(403, "cross-site", "requests of other sites are refused")
 _NO_ORIGIN: Final = Refusal(403, "no origin", "a request that changes something needs the header Origin of this page, "
                             "or Authorization: Bearer TOKEN")
+
+
+class Role(StrEnum):
+    """Rights of a token."""
+
+    ALL = "all"
+    STOP = "stop"  # to see and to stop
 
 
 def new_token() -> str:
@@ -51,8 +66,8 @@ def new_token() -> str:
     return "-".join("".join(letters[i::_GROUPS]) for i in range(_GROUPS))
 
 
-def token_of(path: Path | None) -> str:
-    """Return the token in a file, which is made if it is missing; without a file a new token.
+def token_of(path: Path | None, option: str = "--token-file") -> str:
+    """Return the token in a file, which is made if it is missing; without a file a new token. option: its name.
 
     Raise OmnidError for a file that cannot be used, or that every user of this machine may read.
     """
@@ -61,26 +76,26 @@ def token_of(path: Path | None) -> str:
     try:
         number = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        return _read_token(path)
+        return _read_token(path, option)
     except OSError as error:
-        raise OmnidError(f"--token-file {path}: cannot be made: {error.strerror}; name another file") from error
+        raise OmnidError(f"{option} {path}: cannot be made: {error.strerror}; name another file") from error
     token = new_token()
     with os.fdopen(number, "w", encoding="ascii") as file:
         file.write(f"{token}\n")
     return token
 
 
-def _read_token(path: Path) -> str:
+def _read_token(path: Path, option: str) -> str:
     try:
         with path.open("rb") as file:
             mode, data = os.fstat(file.fileno()).st_mode, file.read(_MAX_FILE_BYTES)
     except OSError as error:
-        raise OmnidError(f"--token-file {path}: cannot be read: {error.strerror}; name another file") from error
+        raise OmnidError(f"{option} {path}: cannot be read: {error.strerror}; name another file") from error
     if mode & 0o007:
-        raise OmnidError(f"--token-file {path}: every user of this machine may read or write it: chmod 600 {path}")
+        raise OmnidError(f"{option} {path}: every user of this machine may read or write it: chmod 600 {path}")
     text = data.decode("ascii", "replace").strip()
     if not _TOKEN.fullmatch(text):
-        raise OmnidError(f"--token-file {path}: expected one line of 16 to 256 letters without spaces; delete the file "
+        raise OmnidError(f"{option} {path}: expected one line of 16 to 256 letters without spaces; delete the file "
                          "to have one made")
     return text
 
@@ -91,22 +106,53 @@ class Access:
 
     hosts: names in lower case by which this server is reached. any_address: True if it is also reached by IP
     addresses: a name that an attacker controls is none of these. cookie: its name, with the port, because browsers
-    send the cookies of one port to all ports of a host.
+    send the cookies of one port to all ports of a host. stop_token: a token that may see and stop only; "": none.
     """
 
     token: str
     hosts: frozenset[str]
     any_address: bool
     cookie: str
+    stop_token: str = ""
+    _ended: dict[str, None] = field(default_factory=dict)  # sessions that were ended, the newest last
 
-    @property
-    def cookie_value(self) -> str:
-        """The value of the cookie of a browser that knew the token; it is valid as long as the token."""
-        return hmac.new(self.token.encode(), b"omnid web cookie", hashlib.sha256).hexdigest()
+    def new_cookie(self, role: Role) -> str:
+        """Return the value of the cookie of a browser that knew a token: a session, its role, its end, and a proof.
 
-    def is_token(self, text: str) -> bool:
-        """True if the text is the token; takes the same time for all texts."""
-        return hmac.compare_digest(text.strip().encode("utf-8", "replace"), self.token.encode())
+        It is valid for COOKIE_S, as long as the token, and until the session is ended.
+        """
+        content = f"{secrets.token_hex(8)}.{role}.{round(time.time()) + COOKIE_S}"
+        return f"{content}.{self._proof(content, role)}"
+
+    def end_session(self, scope: Mapping[str, Any]) -> None:
+        """Refuse the cookies of a request from now on; the newest MOST_ENDED are remembered until the next start."""
+        for name, value in _Headers(scope["headers"]).cookies():
+            if name == self.cookie and self._role_of_cookie(value) is not None:
+                self._ended[value.partition(".")[0]] = None
+        while len(self._ended) > MOST_ENDED:
+            del self._ended[next(iter(self._ended))]
+
+    def role_of(self, text: str) -> Role | None:
+        """Return the role of a token, None for a text that is none; takes the same time for all texts."""
+        given = text.strip().encode("utf-8", "replace")
+        is_all = hmac.compare_digest(given, self.token.encode())
+        is_stop = hmac.compare_digest(given, self.stop_token.encode()) and bool(self.stop_token)
+        if is_all:
+            return Role.ALL
+        return Role.STOP if is_stop else None
+
+    def _proof(self, content: str, role: Role) -> str:
+        key = self.token if role is Role.ALL else self.stop_token
+        return hmac.new(key.encode(), f"omnid web cookie {content}".encode(), hashlib.sha256).hexdigest()
+
+    def _role_of_cookie(self, value: str) -> Role | None:
+        found = _COOKIE.fullmatch(value)
+        if found is None or (found["role"] == Role.STOP and not self.stop_token):
+            return None
+        role, content = Role(found["role"]), value.rpartition(".")[0]
+        if not hmac.compare_digest(found["proof"].encode(), self._proof(content, role).encode()):
+            return None
+        return role if int(found["end_s"]) > time.time() and found["id"] not in self._ended else None
 
     def refusal(self, scope: Mapping[str, Any]) -> Refusal | None:
         """Return the reason not to answer a request (ASGI scope of http or websocket); None to answer it."""
@@ -117,12 +163,12 @@ class Access:
                            "NAME, or use its address")
         fault = self._other_site(scope, headers, host)
         if fault is None and not self._is_open(scope):
-            fault = self._token_fault(headers)
+            fault = self._token_fault(scope, headers)
         return fault
 
     def has_token(self, scope: Mapping[str, Any]) -> bool:
         """True if the request carries the token or the cookie."""
-        return self._token_fault(_Headers(scope["headers"])) is None
+        return self._role(_Headers(scope["headers"])) is not None
 
     def _is_host(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
@@ -147,18 +193,22 @@ class Access:
     def _is_open(self, scope: Mapping[str, Any]) -> bool:
         return scope["type"] == "http" and scope["path"] in OPEN_PATHS
 
-    def _is_bearer(self, headers: _Headers) -> bool:
-        scheme, _, token = headers.only("authorization").partition(" ")
-        return scheme.lower() == "bearer" and self.is_token(token)
-
-    def _token_fault(self, headers: _Headers) -> Refusal | None:
+    def _role(self, headers: _Headers) -> Role | None:
+        """Return what the token or the cookie of a request allows."""
         if headers.has("authorization"):
-            return None if self._is_bearer(headers) else _WRONG_TOKEN
-        values = [value for name, value in headers.cookies() if name == self.cookie]
-        if not values:
-            return _NO_TOKEN
-        known = [hmac.compare_digest(value.encode(), self.cookie_value.encode()) for value in values]
-        return None if any(known) else _WRONG_TOKEN
+            scheme, _, token = headers.only("authorization").partition(" ")
+            return self.role_of(token) if scheme.lower() == "bearer" else None
+        roles = [self._role_of_cookie(value) for name, value in headers.cookies() if name == self.cookie]
+        return max(filter(None, roles), key=lambda role: role is Role.ALL, default=None)
+
+    def _token_fault(self, scope: Mapping[str, Any], headers: _Headers) -> Refusal | None:
+        role = self._role(headers)
+        if role is None:
+            given = headers.has("authorization") or any(name == self.cookie for name, _ in headers.cookies())
+            return _WRONG_TOKEN if given else _NO_TOKEN
+        if role is Role.ALL or scope["type"] == "websocket" or scope["method"] in _READING:
+            return None
+        return None if scope["path"].rpartition("/")[2] in _STOPPING else _STOP_ONLY
 
 
 class _Headers:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
+
+from omnid.core.mapping.thinned_path import ThinnedPath
 
 MOST_POINTS: Final = 4000  # of the path
 _FINEST_M: Final = 0.02
@@ -44,62 +46,60 @@ class Newest:
         return self._encoded[1]
 
 
+class _PathPoint(NamedTuple):
+    x_m: float
+    y_m: float
+    after_gap: bool  # the robot was put elsewhere before it
+
+
+def _is_step(last: _PathPoint, new: _PathPoint, step_m: float) -> bool:
+    return new.after_gap or math.dist(last[:2], new[:2]) >= step_m
+
+
+def _with_gap(dropped: _PathPoint, new: _PathPoint) -> _PathPoint:
+    return new._replace(after_gap=dropped.after_gap or new.after_gap)
+
+
 class LivePath:
-    """The path of the robot: points at a spacing that doubles whenever there are too many; a browser is sent those
-    that it has not seen.
-    """
+    """The path of the robot; a browser is sent the points that it has not seen."""
 
     def __init__(self) -> None:
         self.name, self.version = "path", 0
         self._first = 0  # version of the points before the first one; those who saw less are sent all
-        self._points: list[tuple[float, float] | None] = []  # None: a gap
-        self._step_m = _FINEST_M
-        self._last: tuple[float, float] | None = None
+        self._path = ThinnedPath(MOST_POINTS, _FINEST_M, _is_step, _with_gap)
 
     def add(self, x_m: float, y_m: float, gap: bool = False) -> bool:
         """Add a position, m; return True if it is a new point. gap: the robot was put elsewhere."""
         if not (abs(x_m) < _LARGEST_M and abs(y_m) < _LARGEST_M):
             return False
-        moved_m = math.dist(self._last, (x_m, y_m)) if self._last else math.inf
-        if not gap and moved_m < self._step_m:
+        path = self._path
+        if path.vertices:
+            moved_m = math.dist(path.vertices[-1][:2], (x_m, y_m))
+            gap = gap or moved_m > max(_GAP_M, 10 * path.step_m)
+        else:
+            gap = False
+        times_thinned = path.thinned
+        if not path.add(_PathPoint(x_m, y_m, gap)):
             return False
-        if (gap or moved_m > max(_GAP_M, 10 * self._step_m)) and self._points and self._points[-1] is not None:
-            self._append(None)
-        self._append((x_m, y_m))
-        while len(self._points) > MOST_POINTS:
-            self._coarsen()
+        if path.thinned == times_thinned:
+            self.version += 1
+        else:  # all are sent again: no browser has seen this version
+            self._first = self.version + 1
+            self.version = self._first + len(path.vertices)
         return True
 
     def clear(self) -> None:
         """Begin a new path: the robot has started again."""
-        self._points, self._last, self._step_m = [], None, _FINEST_M
+        self._path.clear()
         self.version += 1
         self._first = self.version
 
     def message(self, seen: int) -> Encoded:
-        """Return the points that were added since that version, or all with `from` 0."""
+        """Return the points [x, y] added since that version, or all with `from` 0; after a gap [x, y, 1]."""
         begin = seen - self._first if seen >= self._first else 0
-        points = [None if point is None else [round(point[0], 3), round(point[1], 3)]
-                  for point in self._points[begin:]]
+        points = [[round(point.x_m, 3), round(point.y_m, 3), *([1] if point.after_gap else [])]
+                  for point in self._path.vertices[begin:]]
         return compact({"type": self.name, "from": begin, "points": points})
-
-    def _append(self, point: tuple[float, float] | None) -> None:
-        self._points.append(point)
-        self._last = point or self._last
-        self.version += 1
-
-    def _coarsen(self) -> None:
-        """Leave out points that are closer together than twice the spacing; all others are sent again."""
-        points, self._points, self._step_m = self._points, [], 2 * self._step_m
-        last: tuple[float, float] | None = None
-        for point in points:
-            if point is None and self._points and self._points[-1] is not None:
-                self._points.append(None)
-            elif point is not None and (last is None or math.dist(last, point) >= self._step_m):
-                self._points.append(point)
-                last = point
-        self._first = self.version + 1  # no browser has seen that
-        self.version = self._first + len(self._points)
 
 
 def compact(message: dict[str, Any]) -> str:

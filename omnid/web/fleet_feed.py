@@ -14,7 +14,8 @@ from typing import Any, Final
 
 from omnid.client import Fleet, Unreachable
 from omnid.monitor.fleet import FLEET_TOPICS, FleetState, severity, word_of, worst_part
-from omnid.monitor.robot_state import Inbox, RobotState, plain
+from omnid.monitor.robot_state import Inbox, RobotState
+from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key, short_name
 from omnid.web.browsers import Browsers

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from omnid.report.page_script import chart_script, policy
 from omnid.web.access import Access
+from omnid.web.places import ConnectionPlaces
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -36,6 +37,7 @@ class Guard:
     def __init__(self, app: App, access: Access) -> None:
         self._app, self._access = app, access
         self.refused: Counter[str] = Counter()
+        self.places = ConnectionPlaces()  # of the connections over which requests come
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -44,6 +46,8 @@ class Guard:
             return
         refusal = self._access.refusal(scope)
         if refusal is None:
+            if self._access.has_token(scope):
+                self.places.know(scope.get("client"))
             await self._app(scope, receive, _protected(send) if scope["type"] == "http" else send)
             return
         self.refused[refusal.reason] += 1

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from omnid.engine.telemetry import Histogram
-from omnid.monitor.robot_state import RobotState, plain
+from omnid.monitor.robot_state import RobotState
+from omnid.plain_text import plain
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import number, short_name
 from omnid.web.browsers import Browsers

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
-import sys
 from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
@@ -13,13 +12,15 @@ from typing import Any, Final, NamedTuple
 
 from drivers.logs.file_lock import is_locked
 from drivers.logs.log_folder import PART_SUFFIX
+from omnid.engine.python_program import python, python_environment
 from omnid.errors import OmnidError
-from omnid.monitor.robot_state import plain
+from omnid.plain_text import one_line, plain
 
 MOST_LISTED: Final = 500  # the newest
 MOST_REPORTS: Final = 8  # that are kept
 REPORT_S: Final = 600.0  # time for a report
 NICE: Final = 10  # lower priority than the daemon's
+_WRONG_INPUT: Final = 2  # exit code of omnid for what the user can correct, told in its last line
 _SUFFIXES: Final = (".mcap", f".mcap{PART_SUFFIX}")
 
 
@@ -78,7 +79,7 @@ class Recordings:
         self._count += 1
         page = self._reports / f"{self._count}.html"
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "omnid", "report", str(log.absolute()), "-o", str(page),
+            *python("-m", "omnid", "report", str(log.absolute()), "-o", str(page)), env=python_environment(),
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE)
         with suppress(OSError):  # it has ended already
             os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
@@ -91,8 +92,16 @@ class Recordings:
             if process.returncode is None:
                 process.kill()
         if process.returncode != 0 or not page.is_file():
-            raise OmnidError(plain(errors.decode("utf-8", "replace").strip()) or "omnid report failed")
+            raise OmnidError(_reason(process.returncode, errors.decode("utf-8", "replace"), log.name))
         return page
+
+
+def _reason(code: int | None, messages: str, name: str) -> str:
+    """Return why there is no report: the program's own line, never the traceback of a program that failed otherwise."""
+    lines = messages.splitlines()
+    if code == _WRONG_INPUT and lines:
+        return one_line(lines[-1])
+    return f"omnid: the report about {plain(name)} failed (exit code {code}): run `omnid report` on it to see why"
 
 
 def _key(name: str) -> str:

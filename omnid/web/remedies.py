@@ -16,14 +16,12 @@ _OF_PART: Final = {
     status_names.RECORDING: "make room on the disk, or change record.folder",
     status_names.LOAD: "close other programs on the robot, or start it with --profile small",
     status_names.EXPOSURE: "switch lights on, or set cameras.exposure_limit_ms",
-    status_names.RIG: "omnid calibrate check on a recording",
-    status_names.RIG_REFINEMENT: "omnid calibrate check on a recording",
+    status_names.RIG: "omnid calibrate check on a recording; name the right rig.toml, or calibrate again",
     status_names.MOTION: "check motor.drive in the configuration, and the grip of the wheels",
     status_names.MAP_FILE: "make room on the disk, or change places.map",
     status_names.NAVIGATION: "remove the cause that the robot names, then `omnid goto` or `omnid route repeat` again",
     status_names.REQUESTS: "see the robot's log for the reason",
     status_names.PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
-    status_names.RIG_AT_START: "name the right rig.toml, or calibrate again",
 }
 _CAMERA: Final = "check its cable and its power; on the robot: omnid doctor"
 

@@ -9,17 +9,19 @@ import os
 import re
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from omnid.engine.logging_setup import log_unlimited
+from omnid.engine.logging_setup import is_journal, log_unlimited
+from omnid.engine.realtime import raise_file_limit
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, token_of
@@ -27,13 +29,14 @@ from omnid.web.feed import RobotFeed
 from omnid.web.fleet_feed import FleetFeed
 from omnid.web.fleet_page import FleetPage
 from omnid.web.guard import Guard
+from omnid.web.places import BACKLOG, Acceptor, ConnectionPlaces
 from omnid.web.recordings import Recordings
 from omnid.web.recordings_page import recordings_routes
 from omnid.web.robot_page import RobotPage
 from omnid.web.site import Site
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
-MOST_CONNECTIONS: Final = 128  # of browsers: each page has up to seven
+SILENCE_S: Final = 5  # a connection on which nothing has come within that is accepted nevertheless
 REQUEST_S: Final = 5.0  # a connection that has not sent a whole request within that is closed
 END_S: Final = 2  # for browsers to finish at the end
 LONGEST_MESSAGE: Final = 256  # bytes, of a browser's websocket
@@ -49,6 +52,7 @@ class WebSettings:
 
     listen: str = DEFAULT_LISTEN  # HOST:PORT; port 0: any
     token_file: Path | None = None
+    stop_token_file: Path | None = None  # of a second token, which may see and stop, not arm; None: there is none
     names: tuple[str, ...] = ()  # further names of this machine
     recordings: Path = Path("recordings")
     tls: tuple[Path, Path] | None = None  # certificate and key, PEM
@@ -60,20 +64,37 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
     checked(bus)
     _check_names(settings.names)
     token = token_of(settings.token_file)
+    stop_token = token_of(settings.stop_token_file, "--stop-token-file") if settings.stop_token_file else ""
+    if token == stop_token:
+        raise OmnidError("--stop-token-file has the token of --token-file, which may arm: name another file")
+    if settings.token_file is None and is_journal(sys.stdout):
+        raise OmnidError("omnid web prints its token, and the journal would keep it: name a --token-file")
     with _listening(settings.listen) as listener, tempfile.TemporaryDirectory(prefix="omnid-web-") as reports:
         host, port = listener.getsockname()[:2]
         local = ipaddress.ip_address(host).is_loopback
         own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", *_names_of_machine())
-        access = Access(token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}")
+        access = Access(token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}",
+                        stop_token)
         guard, follow = _site(bus, settings, access, Path(reports))
-        server = _Server(_uvicorn_config(guard, settings))
+        server = _Server(_uvicorn_config(guard, settings), guard.places)
+        raise_file_limit()
         scheme = "http" if settings.tls is None else "https"
-        print(f"{scheme}://{_address(host)}:{port}/?token={token}", flush=True)
+        _print_addresses(f"{scheme}://{_address(host)}:{port}/", token, stop_token)
         if not local and settings.tls is None:
             log_unlimited(logging.WARNING, "the page can be reached from the network without encryption: everyone who "
                           "can listen there learns the token, and may arm the robot; use --tls-certificate and "
                           "--tls-key, or a network that you trust")
         asyncio.run(_run(server, follow, listener))
+
+
+def _print_addresses(url: str, token: str, stop_token: str) -> None:
+    """Print where the page is; with the tokens, unless the journal would keep them."""
+    if is_journal(sys.stdout):
+        print(f"{url} (the token is in the file of --token-file)", flush=True)
+        return
+    print(f"{url}?token={token}", flush=True)
+    if stop_token:
+        print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
 
 
 def _site(bus: BusConfig, settings: WebSettings, access: Access, reports: Path) -> tuple[Guard, Follow]:
@@ -103,7 +124,22 @@ async def _run(server: _Server, follow: Follow, listener: socket.socket) -> None
 
 
 class _Server(uvicorn.Server):
-    """A server whose signals are handled by its caller."""
+    """A server whose signals are handled by its caller, and whose connections have places."""
+
+    def __init__(self, config: uvicorn.Config, places: ConnectionPlaces) -> None:
+        super().__init__(config)
+        self._places = places
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept connections."""
+        assert sockets is not None
+
+        def protocol() -> asyncio.Protocol:
+            return _Protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+
+        acceptors = [Acceptor(listener, protocol, self.config.ssl, self._places) for listener in sockets]
+        self.servers = cast("list[asyncio.base_events.Server]", acceptors)  # uvicorn only closes them
+        self.started = True
 
     def end(self) -> None:
         """Close all connections and end."""
@@ -145,7 +181,7 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
     config = uvicorn.Config(
         guard, loop="asyncio", http=_Protocol, ws="websockets-sansio", interface="asgi3", lifespan="off",
         ws_max_size=LONGEST_MESSAGE, ws_ping_interval=None, ws_per_message_deflate=False, log_config=None,
-        access_log=False, proxy_headers=False, server_header=False, limit_concurrency=MOST_CONNECTIONS,
+        access_log=False, proxy_headers=False, server_header=False,
         timeout_graceful_shutdown=END_S, ssl_certfile=certificate, ssl_keyfile=key)
     try:
         config.load()
@@ -165,7 +201,9 @@ def _listening(listen: str) -> Iterator[socket.socket]:
     host, port = found[1].strip("[]"), int(found[2])
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.create_server(address[:2], family=family)
+        listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        # A browser speaks first, with TLS too. The system keeps connections on which nothing has come to itself.
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENCE_S)
     except OSError as error:
         raise OmnidError(f"--listen {listen}: {error.strerror or error}; stop the other program there, or name another "
                          "address") from error

@@ -14,12 +14,11 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from omnid.web.access import Access
+from omnid.web.access import COOKIE_S, Access
 from omnid.web.guard import Guard
 from omnid.web.metrics import CONTENT_TYPE
 
 STATIC: Final = Path(__file__).with_name("static")
-COOKIE_S: Final = 30 * 86_400  # for which a browser keeps the cookie
 _LONGEST_FORM: Final = 1024  # bytes
 _FORM_S: Final = 5.0
 
@@ -35,6 +34,7 @@ class Site:
         """
         self._page, self._metrics_text, self._access, self._secure = index, metrics, access, secure
         outer = [Route("/", self._index), Route("/login", self._login, methods=["POST"]),
+                 Route("/logout", self._logout, methods=["POST"]),
                  Route("/metrics", self._metrics), Mount("/static", StaticFiles(directory=STATIC))]
         self.guard = Guard(Starlette(routes=[*outer, *routes]), access)
 
@@ -46,6 +46,14 @@ class Site:
         if self._access.has_token(request.scope):
             return FileResponse(STATIC / self._page)
         return FileResponse(STATIC / "login.html", status_code=401)
+
+    async def _logout(self, request: Request) -> Response:
+        """End the session of a browser."""
+        self._access.end_session(request.scope)
+        response = RedirectResponse("/", 303)
+        response.delete_cookie(self._access.cookie, httponly=True, samesite="lax", secure=self._secure)
+        return response
+
     async def _login(self, request: Request) -> Response:
         """Let a browser in that sends the token in a form."""
         form = bytearray()
@@ -61,11 +69,12 @@ class Site:
 
     def _let_in(self, token: str) -> Response:
         """Return the answer to a token: the address of the page, with a cookie that takes the token's place."""
-        if not self._access.is_token(token):
+        role = self._access.role_of(token)
+        if role is None:
             self.guard.refused["wrong token"] += 1
             return FileResponse(STATIC / "login.html", status_code=401)
         response = RedirectResponse("/", 303)
-        response.set_cookie(self._access.cookie, self._access.cookie_value, max_age=COOKIE_S, httponly=True,
+        response.set_cookie(self._access.cookie, self._access.new_cookie(role), max_age=COOKIE_S, httponly=True,
                             samesite="lax", secure=self._secure)
         return response
 

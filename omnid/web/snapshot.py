@@ -11,7 +11,8 @@ import numpy as np
 
 from calib import se3
 from omnid.engine.telemetry import Histogram
-from omnid.monitor.robot_state import RobotState, plain
+from omnid.monitor.robot_state import RobotState
+from omnid.plain_text import plain
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
 from omnid.transport.scan_codec import Scan

@@ -9,14 +9,16 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
-from omnid.client import Driver
+from omnid.client import HERE, Driver
 from omnid.monitor.arming import ANSWER_S, CONNECT_S, answered_ns
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
+from omnid.transport.stop_datagram import STOPPED, StopSender
 from omnid.web.feed import RobotFeed
 
 T = TypeVar("T")
 REPEAT_S: Final = 0.2  # between two stops
 _POLL_S: Final = 0.02
+_DATAGRAM_S: Final = 0.05
 
 
 class Answer(NamedTuple):
@@ -77,6 +79,8 @@ class WheelCommands:
             if self._again:
                 self._again, begin_s = False, time.monotonic()
             driver, reports = self._ready_driver(), self._feed.wheel_reports
+            if await asyncio.to_thread(self._stops_by_datagram) and not self._again:
+                return Answer(True, "the robot stops: its wheels stand until it is armed")
             if driver is not None:
                 await within(self._stop_thread, driver.stop)
                 reported = await self._wait_for(partial(self._reported_since, reports), REPEAT_S)
@@ -85,6 +89,12 @@ class WheelCommands:
             else:
                 await asyncio.sleep(_POLL_S)
         return Answer(False, f"the stop is NOT confirmed: use the emergency stop. {self._reason()}")
+
+    def _stops_by_datagram(self) -> bool:
+        """Ask for a stop beside the sessions of the bus, which may all be taken; return whether it is confirmed."""
+        bus = self._feed.bus
+        with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
+            return datagrams.ask(_DATAGRAM_S) == STOPPED
 
     async def _arm(self) -> Answer:
         driver = self._ready_driver()

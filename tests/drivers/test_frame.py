@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import omnid  # noqa: F401 - sets the limit of OpenCV
 from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, MAX_SAMPLES, Frame, gray
+from omnid import cli
 from tests.limited import run_limited
 
 WIDTH, HEIGHT = 37, 23
@@ -244,7 +244,8 @@ def test_refuses_colour_images_whose_samples_would_fill_the_memory(suffix: str, 
 
 
 DECODE = """
-import omnid
+from omnid import cli
+cli.bound_image_size()
 import cv2
 import numpy as np
 size = np.array([9000, 9000], "<i4").tobytes()
@@ -256,8 +257,15 @@ except cv2.error as error:
 """
 
 
-def test_opencv_itself_refuses_larger_images() -> None:
+def test_opencv_itself_refuses_larger_images_in_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Formats whose header is not read here are bounded as well."""
     printed, memory_mb = run_limited(DECODE)
     assert printed == "True" and memory_mb < 200
+    monkeypatch.delenv("OPENCV_IO_MAX_IMAGE_PIXELS", raising=False)
+    cli.bound_image_size()
     assert os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] == str(MAX_PIXELS)
+
+
+def test_import_leaves_the_environment_as_it_is() -> None:
+    printed, _ = run_limited("import os\nbefore = dict(os.environ)\nimport omnid\nprint(before == dict(os.environ))")
+    assert printed == "True"

@@ -37,7 +37,7 @@ export class Plan {
     }, { passive: false });
   }
 
-  // Points from a position of the list on; null is a gap.
+  // Points [x, y] from a position of the list on; a third number marks a gap before the point.
   addPath(from, points) {
     if (from > this.points.length) return;
     this.points.length = from;
@@ -165,7 +165,7 @@ export class Plan {
       left = Math.min(left, x); right = Math.max(right, x);
       low = Math.min(low, y); high = Math.max(high, y);
     };
-    for (const point of this.points) if (point !== null) add(point[0], point[1]);
+    for (const point of this.points) add(point[0], point[1]);
     for (const point of this.obstacles) add(point[0], point[1]);
     if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
     if (this.map !== null) {
@@ -214,18 +214,12 @@ export class Plan {
     context.lineWidth = 2.5;
     context.lineJoin = "round";
     context.beginPath();
-    let begins = true;
-    for (const point of this.points) {
-      if (point === null) {
-        begins = true;
-      } else {
-        const [x, y] = toScreen(point[0], point[1]);
-        if (begins) context.moveTo(x, y);
-        else context.lineTo(x, y);
-        begins = false;
-      }
-    }
-    if (this.pose !== null && !begins) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
+    this.points.forEach((point, index) => {
+      const [x, y] = toScreen(point[0], point[1]);
+      if (index === 0 || point.length > 2) context.moveTo(x, y);
+      else context.lineTo(x, y);
+    });
+    if (this.pose !== null && this.points.length > 0) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
     context.stroke();
   }
 

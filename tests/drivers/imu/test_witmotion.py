@@ -75,10 +75,19 @@ def test_a_silent_port_is_opened_again_and_reported(port: tuple[int, str], monke
     events: list[str] = []
     gyro = WitMotionGyro(name, 9600, events.append)
     os.write(device, b"\x55garbage at another baud rate")
-    timer = threading.Timer(1.5, lambda: os.write(device, turn(7)))
-    timer.start()
+    received = threading.Event()
+
+    def send() -> None:
+        """Send turns from 1.5 s on, as a sensor does: what arrives while the port is opened again is lost."""
+        received.wait(1.5)
+        while not received.wait(0.05):
+            os.write(device, turn(7))
+
+    sender = threading.Thread(target=send)
+    sender.start()
     (sample,) = islice(gyro.samples(), 1)
-    timer.join()
+    received.set()
+    sender.join()
     gyro.close()
     assert sample.z_radps > 0 and gyro.restarts >= 1 and "baud rate" in events[0]
 

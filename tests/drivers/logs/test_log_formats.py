@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sqlite3
 from collections.abc import Callable
@@ -20,8 +21,10 @@ from drivers.logs.image_folder import parse_stamp
 from drivers.logs.log_formats import log_info
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_info import LogState
+from drivers.logs.sqlite_bag import SqliteBag
 from tests.drivers.logs.bags import ROS1, ros1_bytes, write_bag, write_db3
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, Entry, jpeg, pairs, write_log
+from tests.drivers.logs.repeated_pages import repeat_pages
 
 PAIRS = 12
 
@@ -280,3 +283,62 @@ def test_a_message_of_another_type_is_left_out(tmp_path: Path) -> None:
     entries = [Entry(LOWER, COMPRESSED, b"\0\1\0\0junk", START_NS), *pairs(2)]
     found, reader = read(write_db3(tmp_path / "bag", entries))
     assert len(found) == 4 and reader.counts["broken"] == 1 and jpeg(1)
+
+
+def test_a_bag_whose_pages_are_named_again_and_again_ends(tmp_path: Path) -> None:
+    """500**6 times the rows of one leaf: neither those that are wanted nor those of other topics are read for ever."""
+    path = write_db3(tmp_path / "bag", [Entry(LOWER, COMPRESSED, b"\0\1\0\0", START_NS)] * 8)
+    repeat_pages(path)
+    assert path.stat().st_size < 100_000
+    with closing(SqliteBag(path)) as bag:
+        assert bag.counts() is None
+        assert len(list(bag.messages())) <= path.stat().st_size // 8
+        assert "more rows than its size allows" in bag.damage().cut
+        bag._topics = {99: (LOWER, COMPRESSED)}
+        assert list(bag.messages()) == [] and "interrupted" in bag.damage().cut
+    assert log_info(path).state is LogState.BROKEN
+
+
+@pytest.mark.parametrize("columns", ["data, topic_id, timestamp, id INTEGER PRIMARY KEY",
+                                     "id INTEGER PRIMARY KEY, topic_id AS (1), timestamp, data"])
+def test_a_table_of_other_columns_is_no_bag(tmp_path: Path, columns: str) -> None:
+    path = write_db3(tmp_path / "bag", pairs(1))
+    with closing(sqlite3.connect(path)) as bag:
+        bag.execute("DROP TABLE messages")
+        bag.execute(f"CREATE TABLE messages ({columns})")
+        bag.commit()
+    with pytest.raises(DriverError, match="no bag of ROS 2"):
+        LogReader(path)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "link", "folder"])
+@pytest.mark.parametrize("name", ["lower/1700000000000000001.jpg", "rig.toml"])
+def test_folders_hold_regular_files_only(tmp_path: Path, kind: str, name: str) -> None:
+    """Anything else is one line, and nothing waits for a pipe; a rig that is none is left out."""
+    folder, odd = write_folders(tmp_path / "images", pairs(2)), tmp_path / "images" / name
+    (tmp_path / "secret").write_text("secret")
+    if kind == "pipe":
+        os.mkfifo(odd)
+    elif kind == "folder":
+        odd.mkdir()
+    else:
+        odd.symlink_to("/dev/zero" if kind == "device" else tmp_path / "secret")
+    if name == "rig.toml":
+        with closing(LogReader(folder)) as reader:
+            assert reader.attachments() == {}
+        return
+    with pytest.raises(DriverError, match=r"1700000000000000001.jpg': no regular file of the folder") as refused:
+        LogReader(folder)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_link_within_the_folder_is_an_image_and_a_pipe_that_comes_later_is_not_waited_for(tmp_path: Path) -> None:
+    folder = write_folders(tmp_path / "images", pairs(3))
+    first, last = (sorted((folder / "lower").iterdir())[number] for number in (0, -1))
+    (folder / "kept").mkdir()
+    first.rename(folder / "kept" / "image")
+    first.symlink_to(folder / "kept" / "image")
+    with closing(LogReader(folder)) as reader:
+        last.unlink()
+        os.mkfifo(last)
+        assert len(list(reader.frames())) == 5 and reader.counts["broken"] + reader.counts["broken_records"] == 1

@@ -106,21 +106,6 @@ def test_starts_a_new_file_by_size_and_by_age(bench: Callable[..., Bench], rotat
             assert [a.name for a in make_reader(opened).iter_attachments()] == ["rig.toml"]
 
 
-def test_another_attachment_begins_a_new_file(bench: Callable[..., Bench]) -> None:
-    recording = bench()
-    recording.write(30)
-    recording.log.attach("rig.toml", b"# refined")
-    recording.write(20)
-    recording.log.close()
-    files = sorted(recording.folder.iterdir())
-    attached = []
-    for file in files:
-        with file.open("rb") as opened:
-            attached.append([(a.name, a.data) for a in make_reader(opened).iter_attachments()])
-    assert [counted(file) for file in files] == [30, 20]
-    assert attached[0] == [*RIG.items()] and attached[1] == [("rig.toml", b"# refined")]
-
-
 def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_s=1.0, keep_files=3))
     strangers = ["notes.txt", "robot_20200101T000000Z_001.mcap.bak", "other_20200101T000000Z_001.mcap"]

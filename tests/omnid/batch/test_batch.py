@@ -167,6 +167,19 @@ def test_tables_hold_names_that_are_no_formulas_and_no_html(tmp_path: Path) -> N
     assert "<script>" not in text and "&lt;script&gt;" in text
 
 
+def test_names_that_are_no_text_are_escaped_everywhere(tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for name in (b"\xff\x1b[2J\n.mcap", b"...mcap"):
+        Path(os.fsdecode(os.fsencode(logs) + b"/" + name)).write_text("no log")
+    done = omnid("batch", logs, "--out", tmp_path / "out")
+    assert done.returncode == 1 and "2 failed" in done.stdout and "Traceback" not in done.stderr, done.stderr
+    found = rows(tmp_path / "out")
+    assert found.keys() == {"'-2J-", "log"} and found["'-2J-"]["log"] == rf"{logs}/\xff\x1b[2J\n.mcap"
+    table, page = ((tmp_path / "out" / name).read_text() for name in ("results.csv", "index.html"))
+    assert len(table.splitlines()) == 3 and not any("\x1b" in text for text in (done.stdout, done.stderr, table, page))
+
+
 def test_a_stored_result_of_another_version_or_with_damage_is_none(tmp_path: Path) -> None:
     log = short_log(tmp_path / "log.mcap", 1000)
     (job,) = jobs(find_logs([str(log)]), tmp_path / "out", BatchOptions())

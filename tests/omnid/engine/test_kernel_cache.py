@@ -72,6 +72,35 @@ def test_a_folder_that_cannot_be_used_gives_a_warning(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+def test_code_that_others_could_have_written_is_not_read(tmp_path: Path) -> None:
+    """The right digests do not help: a program that may write the code may write them, too."""
+    run(tmp_path)
+    assert run(tmp_path).stdout == "[1.5, 2.5] 1\n"
+    (folder,) = tmp_path.glob("kernels-sample-*")
+    assert kernel_cache._is_intact(folder) and not kernel_cache._is_intact(folder, os.geteuid() + 1)
+    for mode in (0o720, 0o702):
+        folder.chmod(mode)
+        assert not kernel_cache._is_intact(folder)
+        assert run(tmp_path).stdout.endswith("[1.5, 2.5] 0\n"), "compiled again"
+    assert run(tmp_path).stdout == "[1.5, 2.5] 1\n"
+    for mode in (0o720, 0o702):
+        tmp_path.chmod(mode)
+        done = run(tmp_path)
+        assert "others can write" in done.stdout and done.stdout.endswith("[1.5, 2.5] 0\n"), "nothing is read from it"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to another user")
+def test_code_of_another_user_is_not_read(tmp_path: Path) -> None:
+    run(tmp_path)
+    (folder,) = tmp_path.glob("kernels-sample-*")
+    os.chown(folder, 12345, -1)
+    assert run(tmp_path).stdout.endswith("[1.5, 2.5] 0\n")
+    assert run(tmp_path).stdout == "[1.5, 2.5] 1\n"
+    os.chown(tmp_path, 12345, -1)
+    done = run(tmp_path)
+    assert "belongs to another user" in done.stdout and done.stdout.endswith("[1.5, 2.5] 0\n")
+
+
 def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
     done = run(tmp_path, "deny")
     if done.returncode == 77:

@@ -132,8 +132,8 @@ def test_remembers_a_bounded_number_of_kinds(log: Log) -> None:
 
 @pytest.mark.parametrize(
     ("text", "line"),
-    [("two\nlines", "two lines"), ("\x1b[31mred\x00\x07", "[31mred"), (" much   room ", "much room"), ("", ""),
-     ("<0>panic", "<0>panic"), ("100 %s", "100 %s")],
+    [("two\nlines", "two lines"), ("\x1b[31mred\x00\x07", r"\x1b[31mred\x00\x07"), (" much   room ", "much room"),
+     ("", ""), ("<0>panic", "<0>panic"), ("100 %s", "100 %s")],
 )
 def test_writes_one_printable_line_per_record(log: Log, text: str, line: str) -> None:
     log(logging.INFO, text)

@@ -21,7 +21,7 @@ from calib.panorama import Cylinder
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import seen_by
 from omnid.errors import OmnidError
-from omnid.formats.place_file import APPLICATION_ID, SCHEMA_2, read_places, write_places
+from omnid.formats.place_file import APPLICATION_ID, MAX_VALUE_BYTES, SCHEMA_2, read_places, write_places
 from omnid.formats.place_rows import checksum
 from omnid.formats.ply import write_ply
 from tests.faults.mutation import mutated
@@ -236,6 +236,36 @@ def test_odometry_that_stood_still_has_no_uncertainty(tmp_path: Path) -> None:
 def test_a_map_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(OmnidError, match=r"cannot write the map: .*: choose another file$"):
         write_places(tmp_path / "no folder" / "a.omap", some_places(1), RIG)
+
+
+def test_a_map_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a power cut could leave an empty file in the place of the map. The calls are made, and their order kept."""
+    calls: list[tuple[str, str]] = []
+    sync, replace = os.fsync, os.replace
+
+    def noted_sync(number: int) -> None:
+        sync(number)
+        calls.append(("sync", os.readlink(f"/proc/self/fd/{number}")))
+
+    def noted_replace(source: Path, target: Path) -> None:
+        replace(source, target)
+        calls.append(("replace", str(source)))
+
+    monkeypatch.setattr(os, "fsync", noted_sync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    write_places(tmp_path / "a.omap", some_places(2), RIG)
+    partial = calls[0][1]
+    assert calls == [("sync", partial), ("replace", partial), ("sync", str(tmp_path))]
+    assert Path(partial).suffix == ".part"
+
+
+def test_a_value_that_is_too_long_is_never_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.omap"
+    write_places(path, some_places(2), RIG)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE keyframe SET thumbnail = zeroblob(?)", (MAX_VALUE_BYTES + 1,))
+    with pytest.raises(OmnidError, match="string or blob too big"):
+        read_places(path)
 
 
 def test_a_program_that_is_killed_while_it_writes_leaves_the_old_map(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -11,7 +12,7 @@ import pytest
 
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
-from omnid.service.install import Installation, service_file
+from omnid.service.install import SHIPPED_PROGRAM, Installation, exec_word, service_file
 from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[3]
@@ -68,6 +69,54 @@ def test_a_folder_that_cannot_be_written_is_one_line(omnid: Command, tmp_path: P
 def test_refuses_a_program_that_the_unit_cannot_see(tmp_path: Path, program: str) -> None:
     with pytest.raises(OmnidError, match="/opt/omnid"):
         Installation(tmp_path, Path(program)).steps()
+
+
+@pytest.mark.parametrize(("name", "unit"), [
+    ("with space", "omnid.service"), ("100%n", "omnid-web.service"),
+    ("a %n ; ${HOME} größe", "omnid.service")])
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="apt-get install systemd")
+def test_systemd_starts_a_program_of_any_name(tmp_path: Path, name: str, unit: str) -> None:
+    """Without the program systemd names the path that it has read."""
+    program = tmp_path / name / "bin" / "omnid"
+    path = tmp_path / unit
+    path.write_text(service_file(unit).replace(SHIPPED_PROGRAM, exec_word(program)))
+    verify = ["systemd-analyze", "verify", "--man=no", path]
+    missing = subprocess.run(verify, capture_output=True, text=True, timeout=60)
+    assert f"Command {program} is not executable: No such file or directory" in missing.stderr
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    done = subprocess.run(verify, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["two\nExecStartPre=/bin/evil", "tab\t", "\udcff", "\x1b[2J", 'a "b"', "a 'b'",
+                                  "a\\x41"])
+def test_refuses_a_program_that_no_unit_can_name(omnid: Command, tmp_path: Path, name: str,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "prefix", f"/srv/{name}")
+    assert "characters that a systemd unit cannot name" in omnid.refused("install-service", "--root", tmp_path, "--yes")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("link", ["etc", "etc/systemd", FILES[0], FILES[2]])
+def test_writes_through_no_link_below_the_root(omnid: Command, tmp_path: Path, link: str) -> None:
+    elsewhere, root = tmp_path / "elsewhere", tmp_path / "root"
+    elsewhere.mkdir()
+    (root / link).parent.mkdir(parents=True)
+    (root / link).symlink_to(elsewhere / "file" if link in FILES else elsewhere)
+    assert "symbolic link" in omnid.refused("install-service", "--root", root, "--yes")
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_a_link_that_appears_later_is_not_followed(tmp_path: Path) -> None:
+    steps = Installation(tmp_path / "root", Path("/srv/robot/bin/omnid")).steps()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "etc").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OmnidError, match="symbolic link"):
+        steps[0].act()
+    assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
 def test_the_files_are_found_in_a_clone() -> None:

@@ -6,6 +6,8 @@ import contextlib
 import json
 import socket
 import threading
+import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +15,11 @@ import pytest
 import zenoh
 
 from omnid.client import Robot
-from omnid.errors import OmnidError
+from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import ERROR, OK
+from omnid.transport.codec import ERROR, OK, WARN
+from omnid.transport.intake import UNKNOWN, budget_of
+from omnid.transport.topics import command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
 
@@ -113,6 +117,18 @@ def test_does_not_collect_large_messages() -> None:
     assert most_mb[0] - before_mb < 100
 
 
+def test_more_sessions_than_there_are_places_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each session holds fragments in memory. The places are few here; the bus is the real one."""
+    monkeypatch.setattr(transport_session, "_MAX_SESSIONS", 3)
+    endpoint = free_endpoint()
+    client = {"mode": "client", "connect__endpoints": [endpoint], "connect__timeout_ms": 2000}
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), contextlib.ExitStack() as stack:
+        for _ in range(3):
+            stack.enter_context(session(**client))
+        with pytest.raises(zenoh.ZError):
+            stack.enter_context(session(**client))
+
+
 def test_clients_receive_messages_above_the_limit_of_the_daemon() -> None:
     endpoint, payload = free_endpoint(), bytes(3 << 20)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
@@ -132,17 +148,95 @@ def test_idle_connections_do_not_lock_others_out() -> None:
             assert operator.alive
 
 
-def test_refuses_to_start_beside_a_robot_of_the_same_name() -> None:
+def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
     router = free_endpoint()
-    with script(ROUTER, router):
-        with contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)))) as first:
-            with pytest.raises(OmnidError, match=r"the name 'omnid'.*change bus\.robot") as caught:
-                Bus(BusConfig(listen=(), connect=(router,)))
-            assert "\n" not in str(caught.value)
-            with contextlib.closing(Bus(BusConfig(robot="other", listen=(), connect=(router,)))) as other:
-                assert other.status().level == first.status().level == OK
-        with contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)))) as again:
-            assert again.status().level == OK, "the first has gone"
+    with script(ROUTER, router), contextlib.ExitStack() as stack:
+        first = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)))))
+        warnings, commands = list[str](), list[str]()
+        second = stack.enter_context(contextlib.closing(
+            Bus(BusConfig(listen=(), connect=(router,)), warnings.append)))
+        assert len(warnings) == 1 and "change bus.robot" in warnings[0] and "\n" not in warnings[0]
+        second.subscribe_commands(lambda key, *_: commands.append(key), {})
+        assert second.status().level == ERROR and not second.is_unique and commands == ["cmd/stop"]
+        with contextlib.closing(Bus(BusConfig(robot="other", listen=(), connect=(router,)))) as other:
+            assert other.status().level == first.status().level == OK
+        first.close()
+        wait_until(lambda: second.status().level == OK and second.is_unique)
+
+
+@pytest.mark.parametrize("token", ["omnid/alive", "omnid/alive/x"])
+def test_a_token_of_a_stranger_keeps_no_robot_from_starting(token: str) -> None:
+    """It may keep the robot disarmed, and the status says so, where no user needs a password."""
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        commands: list[str] = []
+        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        with session(mode="client", connect__endpoints=[endpoint]) as stranger:
+            held = stranger.liveliness().declare_token(token)
+            if token.endswith("x"):
+                wait_until(lambda: bus.status().level == ERROR)
+                wait_until(lambda: commands == ["cmd/stop"])
+            else:
+                stranger.put("omnid/cmd/mark", b"")
+                wait_until(lambda: commands == ["cmd/mark"])
+                assert bus.is_unique
+            del held
+        wait_until(lambda: bus.status().level == OK)
+
+
+def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path) -> None:
+    endpoint, users = free_endpoint(), tmp_path / "users"
+    users.write_text("eve:secret\n")
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), users_file=str(users)))) as bus:
+        commands: list[str] = []
+        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        with session(mode="client", connect__endpoints=[endpoint], transport__auth__usrpwd__user="eve",
+                     transport__auth__usrpwd__password="secret") as stranger:
+            held = stranger.liveliness().declare_token("omnid/alive/x")
+            stranger.put("omnid/cmd/mark", b"")
+            wait_until(lambda: commands == ["cmd/mark"])
+            assert bus.is_unique and bus.status().level == OK
+            replies = list(stranger.liveliness().get("omnid/alive"))
+            assert len(replies) == 1, "that of the robot is still seen"
+            del held
+
+
+FLOOD = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    publisher = session.declare_publisher(sys.argv[2], congestion_control=zenoh.CongestionControl.BLOCK)
+    print("ready", flush=True)
+    while True:
+        publisher.put(b"")
+"""
+
+
+@pytest.mark.parametrize("key", ["cmd/imu", "cmd/route", "cmd/arm", "cmd/nothing"])
+def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> None:
+    """Of the flood no more than the budget is passed on; a stop and a command on another key get through."""
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        commands: Counter[str] = Counter()
+
+        def count(topic: str, *_: object) -> None:
+            commands[topic] += 1
+
+        bus.subscribe_commands(count, command_topics(("operator",)))
+        with script(FLOOD, endpoint, f"omnid/{key}"), Robot(connect=(endpoint,)) as operator:
+            driver = operator.driver()
+            wait_until(lambda: bus.status().level == WARN)
+            assert any(name.startswith("flooded, ") for name in bus.status().values)
+            begin_s, before = time.monotonic(), commands[key]
+            wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)
+            wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
+            time.sleep(1.0)
+            budget = UNKNOWN if key == "cmd/nothing" else budget_of(key)
+            most = 2 * budget.burst + budget.rate_hz * (time.monotonic() - begin_s)
+            assert commands[key] - before <= most
 
 
 def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:

@@ -17,6 +17,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
+from omnid.transport.stamps import StampRule
 
 STALE_S = 0.5
 STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
@@ -31,7 +32,7 @@ class AcceptedCommands:
         self.stops = 0
         self.arms: list[ArmRequest] = []
         self.commands: list[TimedSetpoint] = []
-        self.receiver = CommandReceiver(self, STALE_S, synchronised=synchronised)
+        self.receiver = CommandReceiver(self, StampRule(STALE_S, synchronised=synchronised))
 
     def send_setpoint(self, command: TimedSetpoint) -> None:
         """Keep a setpoint."""
@@ -152,7 +153,7 @@ def test_a_plain_twist_without_stamp_counts_where_the_clocks_differ() -> None:
 
 def test_refusals_are_reported_with_what_to_do() -> None:
     lines: list[str] = []
-    receiver = CommandReceiver(AcceptedCommands(), STALE_S, report=lines.append)
+    receiver = CommandReceiver(AcceptedCommands(), StampRule(STALE_S), report=lines.append)
     receiver.receive("cmd/twist", plain_twist())
     receiver.receive("cmd/twist", b"{}")
     receiver.receive("cmd/" + "\n\x1b[2J" * 50, twist())
@@ -258,7 +259,18 @@ def test_a_request_to_arm_is_validated_like_commands(accepted: AcceptedCommands)
     for bad in (b"", arm(-1.0), arm(5.0), b"\xff" * 40, bytes(LONGEST_PAYLOAD + 1), codec.header_cdr(0)):
         receiver.receive("cmd/arm", bad)
     assert len(accepted.arms) == 1
-    assert receiver.refused == {"malformed": 2, "too old": 2, "stamp in the future": 1, "too long": 1}
+    assert receiver.refused == {"malformed": 2, "too old": 1, "no stamp": 1, "stamp in the future": 1,
+                                "too long": 1}
+
+
+def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
+    unique, accepted = [False], AcceptedCommands()
+    receiver = CommandReceiver(accepted, StampRule(STALE_S), is_unique=lambda: unique[0])
+    receiver.receive("cmd/arm", arm())
+    assert accepted.arms == [] and receiver.refused == {"another robot has this name": 1}
+    unique[0] = True
+    receiver.receive("cmd/arm", arm())
+    assert len(accepted.arms) == 1
 
 
 def test_a_request_that_was_sent_before_the_stop_and_comes_after_it_is_refused(accepted: AcceptedCommands) -> None:

@@ -29,6 +29,7 @@ from omnid.transport.navigation_codec import (
     string_from_cdr,
 )
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD, MOST_WAITING, NavigationReceiver, RequestQueue
+from omnid.transport.stamps import StampRule
 
 MAP = NavigationFrame.MAP
 
@@ -39,8 +40,8 @@ class Received:
     def __init__(self, *, synchronised: bool = True) -> None:
         self.commands: list[NavigationCommand] = []
         self.lines: list[str] = []
-        self.receiver = NavigationReceiver(self.commands.append, 0.5, synchronised=synchronised,
-                                           report=self.lines.append)
+        self.stamps = StampRule(0.5, synchronised=synchronised)
+        self.receiver = NavigationReceiver(self.commands.append, self.stamps, report=self.lines.append)
 
     def send(self, topic: str, payload: bytes, sent_ns: int = 0) -> NavigationCommand | None:
         """Return the command that a message leads to."""
@@ -72,8 +73,9 @@ def test_requests_are_passed_on() -> None:
     assert command.request == GoalRequest(MAP, 1.5, -2.0, pytest.approx(0.5))
     command = received.send("path", path_cdr(now_ns, "odom", [[0, 0], [1, 1]]))
     assert command is not None and isinstance(command.request, PathRequest)
-    assert [received.send("navigation", string_cdr(verb)).request for verb in NavigationVerb] == list(NavigationVerb)
-    assert received.send("route", string_cdr("repeat hall loops=2")).request == RouteRequest(
+    verbs = [received.send("navigation", string_cdr(verb), time.time_ns()).request for verb in NavigationVerb]
+    assert verbs == list(NavigationVerb)
+    assert received.send("route", string_cdr("repeat hall loops=2"), time.time_ns()).request == RouteRequest(
         RouteAction.REPEAT, "hall", False, 2)
     assert not received.lines and received.receiver.accepted == 6
 
@@ -90,6 +92,31 @@ def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> No
     assert received.receiver.refused == {"cmd/goal": 2, "cmd/route": 1, "cmd/navigation": 1}
     assert all("bus.command_clock" in line and "\n" not in line for line in received.lines)
     assert Received(synchronised=False).send("goal", goal(sent_ns)) is not None
+
+
+@pytest.mark.parametrize("synchronised", [True, False])
+@pytest.mark.parametrize(("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"),
+                                             ("navigation", "resume")])
+def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(topic: str, text: str, synchronised: bool
+                                                                       ) -> None:
+    received, now_ns = Received(synchronised=synchronised), time.time_ns()
+    assert received.send(topic, string_cdr(text)) is None and "no stamp" in received.lines[0]
+    assert received.send(topic, string_cdr(f"{text} stamp=0")) is None
+    command = received.send(topic, string_cdr(f"{text} stamp={now_ns}"))
+    assert command is not None and command.stamp_ns == now_ns
+    assert received.send(topic, string_cdr(text), now_ns + 10) is not None
+    for end_topic, end in (("navigation", "cancel"), ("navigation", "pause"), ("route", "stop"), ("route", "finish")):
+        assert received.send(end_topic, string_cdr(end)) is not None
+
+
+def test_requests_of_another_clock_that_are_recorded_and_sent_again_are_refused() -> None:
+    """A request to arm lets the stamps begin again, as of another sender."""
+    received, recorded = Received(synchronised=False), string_cdr("repeat hall stamp=1000")
+    assert received.send("route", recorded) is not None
+    assert received.send("route", recorded) is None and "does not rise" in received.lines[0]
+    assert received.send("goal", goal(1000)) is not None and received.send("goal", goal(1000)) is None
+    received.stamps.accept_arm(5)
+    assert received.send("route", recorded) is not None
 
 
 @pytest.mark.parametrize(("topic", "payload"), [

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.web.access import Access, new_token, token_of
+from omnid.web.access import Access, Role, new_token, token_of
 
 TOKEN = "abcde-fghjk-mnpqr-stuvw"
 LOCAL = Access(TOKEN, frozenset(("localhost", "127.0.0.1", "[::1]")), False, "omnid_8447")
 NETWORK = Access(TOKEN, frozenset(("localhost", "rover", "rover.local")), True, "omnid_8447")
 HOST = "127.0.0.1:8447"
-COOKIE = {"cookie": f"other=1; omnid_8447={LOCAL.cookie_value}"}
+COOKIE = {"cookie": f"other=1; omnid_8447={LOCAL.new_cookie(Role.ALL)}"}
 BEARER = {"authorization": f"Bearer {TOKEN}"}
 OWN = {"origin": f"http://{HOST}"}
 
@@ -50,7 +50,7 @@ def test_only_own_names_are_answered(access: Access, host: str, enters: bool) ->
     ({**COOKIE, "authorization": "Bearer wrong"}, "wrong token"),
     ({"cookie": f"omnid_8447={TOKEN}"}, "wrong token"), ({"cookie": "omnid_8447="}, "wrong token"),
     ({"cookie": "omnid_8447=\xe4"}, "wrong token"),
-    ({"cookie": f"omnid_1={LOCAL.cookie_value}"}, "no token"), ({"cookie": ";;=;"}, "no token"),
+    ({"cookie": f"omnid_1={LOCAL.new_cookie(Role.ALL)}"}, "no token"), ({"cookie": ";;=;"}, "no token"),
 ])
 def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: str) -> None:
     assert reason(LOCAL, headers) == expected
@@ -111,3 +111,29 @@ def test_unfit_token_files_are_refused(tmp_path: Path, text: str, mode: int, mes
         token_of(path)
     with pytest.raises(OmnidError, match="cannot be made"):
         token_of(tmp_path / "missing" / "token")
+
+
+def scope(path: str, method: str, **headers: str) -> dict[str, Any]:
+    lines = [(name.encode(), value.encode()) for name, value in {"host": HOST, **headers}.items()]
+    return {"type": "http", "path": path, "method": method, "headers": lines}
+
+
+def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
+    access = Access(TOKEN, LOCAL.hosts, False, "omnid_8447", "stop-stop-stop-stop")
+    for headers in ({"authorization": "Bearer stop-stop-stop-stop"},
+                    {"cookie": f"omnid_8447={access.new_cookie(Role.STOP)}", **OWN}):
+        for path, method in (("/", "GET"), ("/metrics", "GET"), ("/stop", "POST"), ("/robot/ab/stop", "POST")):
+            assert access.refusal(scope(path, method, **headers)) is None
+        for path in ("/arm", "/route", "/navigation", "/map", "/robot/ab/arm", "/recordings/1/report"):
+            refusal = access.refusal(scope(path, "POST", **headers))
+            assert refusal is not None and refusal.reason == "stop only"
+    forged = access.new_cookie(Role.STOP).replace(".stop.", ".all.")
+    assert access.refusal(scope("/arm", "POST", cookie=f"omnid_8447={forged}", **OWN)) is not None
+    assert LOCAL.role_of("") is None, "without a token for stops an empty one is none"
+
+
+def test_a_session_ends_and_others_with_the_same_token_go_on() -> None:
+    access = Access(TOKEN, LOCAL.hosts, False, "omnid_8447")
+    mine, other = (scope("/metrics", "GET", cookie=f"omnid_8447={access.new_cookie(Role.ALL)}") for _ in range(2))
+    access.end_session(mine)
+    assert access.refusal(mine) is not None and access.refusal(other) is None

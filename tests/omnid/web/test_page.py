@@ -119,9 +119,9 @@ def expect_it_fits(page: Any, size: str) -> None:
     assert box["x"] >= 0 and box["y"] + box["height"] <= height and box["x"] + box["width"] <= width
 
 
-def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, scene: Path) -> None:
+def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, course: Path) -> None:
     more = ("--set", "bus.panorama_hz=2", "--set", "record.enabled=true", "--set", f"record.folder={tmp_path / 'rec'}")
-    with robot(scene, tmp_path, *MANUAL, *more) as (daemon, operator, base), \
+    with robot(course, tmp_path, *MANUAL, *more) as (daemon, operator, base), \
             served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", tmp_path / "rec") as server:
         operator.drive(0.3)
         for size, scheme in (("phone", "light"), ("desk", "dark")):

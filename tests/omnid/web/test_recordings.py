@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shutil
@@ -9,7 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from pathlib import Path
 
+import pytest
+
 from drivers.logs.file_lock import lock
+from omnid.errors import OmnidError
+from omnid.web.recordings import Recordings
 from tests.omnid.web.servers import WebServer
 
 
@@ -31,11 +36,12 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
     with (recordings / "now.mcap.part").open("wb") as written:
         lock(written)
         found = listed(server)
-    assert set(found) == {"images_20261122T050000Z_001.mcap", "cut.mcap.part", "<b>??.mcap", "now.mcap.part"}
+    assert set(found) == {"images_20261122T050000Z_001.mcap", "cut.mcap.part", r"<b>\xff\n.mcap", "now.mcap.part"}
     assert found["images_20261122T050000Z_001.mcap"]["size_bytes"] == sample.stat().st_size
     assert (found["now.mcap.part"]["state"], found["cut.mcap.part"]["state"]) == ("being written",
                                                                                   "cut: omnid log recover")
-    answer = server.request(f"/recordings/{found['<b>??.mcap']['key']}/report", "POST", server.bearer)
+    odd_key = found[r"<b>\xff\n.mcap"]["key"]
+    answer = server.request(f"/recordings/{odd_key}/report", "POST", server.bearer)
     text = json.loads(answer.text)["text"]
     assert answer.status == 409 and text.startswith("omnid: ") and "Traceback" not in text
     with ThreadPoolExecutor(2) as threads:
@@ -45,3 +51,18 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
     assert sum('"text":"omnid: ' in answer for answer in answers) == 1, "it has no poses"
     missing = server.request("/recordings/0123/report", "POST", server.bearer)
     assert missing.status == 409 and "not there" in missing.text
+
+
+def test_a_program_that_fails_otherwise_is_one_line_without_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program finds the modules of this one: here one that raises."""
+    (tmp_path / "modules" / "rosbags").mkdir(parents=True)
+    (tmp_path / "modules" / "rosbags" / "__init__.py").write_text("raise RuntimeError('/a/path')")
+    monkeypatch.syspath_prepend(tmp_path / "modules")
+    (tmp_path / "one\x1b.mcap").write_bytes(b"nothing")
+    recordings = Recordings(tmp_path, tmp_path)
+    with pytest.raises(OmnidError) as refused:
+        asyncio.run(recordings.report(recordings.list()[0].key))
+    assert str(refused.value) == (r"omnid: the report about one\x1b.mcap failed (exit code 1): run `omnid report` "
+                                  "on it to see why")

@@ -1,0 +1,31 @@
+"""A thread that does short work again and again, for rooms that have no graph to run it."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+
+
+class Poller:
+    """Calls an action each period until it is closed; what the action raises is printed, and the calls go on."""
+
+    def __init__(self, action: Callable[[], None], period_s: float, name: str) -> None:
+        self._action, self._period_s = action, period_s
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the calls; one that is under way ends first, unless this is it."""
+        self._closing.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing.wait(self._period_s):
+            try:
+                self._action()
+            except Exception:  # the thread is the only way in for stops: it must not end by a defect elsewhere
+                traceback.print_exc(file=sys.stderr)

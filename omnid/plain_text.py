@@ -1,0 +1,30 @@
+"""Texts from outside made safe to show: names of files and topics, messages of the network, errors that quote them.
+
+A terminal, a table and a page show the same: control characters, line breaks, characters that change the direction of
+writing, and bytes of a file name that are no UTF-8 appear as escapes such as \\x1b.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+MOST_CHARACTERS: Final = 400
+_NO_UTF8: Final = range(0xDC80, 0xDD00)  # how Python keeps a byte of a file name that is no UTF-8 (PEP 383)
+
+
+def plain(text: str, most: int = MOST_CHARACTERS) -> str:
+    """Return a text of printable characters, of which there are `most` at most."""
+    shown = text[:most]
+    return shown if shown.isprintable() else "".join(map(_shown, shown))[:most]
+
+
+def one_line(message: object, most: int = MOST_CHARACTERS) -> str:
+    """Return a message in one line of printable characters; white space of any length becomes one blank."""
+    return plain(" ".join(str(message).split()), most)
+
+
+def _shown(letter: str) -> str:
+    if letter.isprintable():
+        return letter
+    number = ord(letter)
+    return f"\\x{number & 0xFF:02x}" if number in _NO_UTF8 else letter.encode("unicode_escape").decode("ascii")

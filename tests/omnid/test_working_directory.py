@@ -1,0 +1,163 @@
+"""Code in the working directory does not run: neither by a command nor by a program that a command starts."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from omnid.cli import _parser
+from tests.omnid.batch.test_batch import rows, short_log
+from tests.omnid.test_cli import leaves
+
+ROOT = Path(__file__).parents[2]
+# Modules of the program, of its packages and of Python that a file in the working directory may pretend to be.
+FOREIGN = ("omnid", "drivers", "numpy", "cv2", "zenoh", "json", "pickle", "html", "rerun_cli", "sitecustomize")
+NOWHERE = ("--connect", "nonsense")
+NO_ROUTE = "bus.connect has 'nonsense'"
+NO_FILE = "No such file or directory"
+# Words of each command -> its arguments, and what it then says: it has run far enough to load its packages.
+COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
+    "run": (("--lower", "/dev/null", "--upper", "/dev/null", "--rig", "none.toml"), NO_FILE),
+    "simulate": (("nowhere",), "world 'nowhere' is not known"),
+    "replay": (("none.mcap",), "none.mcap"),
+    "demo": (("--output", "/dev/null/demo"), "/dev/null/demo"),
+    "eval": (("none.txt", "none.txt"), NO_FILE),
+    "calibrate board": (("--corners", "6x7", "--square-mm", "25", "-o", "board.pdf"), "board of 6x7 inner corners"),
+    "calibrate live": (("--log", "none.mcap", "--corners", "6x7", "--square-mm", "30"), "none.mcap"),
+    "calibrate camera": (("none.png", "--corners", "6x7", "--square-mm", "30", "-o", "c.toml"), "none.png"),
+    "calibrate rig": (("none.mcap", "--corners", "6x7", "--square-mm", "30", "-o", "r.toml"), "none.mcap"),
+    "calibrate check": (("none.mcap", "--rig", "none.toml"), NO_FILE),
+    "calibrate drive": (("none.mcap", "--rig", "none.toml", "-o", "r.toml"), NO_FILE),
+    "calibrate import": (("none.yaml", "-o", "r.toml"), "none.yaml"),
+    "calibrate export": (("none.toml", "--format", "kalibr", "-o", "c.yaml"), NO_FILE),
+    "cameras": (("--snapshot", "views", "--log", "none.mcap"), "none.mcap"),
+    "arm": (NOWHERE, NO_ROUTE),
+    "stop": (NOWHERE, NO_ROUTE),
+    "drive": (NOWHERE, "keyboard"),
+    "goto": (("1", "2", *NOWHERE), NO_ROUTE),
+    "route teach": (("a", *NOWHERE), NO_ROUTE),
+    "route finish": (NOWHERE, NO_ROUTE),
+    "route repeat": (("a", *NOWHERE), NO_ROUTE),
+    "route stop": (NOWHERE, NO_ROUTE),
+    "route list": (("--config", "none.toml"), NO_FILE),
+    "route show": (("a", "--config", "none.toml"), NO_FILE),
+    "route delete": (("a", "--config", "none.toml"), NO_FILE),
+    "listen": (NOWHERE, NO_ROUTE),
+    "view": (("none.mcap", "-o", "view.rrd"), "none.mcap" if find_spec("rerun") else "rerun, which is not installed"),
+    "web": (("--listen", "127.0.0.1:99999"), "expected HOST:PORT"),
+    "batch": (("none.mcap", "--out", "out"), "no log 'none.mcap'"),
+    "record": (("rec", "--lower", "/dev/null", "--upper", "/dev/null"), "not a video device"),
+    "report": (("none.mcap", "-o", "report.html"), "none.mcap"),
+    "log info": (("none.mcap",), "none.mcap"),
+    "log recover": (("none.mcap",), "none.mcap"),
+    "map build": (("none.mcap", "-o", "place.omap", "--rig", "none.toml"), "none"),
+    "map info": (("none.omap",), NO_FILE),
+    "map show": (("none.omap", "-o", "place.html"), NO_FILE),
+    "map merge": (("none.omap", "none.omap", "-o", "place.omap"), "none.omap"),
+    "map tags": (("none.omap",), NO_FILE),
+    "map align": (("none.omap", "--known", "none.toml", "-o", "place.omap"), NO_FILE),
+    "map export": (("none.omap", "--ply", "place.ply"), NO_FILE),
+    "map save": (NOWHERE, NO_ROUTE),
+    "diff": (("none.mcap", "none.mcap"), "none.mcap"),
+    "doctor": (("--config", "none.toml"), NO_FILE),
+    "motor test": (("--motor", "simulated"), "motor.protocol is 'line'"),
+    "config": (("--minimal",), "[motor"),
+    "install-service": (("--dry-run",), "omnid.service"),
+}
+IN_ONE_PROCESS = """
+import contextlib, io, json, sys
+from omnid.cli import main
+for words in json.loads(sys.argv[1]):
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            code = main(words)
+        except SystemExit as end:
+            code = end.code
+    print(json.dumps([code, said.getvalue()]), flush=True)
+"""
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Iterator[Path]:
+    """A working directory with modules that write a file when they run; none is there afterwards."""
+    folder, marker = tmp_path / "hostile", tmp_path / "marker"
+    folder.mkdir()
+    for name in FOREIGN:
+        (folder / f"{name}.py").write_text(f"open({str(marker)!r}, 'a').write({name!r} + ' ')\nraise SystemExit(99)\n")
+    yield folder
+    assert not marker.exists(), f"ran: {marker.read_text()}"
+
+
+def run(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run Python in the folder without its modules, as the installed program does."""
+    return subprocess.run([sys.executable, "-P", *map(str, words)], cwd=folder, capture_output=True, text=True,
+                          timeout=240, stdin=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+
+def test_no_command_runs_it(hostile: Path) -> None:
+    assert set(COMMANDS) == {words for words, _ in leaves(_parser([]))}
+    calls = [[*words.split(), *arguments] for words, (arguments, _) in COMMANDS.items()]
+    done = run(hostile, "-c", IN_ONE_PROCESS, json.dumps(calls))
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(answers) == len(calls), (answers[-1:], done.stderr)
+    wrong = {words: answer for (words, (_, expected)), answer in zip(COMMANDS.items(), answers, strict=True)
+             if expected not in answer[1] or "Traceback" in answer[1]}
+    assert not wrong
+
+
+def test_the_controller_and_the_program_of_a_report_do_not_run_it(hostile: Path, tmp_path: Path) -> None:
+    log, recordings = short_log(tmp_path / "log.mcap"), tmp_path / "recordings"
+    recordings.mkdir()
+    done = run(hostile, "-m", "omnid", "replay", log, "--motor", "simulated", "--record", recordings / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    report = ("import asyncio, sys\nfrom pathlib import Path\nfrom omnid.web.recordings import Recordings\n"
+              "found = Recordings(Path(sys.argv[1]), Path(sys.argv[2]))\n"
+              "print(asyncio.run(found.report(found.list()[0].key)).read_text()[:15])")
+    done = run(hostile, "-c", report, recordings, tmp_path)
+    assert done.stdout == "<!DOCTYPE html>\n", done
+
+
+def test_the_process_of_the_refinement_does_not_run_it(hostile: Path) -> None:
+    """It fails for a request that is none, after it has loaded what it needs to read one."""
+    ask = ("from omnid.refinement.rig_refinement import _Estimate\n"
+           "asked = _Estimate(None)\nasked.wait()\nprint(asked.answer())")
+    assert run(hostile, "-c", ask).stdout == "the estimate ended with exit code 1\n"
+
+
+def test_the_viewer_does_not_run_it(hostile: Path) -> None:
+    pytest.importorskip("rerun")
+    ask = ("import subprocess\nfrom omnid.viewer.targets import _rerun\n"
+           "print(subprocess.run(_rerun(['--version']), capture_output=True, text=True).stdout)")
+    assert "rerun" in run(hostile, "-c", ask).stdout
+
+
+def test_a_batch_runs_no_object_that_it_fetches(hostile: Path, tmp_path: Path) -> None:
+    """The objects of an address have names that strangers chose; programs run in the folder to which they are fetched.
+    """
+    pytest.importorskip("fsspec")
+    bucket = tmp_path / "bucket"
+    short_log(bucket / "drive.mcap")
+    shutil.copy(hostile / "numpy.py", bucket)
+    done = run(hostile, "-m", "omnid", "batch", f"file://{bucket}/*", "--out", tmp_path / "out", "--record")
+    assert "1 ok" in done.stdout, done
+    found = rows(tmp_path / "out")
+    assert found["drive"]["status"] == "ok" and (tmp_path / "out" / "drive" / "report.html").is_file()
+    assert found["numpy"]["status"] == "failed" and "fetched.mcap' is not an MCAP log" in found["numpy"]["error"]
+
+
+def test_each_program_is_started_by_one_function() -> None:
+    """Code that starts a Python names the interpreter in one file only; the others name it in a message."""
+    starts = re.compile(r"\[\s*sys\.executable|exec\w*\(\s*sys\.executable|^\s+sys\.executable,|multiprocessing", re.M)
+    found = [path.relative_to(ROOT).as_posix() for layer in ("calib", "drivers", "omnid")
+             for path in sorted((ROOT / layer).rglob("*.py")) if starts.search(path.read_text("utf-8"))]
+    assert found == ["omnid/engine/python_program.py"]
