@@ -8,30 +8,37 @@
     odometry = omnid.Odometry("rig.toml")                 # images in, poses out
     pose = odometry.process(stamp_ns, lower, upper)       # grey images (H, W) uint8 -> OdometryUpdate
 
+    found = omnid.calibrate_rig(Path("boards/"), omnid.Board(6, 7, 0.03))   # also calibrate_camera, calibrate_drive
+    print(found)
+    found.save(Path("rig.toml"))
+
 The geometry (camera models, rigs, panoramas) is the package `calib`, a client of a running daemon is `omnid.client`.
 `omnid/examples` has a program for each. Names are imported when they are first used: `import omnid` loads no numpy.
 """
 
-import os
 from typing import TYPE_CHECKING
 
 from omnid.version import __version__
 
-# OpenCV reads this when it is loaded. It is drivers.frame.MAX_PIXELS, which is not imported here.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
-
 if TYPE_CHECKING:
+    from calib.boards.board import Board
     from omnid.api import Odometry, replay
+    from omnid.calibration.camera import calibrate_camera
+    from omnid.calibration.drive import calibrate_drive
+    from omnid.calibration.rig import calibrate_rig
     from omnid.config import Config, load_config
     from omnid.errors import OmnidError
     from omnid.messages import OdometryUpdate
     from omnid.runs.run_result import RunResult
     from omnid.tracking_state import TrackingState
 
-__all__ = ["Config", "Odometry", "OdometryUpdate", "OmnidError", "RunResult", "TrackingState", "__version__",
-           "load_config", "replay"]
-_MODULES = {"Config": "config", "Odometry": "api", "OdometryUpdate": "messages", "OmnidError": "errors",
-            "RunResult": "runs.run_result", "TrackingState": "tracking_state", "load_config": "config", "replay": "api"}
+__all__ = ["Board", "Config", "Odometry", "OdometryUpdate", "OmnidError", "RunResult", "TrackingState", "__version__",
+           "calibrate_camera", "calibrate_drive", "calibrate_rig", "load_config", "replay"]
+_MODULES = {"Board": "calib.boards.board", "Config": "omnid.config", "Odometry": "omnid.api",
+            "OdometryUpdate": "omnid.messages", "OmnidError": "omnid.errors", "RunResult": "omnid.runs.run_result",
+            "TrackingState": "omnid.tracking_state", "calibrate_camera": "omnid.calibration.camera",
+            "calibrate_drive": "omnid.calibration.drive", "calibrate_rig": "omnid.calibration.rig",
+            "load_config": "omnid.config", "replay": "omnid.api"}
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of this package
 
@@ -41,7 +48,7 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of this pack
 
         if name not in _MODULES:
             raise AttributeError(f"module 'omnid' has no attribute {name!r}")
-        value = globals()[name] = getattr(import_module(f"omnid.{_MODULES[name]}"), name)
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
         return value
 
     def __dir__() -> list[str]:

@@ -25,17 +25,14 @@ from omnid.config_use import unused_settings
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
-from omnid.messages import FramePair, OdometryUpdate
+from omnid.messages import DensePoints, FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
 from omnid.settings import parse
 from omnid.settings_dump import dump
-from omnid.stages.dewarp import Dewarp
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.odometry import OdometryStage
-from omnid.stages.rig_gate import RigGate
 from omnid.stages.skew import Skew
-from omnid.stages.stereo import Stereo
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
@@ -104,10 +101,7 @@ class Odometry:
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
-            self._dewarp = Dewarp(place, settings.panorama, settings.camera)
-            gate = RigGate(place.cylinder, settings.stereo.rig_check)
-            self._stereo = Stereo(place, settings.stereo_settings(), gate)
-            self._odometry = OdometryStage(place, settings.odometry)
+            self._front_end = FrontEnd(place, settings)
         self.rig = place.rig  # with the masks that were found
         self._pairs = 0
         self._skew = Skew()
@@ -121,21 +115,28 @@ class Odometry:
         between is then corrected as in a replay. None: both images were exposed at once.
 
         Of the result: `T_odom_rig` (4, 4) maps points of the rig frame into odom, which is the rig frame of the first
-        pair (m); `covariance` (6, 6) of x y z rx ry rz in odom axes (m^2, rad^2); `velocity` (6,) in the rig frame;
-        `state`; `inliers` of `tracks` landmarks. `depth.points` (N, 3) in the rig frame (m) with `depth.variance_m2`
-        (N,) along the ray, `depth.disparity` (H, W) in px, NaN where unknown, and the panoramas
-        `depth.panoramas.lower.panorama` and `.upper.panorama` (H, W) uint8.
+        pair (m); `covariance` (6, 6) of [x y z; rx ry rz] in the axes of the rig (m^2, rad^2); `velocity` (6,) in them;
+        `state`; `inliers` of `tracks` landmarks; the panoramas `depth.panoramas.lower.panorama` and `.upper.panorama`
+        (H, W) uint8. Points and disparities are those of the method `depth`.
 
         Raises OmnidError for an image of another type or size than the rig's, for a stamp that is not later than the
         previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Also
-        raises it where one of the first pairs shows that the images cannot be of this rig, unless stereo.rig_check says
+        raises it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says
         otherwise.
         """
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))
         pair = FramePair(self._pairs, stamp_ns, *images, self._skew_s(stamp_ns, upper_stamp_ns))
         self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
-        return self._odometry.process(self._stereo.process(self._dewarp.process(pair)))
+        return self._front_end.process(pair)
+
+    def depth(self, pose: OdometryUpdate) -> DensePoints:
+        """Return the dense depth of a pair that `process` has given the pose of; it is computed the first time.
+
+        `points` (N, 3) in the rig frame (m) with `variance_m2` (N,) along the ray; `disparity` (H, W) in px, NaN where
+        unknown, and `pixels` (N, 2) of the points in the lower panorama.
+        """
+        return self._front_end.dense.of(pose.depth)
 
     def _skew_s(self, stamp_ns: int, upper_stamp_ns: int | None) -> float:
         """Return the time from the lower to the upper exposure."""

@@ -32,6 +32,7 @@ class Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 130 Ctrl-C."""
     _open_closed_streams()
+    bound_image_size()
     words = list(sys.argv[1:] if argv is None else argv)
     args = _parser(words).parse_args(words)
     return _guarded(args)
@@ -41,6 +42,16 @@ def _open_closed_streams() -> None:
     """Open stdout and stderr if they were closed, else the next file would get their number and all prints."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
+
+
+def bound_image_size() -> None:
+    """Let OpenCV refuse image files that would take much memory, of any format.
+
+    OpenCV reads the variable when it is loaded, so this comes before the first import of it. The value is
+    drivers.frame.MAX_PIXELS, whose module loads OpenCV. `import omnid` leaves the environment of a program as it is:
+    there, frames are bounded by their headers (drivers/frame.py).
+    """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
 
 
 def _parser(words: Sequence[str]) -> Parser:

@@ -23,7 +23,7 @@ from typing import Any, Final, Generic, Self, TypeVar, cast
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.transport import codec
+from omnid.transport import codec, ros2
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.client_session import HERE, open_client
 from omnid.transport.decode import (
@@ -290,7 +290,7 @@ class Driver:
         self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
         self._publishers = {topic: _command_publisher(session, f"{robot}/{topic}")
                             for topic in (self._twist, self._heading, STOP, ARM)}
-        self._sent = 0
+        self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
 
     @property
     def connected(self) -> bool:
@@ -325,11 +325,15 @@ class Driver:
         return stamp_ns
 
     def send(self, topic: str, payload: bytes) -> None:
-        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program: it tells senders apart."""
+        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which tells senders apart.
+
+        The time of sending is attached: it is the stamp of a message that has none of its own.
+        """
         if topic not in self._publishers:
             self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
         publisher, self._sent = self._publishers[topic], (self._sent + 1) % _SEQUENCE
-        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent))
+        attachment = ros2.attachment(self._sent, time.time_ns(), self._gid)
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
 
 
 def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:

@@ -78,17 +78,20 @@ class LiveConfig:
     cloud_points: int = knob(50_000, "largest number of map points on the bus: the most confident ones", low=0,
                              high=10_000_000)
     shed_load: bool = knob(True, "give up the map, then half the landmarks, while the computer is too slow")
-    check_s: float = knob(5.0, "period of the check of the rig's calibration, s; 0: none", low=0,
-                          high=3600)
 
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """Refinement of the rig while `omnid run` drives; the rig's file is written by `apply` alone."""
+    """Is the rig right? Checks, and refinement; the file of the calibration, cameras.rig, is never written."""
 
-    refine: str = knob("report", "all parameters of the rig from windows of keyframes, in a process of low priority, "
-                       "told in the status with their sigmas; 'apply': also used once the robot stands, and written to "
-                       "the rig's file, beside which the calibration is kept", choices=("off", "report", "apply"))
+    check: str = knob("refuse", "if the first images contradict the rig: end with an error, warn only, or do not "
+                      "check", choices=("refuse", "warn", "off"))
+    check_s: float = knob(5.0, "time between two views that a live run compares with the rig, s; 0: none", low=0,
+                          high=3600)
+    refine: str = knob("report", "estimate all parameters of the rig from windows of keyframes, in a process of low "
+                       "priority; where they do not fit, report it and write the refined rig to refined_file; 'use': "
+                       "the next start uses that file", choices=("off", "report", "use"))
+    refined_file: str = knob("rig.refined.toml", "file of the refined rig; delete it to go back to the calibration")
     refine_keyframes: int = knob(20, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
     refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
 
@@ -133,8 +136,6 @@ class StereoConfig:
 
     min_range_m: float = knob(0.65, "distance of the nearest points from the rig's axis, m", low=0.01, high=100)
     noise_px: float = knob(0.5, "sigma of a disparity, px: sets the weight of a point in the map", low=0.01, high=10)
-    rig_check: str = knob("refuse", "if the first images contradict the rig: end with an error, warn only, or do not "
-                          "check", choices=("refuse", "warn", "off"))
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 
@@ -175,10 +176,10 @@ class MappingConfig:
     max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)
     min_frames: int = knob(6, "frames that must have observed a voxel that is written; fewer in a short run",
                            low=1, high=1000)
-    heights_m: tuple[float, float] = knob((-1.0, 1.5), "heights of obstacles in the grid on the bus, m above the base "
-                                          "at the start", low=-1000, high=1000)
-    path_poses: int = knob(100_000, "poses kept for the plan view; when full, every second one is dropped", low=100,
-                           high=10_000_000)
+    heights_m: tuple[float, float] = knob((-1.0, 1.5), "heights of obstacles in the keyframes' range scans and in the "
+                                          "grid, m above the base", low=-1000, high=1000)
+    path_poses: int = knob(10_000, "vertices of the path in the plan view; when full, every second one is dropped",
+                           low=100, high=10_000_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,6 +283,8 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType({
     "odometry.limits.min_share": "odometry.limits.min_inlier_ratio",
     "odometry.limits.sure_inliers": "odometry.limits.good_inliers",
     "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
+    "stereo.rig_check": "rig.check",
+    "live.check_s": "rig.check_s",
 })
 
 

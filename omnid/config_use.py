@@ -26,6 +26,7 @@ USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
     "record": "run",
     "record.cloud_points": "",
     "rig": "run",
+    "rig.check": "",
     "service": "run",
 })
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -16,11 +15,11 @@ from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light
-from omnid.engine.one_at_a_time import OneAtATime
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -39,7 +38,7 @@ class FramePair:
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Panoramas:
     """Both images on the cylinder about the line through the viewpoints: epipolar lines are columns."""
 
@@ -48,10 +47,9 @@ class Panoramas:
     lower: PaddedPanorama
     upper: PaddedPanorama
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
-    times: ExposureTimes | None = None  # of the pixels; None: all are exposed at the stamp
+    times: PixelTimes = AT_ONCE
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
-    rig_version: int = 0  # counts the refined rigs that this run has begun to use before this pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,79 +62,13 @@ class DensePoints:
     variance_m2: Array  # (N,) along the ray, where it is largest
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class StereoDepth:
-    """Panoramas of a pair, and their dense depth, which is computed when it is first read.
+    """Evidence of the depth of a pair: `stages.dense_depths` computes the dense depth from it."""
 
-    Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map.
-    Any thread may read; while one computes it, others that read it wait for the result.
-    rig_fits is False if the images contradict the rig, so that no result of them is better than degraded.
-
-    Where the images were exposed at several times, the depth depends on the motion in between, which the odometry
-    finds: it settles the depth before it passes it on.
-    """
-
-    __slots__ = ("_compute", "_dense", "_exposure", "_one", "_settled", "panoramas", "rig_fits", "seq", "stamp_ns")
-
-    def __init__(self, panoramas: Panoramas, compute: Callable[[Panoramas, Exposure | None], DensePoints], *,
-                 rig_fits: bool = True) -> None:
-        self.seq, self.stamp_ns, self.panoramas = panoramas.seq, panoramas.stamp_ns, panoramas
-        self.rig_fits = rig_fits
-        self._compute = compute
-        self._dense: DensePoints | None = None
-        self._exposure: Exposure | None = None
-        self._settled = False
-        self._one = OneAtATime()
-
-    def dense(self) -> DensePoints:
-        """Return the dense depth; compute it the first time."""
-        with self._one:
-            if self._dense is None:
-                self._dense = self._compute(self.panoramas, self._exposure)
-            return self._dense
-
-    @property
-    def exposure(self) -> Exposure | None:
-        """The motion during the exposures that the depth is corrected for."""
-        return self._exposure
-
-    def settle(self, exposure: Exposure | None, *, again: bool = False) -> None:
-        """Set the motion during the exposures, unless the depth was already computed for one.
-
-        again: then it is computed again.
-        """
-        if again and exposure is not self._exposure:
-            self._dense = None
-        if self._dense is None:
-            self._exposure = exposure
-        self._settled = True
-
-    def disparity_at(self, exposure: Exposure | None) -> NDArray[np.float32]:
-        """Return the disparities for a motion during the exposures, and keep them if the depth is not settled."""
-        if self._settled and exposure is not None and exposure is not self._exposure:
-            return self._compute(self.panoramas, exposure).disparity
-        if not self._settled and exposure is not self._exposure:
-            self._exposure, self._dense = exposure, None
-        return self.disparity
-
-    @property
-    def disparity(self) -> NDArray[np.float32]:
-        """Disparities (H, W) [px] > 0 of the lower panorama, NaN: unknown."""
-        return self.dense().disparity
-
-    @property
-    def pixels(self) -> Array:
-        """Column and row (N, 2) of the matched pixels."""
-        return self.dense().pixels
-
-    @property
-    def points(self) -> Array:
-        """Points (N, 3) [m] in the rig frame."""
-        return self.dense().points
-
-    @property
-    def variance_m2(self) -> Array:
-        """Variances (N,) of the points along the ray, where they are largest."""
-        return self.dense().variance_m2
+    panoramas: Panoramas
+    # The motion during the exposures, for which the depth is corrected; None: not known, or all pixels at once.
+    exposure: Exposure | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +78,7 @@ class OdometryUpdate:
     seq: int
     stamp_ns: int
     T_odom_rig: Array  # (4, 4)
-    covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
+    covariance: Array  # (6, 6) of the pose, [t; r] in the axes of the rig, m^2 and rad^2
     velocity: Array  # (6,) m/s, rad/s in the rig frame
     velocity_covariance: Array  # (6, 6)
     state: TrackingState
@@ -168,7 +100,7 @@ class PlaceUpdate:
     stamp_ns: int
     T_map_odom: Array  # (4, 4) map and odom are rig frames, both that of the first pair at the start
     T_map_rig: Array  # (4, 4)
-    covariance: Array  # (6, 6) of T_map_rig, x y z rx ry rz in map axes, m^2 and rad^2
+    covariance: Array  # (6, 6) of T_map_rig, [t; r] in the axes of the rig, m^2 and rad^2
     state: MapState
     keyframe: int = -1  # of the map, to which the pose belongs; -1: none
     T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry

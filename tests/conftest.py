@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,15 +10,21 @@ from pathlib import Path
 import pytest
 
 from omnid.engine.kernel_cache import prepare_kernels
+from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
 PAIRS = 24
+COURSE_PAIRS = 22  # before the turn
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kernels() -> None:
-    """Compile the functions of omnid once, or read them from the cache folder, before the first test."""
-    prepare_kernels(lambda level, line: None)
+def kernels(request: pytest.FixtureRequest) -> None:
+    """Compile the functions of omnid once, or read them from the cache folder, before the first test.
+
+    The tests beside this file read source code only.
+    """
+    if any(item.path.parent != Path(__file__).parent for item in request.session.items):
+        prepare_kernels(lambda level, line: None)
 
 
 @pytest.fixture(scope="session")
@@ -26,6 +33,21 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     run = build("two_walls", seed=3, size=256, pairs=PAIRS)
     write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def course(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene without its turn of 94 degrees within 0.1 s, for live runs: a base could follow it to and fro.
+
+    At such a turn the controller voids the command, so the wheels slow down until the next one.
+    """
+    folder = tmp_path_factory.mktemp("course")
+    taken = images(scene / "log.mcap")
+    save(folder / "log.mcap", (image for image in taken if image.pair < COURSE_PAIRS))
+    shutil.copy(scene / "rig.toml", folder / "rig.toml")
+    rows = (scene / "truth.txt").read_text().splitlines(keepends=True)
+    (folder / "truth.txt").write_text("".join(rows[:COURSE_PAIRS]))
     return folder
 
 

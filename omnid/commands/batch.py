@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.batch.jobs import find_logs, jobs
     from omnid.batch.tables import write_tables
     from omnid.errors import OmnidError
+    from omnid.plain_text import plain
 
     if not 1 <= args.jobs <= MAX_JOBS or not args.timeout_s > 0:
         raise OmnidError(f"batch: --jobs {args.jobs} --timeout-s {args.timeout_s:g}: expected 1 to {MAX_JOBS} jobs and "
@@ -78,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         written = write_tables(list(results.values()), args.out)
     counts = Counter(result.status for result in results.values())
     print(", ".join(f"{count} {status}" for status, count in counts.most_common()))
-    print("\n".join(map(str, written)))
+    print("\n".join(plain(str(path)) for path in written))
     return int(set(counts) != {OK})
 
 

@@ -79,10 +79,5 @@ def options_of(args: argparse.Namespace) -> list[str]:
     return [f"{float(word):g}" if word.replace(".", "", 1).isdigit() else word for word in words]
 
 
-def length_option(args: argparse.Namespace) -> tuple[str, float]:
-    """Return the option that scales the board, and its value [mm]."""
-    return ("--tag-mm", args.tag_mm) if args.board == "aprilgrid" else ("--square-mm", args.square_mm)
-
-
 def _options(names: tuple[str, ...] | list[str]) -> str:
     return ", ".join("--" + name.replace("_", "-") for name in names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -12,20 +13,22 @@ from calib.fit.rig_drift import apply_drift
 from calib.masks.rim_check import RimShift
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.image_pairs import SIDES
-from omnid.calibration.log_rig_check import RigCheckResult, check_rig, open_log, read_rig_pairs
-from omnid.calibration.moving_rig_check import moving_rig_finding
+from omnid.calibration.image_pairs import SIDES, open_log
+from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_finding, read_rig_pairs
 from omnid.config import Config
-from omnid.core.rig.rig_check import DRIFTED_PX, MIN_MATCHES, RigFinding
+from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding
+from omnid.core.rig.rig_state import RigState
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.runs.log_rig import attached_rig
 from omnid.sinks.files import check_outputs
 
-REFINEMENTS = 3
-MAX_SKEW_S = 3e-3  # median of the pairs: more is no scatter of stamps
-# No mirror moves this far to the side [deg of the baseline]; a camera's centre that is some pixels off has this effect.
-NO_MIRROR_DEG = 5.0
+# Most corrections of the upper camera's pose: each finds more points than the one before, as more of them match.
+REFINEMENTS: Final = 3
+# Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
+MAX_SKEW_S: Final = 3e-3
+# No mirror moves this far to the side, deg of the baseline; a camera's centre that is some pixels off has this effect.
+NO_MIRROR_DEG: Final = 5.0
 RECALIBRATE = ("the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board")
 NOT_OBSERVABLE = ("not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
                   "rig's pose on the robot")
@@ -45,7 +48,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the rig; return 0 if it is good, 1 if it has drifted or is broken."""
+    """Check the rig; return 0 if it fits, 1 if it has drifted or is broken."""
     if args.refine != (args.output is not None):
         raise OmnidError("calibrate check: --refine and -o go together: -o names the rig.toml that is written")
     if args.output:
@@ -71,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{skewed}: the motion in between, as the odometry sees it, is allowed for")
     if args.refine:
         _refine(rig, pairs, found, args.output)
-    return 0 if found.good else 1
+    return 0 if found.state is RigState.FITS else 1
 
 
 def _skewed(pairs: list[FramePair]) -> str:
@@ -83,7 +86,7 @@ def _skewed(pairs: list[FramePair]) -> str:
 
 
 def _require_matches(finding: RigFinding, pairs: int) -> None:
-    if finding.condition == "unknown":
+    if finding.state is RigState.UNCHECKED:
         raise OmnidError(f"calibrate check: expected at least {MIN_MATCHES} points in both panoramas, found "
                          f"{finding.matches} of {finding.tried} in {pairs} pairs; use a log with more texture")
 
@@ -91,7 +94,7 @@ def _require_matches(finding: RigFinding, pairs: int) -> None:
 def report(found: RigCheckResult, pairs: int) -> str:
     """Return the result as lines of text, the condition first."""
     finding = found.finding
-    lines = [f"{_condition(found)}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
+    lines = [f"{found.state}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
              f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
              "the left of forward:"]
     lines.append("  " + "  ".join(f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth
@@ -101,10 +104,6 @@ def report(found: RigCheckResult, pairs: int) -> str:
         lines += [RECALIBRATE] * _intrinsics_changed(finding)
     lines += [_rim(name, rim) for name, rim in zip(SIDES, found.rims, strict=True)]
     return "\n".join(lines)
-
-
-def _condition(found: RigCheckResult) -> str:
-    return "drifted" if found.finding.condition == "good" and not found.good else found.finding.condition
 
 
 def _drift(finding: RigFinding) -> list[str]:
@@ -150,7 +149,7 @@ def _refine(rig: Rig, pairs: list[FramePair], found: RigCheckResult, path: Path)
             break
     write_rig(path, rig)
     print(f"{path}: {found.finding.summary}\n{NOT_OBSERVABLE}")
-    if recalibrate or found.finding.condition != "good":
+    if recalibrate or found.finding.state is not RigState.FITS:
         print(RECALIBRATE)
 
 

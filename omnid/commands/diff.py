@@ -35,7 +35,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Print the comparison; return 0 where the runs agree, 1 where they differ."""
     from omnid.engine.logging_setup import log_unlimited
-    from omnid.monitor.robot_state import plain
+    from omnid.plain_text import plain
     from omnid.recordings.comparison import RunComparison, Tolerance
     from omnid.recordings.run_series import read_run_series
 

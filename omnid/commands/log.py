@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from drivers.logs.mcap_recovery import Recovery
 
 MAX_COLUMN = 60  # characters of a topic or a type
+MAX_LINE = 5000  # characters of a line, which may contain the path of a file
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -128,8 +129,10 @@ def _table(found: LogInfo, duration_s: float) -> Iterator[str]:
 
 
 def _shown(text: str) -> str:
-    """Return the text with non-printable characters escaped."""
-    return text if text.isprintable() else ascii(text)
+    """Return a name or a line as it may be printed: the log may contain anything."""
+    from omnid.plain_text import plain
+
+    return plain(text, MAX_LINE)
 
 
 def _bytes(size: int) -> str:

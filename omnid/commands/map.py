@@ -158,10 +158,10 @@ def run_save(args: argparse.Namespace) -> int:
 
 def run_merge(args: argparse.Namespace) -> int:
     """Join the maps, each to those before."""
-    from omnid.core.odometry.pose_estimation import StereoModel
     from omnid.core.places.merge import merge
     from omnid.core.places.place_rig import seen_by
     from omnid.core.places.place_views import summary
+    from omnid.core.types.stereo_model import StereoModel
     from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs

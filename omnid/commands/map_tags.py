@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from omnid.core.places.tags import TagEstimate
     from omnid.engine.telemetry import Telemetry
     from omnid.sinks.tag_collector import TagCollector
-    from omnid.stages.geometry import Geometry
+    from omnid.stages.front_end import FrontEnd
 
 # Tags by id, the poses of those that were found, and how many views were refused.
 Found: TypeAlias = "tuple[dict[int, MapTag], dict[int, TagEstimate], int]"
@@ -114,8 +114,8 @@ def _of_log(args: argparse.Namespace) -> Found:
     config = load_config(args.config, [*args.overrides, *map_settings(args)])
     collector: Slot[TagCollector] = Slot()
 
-    def observer(geometry: Geometry, _: Telemetry) -> TagCollector:
-        collector.put(TagCollector(geometry, {id: tag.size_m for id, tag in tags.items()}))
+    def observer(front_end: FrontEnd, _: Telemetry) -> TagCollector:
+        collector.put(TagCollector(front_end.geometry, {id: tag.size_m for id, tag in tags.items()}))
         return cast("TagCollector", collector.get())
 
     result = run_log(args.source, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the page."""
     from calib.rig_file import write_file
     from omnid.formats.tum import read_tum
-    from omnid.monitor.robot_state import plain
+    from omnid.plain_text import plain
     from omnid.report.report import report_html
     from omnid.report.report_data import collect_report_data
     from omnid.sinks.files import check_outputs, on_stdout

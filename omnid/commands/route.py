@@ -123,7 +123,7 @@ def run_show(args: argparse.Namespace) -> int:
     """Print a route."""
     import numpy as np
 
-    from omnid.core.places.planar import transform
+    from calib.se2_arrays import transform
     from omnid.sinks.files import check_outputs, write_trajectory
 
     folder = _folder(args)

@@ -18,7 +18,7 @@ IMU_BAUD = 115_200  # at which the stamps of the simulated gyro are right
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
-    from omnid.runs.live import OpenCamera
+    from omnid.runs.live_cameras import OpenCamera
     from omnid.simulation.realtime import RealtimeRobot
     from omnid.simulation.robot import SimulatedRobot
 

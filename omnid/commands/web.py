@@ -24,6 +24,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "default %(default)s, this machine only; 0.0.0.0:8447 for its network")
     parser.add_argument("--token-file", type=Path, metavar="FILE", help="the token; the file is made if it is missing; "
                         "default: a new token at each start")
+    parser.add_argument("--stop-token-file", type=Path, metavar="FILE", help="a second token, which may see and stop, "
+                        "not arm; the file is made if it is missing; default: none")
     parser.add_argument("--host", action="append", default=[], metavar="NAME", help="a further name of this machine, "
                         "in addresses of browsers; without --listen on the network: localhost only")
     parser.add_argument("--recordings", type=Path, metavar="DIR", help="default: record.folder of the settings")
@@ -48,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     config = config_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
     folder = args.recordings or Path(config.record.folder)
-    serve(config.bus, WebSettings(args.listen, args.token_file, tuple(args.host), folder, tls, args.all))
+    serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), folder, tls,
+                                  args.all))
     return 0
 
 

@@ -173,7 +173,7 @@ class Controller:
                 self._report(str(error))
             self.state.failed = True
             self.state.errors += 1
-            self._law.motion = STOP  # its own watchdog stops a motor controller that receives nothing
+            self._law.stand()  # its own watchdog stops a motor controller that receives nothing
             return None
         if self.state.failed:
             self._report("the motor controller is back")
@@ -186,7 +186,7 @@ class Controller:
         self.state.expiries += status.watchdog_expired
         self.state.fault, self.state.battery_v = status.fault, status.battery_v
         if status.watchdog_expired:  # it stands: the command was not obeyed
-            self._law.motion = STOP
+            self._law.stand()
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
         # One that holds a heading decides about its yaw rate itself.
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -21,6 +19,7 @@ from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.flow import nothing
+from omnid.engine.python_program import python, python_environment
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 
@@ -154,7 +153,6 @@ class ControllerLink:
 
 
 def _started(descriptor: int) -> subprocess.Popen[bytes]:
-    """Start the process: with this program's modules, not those of the current folder, and without Ctrl-C."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.Popen([sys.executable, "-P", "-m", PROCESS, str(descriptor)], pass_fds=(descriptor,),
-                            stdin=subprocess.DEVNULL, env=environment, start_new_session=True)
+    """Start the process in a session of its own, which Ctrl-C does not end."""
+    return subprocess.Popen(python("-m", PROCESS, str(descriptor)), pass_fds=(descriptor,), stdin=subprocess.DEVNULL,
+                            env=python_environment(), start_new_session=True)

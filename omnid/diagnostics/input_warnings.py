@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from omnid.config import PairConfig
+from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.stages.repeated_images import FROZEN_IMAGES
-from omnid.stages.rig_gate import RigGate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -18,7 +18,7 @@ REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise
 
 
 def input_warnings(
-    pairing: Synchronise, rig_gate: RigGate, statistics: RunStatistics, config: PairConfig
+    pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: PairConfig
 ) -> Iterator[str]:
     """Return one line for each problem of the input."""
     counts = pairing.counts
@@ -34,8 +34,8 @@ def input_warnings(
         if images.longest >= FROZEN_IMAGES:
             yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
                    f"{images.longest} in a row; {REPEATED[config.repeated_images]}")
-    if rig_gate.warning:
-        yield rig_gate.warning
+    if rig.warning:
+        yield rig.warning
     if statistics.dark > statistics.poses * DARK_SHARE:
         yield (f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
                "contrast; more light, a longer exposure (cameras.exposure_us) or less gain")

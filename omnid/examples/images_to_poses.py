@@ -16,4 +16,4 @@ for stamp_ns in sorted(int(path.stem) for path in (folder / "lower").glob("*.png
     upper = cv2.imread(str(folder / "upper" / f"{stamp_ns}.png"), cv2.IMREAD_GRAYSCALE)
     pose = odometry.process(stamp_ns, lower, upper)
     x_m, y_m, _ = pose.T_odom_rig[:3, 3]
-    print(f"{stamp_ns} {pose.state} ({x_m:.3f}, {y_m:.3f}) m, {len(pose.depth.points)} points")
+    print(f"{stamp_ns} {pose.state} ({x_m:.3f}, {y_m:.3f}) m, {len(odometry.depth(pose).points)} points")

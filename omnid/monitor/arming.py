@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from omnid.client import Diagnostics, Driver, Robot, Subscription
+from omnid.client import HERE, Diagnostics, Driver, Robot, Subscription
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
+from omnid.transport.commands import SAME_NAME
+from omnid.transport.status_names import BUS, DISARMED_BY_STOP, SAME_NAME_COUNT, WHEELS, Key
+from omnid.transport.stop_datagram import STOPPED, StopSender
 
 CONNECT_S: Final = 2.0
 ANSWER_S: Final = 10.0  # longer than the usual live.status_s
+_DATAGRAM_S: Final = 0.15  # after which a stop goes over the bus, too: the robot is behind a router, or far away
 _REPEAT_S: Final = 0.2  # between two stops
 _POLL_S: Final = 0.02
 
@@ -27,6 +30,8 @@ def arm(bus: BusConfig, answer_s: float = ANSWER_S) -> str:
         deadline_s = time.monotonic() + answer_s
         while time.monotonic() < deadline_s:
             report = statuses.wait(deadline_s - time.monotonic())
+            if report is not None and report.value(BUS, SAME_NAME_COUNT) not in ("", "0"):
+                return f"{SAME_NAME}; change bus.robot of one of them"
             if report is not None and answered_ns(report.value(WHEELS, Key.ARM_STAMP_NS)) >= stamp_ns:
                 return report.value(WHEELS, Key.ARM_REFUSAL)
     raise OmnidError(f"{bus.robot} has not answered within {answer_s:g} s: either this program must not command it "
@@ -37,14 +42,19 @@ def arm(bus: BusConfig, answer_s: float = ANSWER_S) -> str:
 def stop(bus: BusConfig, answer_s: float = ANSWER_S) -> bool:
     """Stop the robot, and go on until its status confirms it; False where it has not in time.
 
-    Raise OmnidError where it cannot be reached.
+    It goes as a datagram first, which needs no place among the sessions of the bus, and over the bus where that is not
+    answered. Raise OmnidError where the robot cannot be reached.
     """
-    with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
-        driver, deadline_s = driver_of(robot), time.monotonic() + answer_s
-        while time.monotonic() < deadline_s:
-            driver.stop()
-            if _is_stopped(statuses):
-                return True
+    deadline_s = time.monotonic() + answer_s
+    with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
+        if datagrams.ask(_DATAGRAM_S):
+            return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
+        with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
+            driver = driver_of(robot)
+            while time.monotonic() < deadline_s:
+                driver.stop()
+                if _is_stopped(statuses) or datagrams.ask(0.0) == STOPPED:
+                    return True
     return False
 
 

@@ -12,8 +12,9 @@ from typing import IO, Final
 
 from omnid.client import Fleet
 from omnid.errors import OmnidError
-from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState, plain
+from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import CLEAR, fitted
+from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.session import Unreachable

@@ -11,12 +11,12 @@ from typing import Final, NamedTuple
 
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
+from omnid.plain_text import plain
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode_pose
 
 NO_POSE_S: Final = 2.0  # without a pose, from which the state and the rate of the last poses are no longer shown
 _INBOX_DEPTH: Final = 2000
-_MAX_LINE: Final = 400  # characters
 _MAX_STATUSES: Final = 100
 _RATE_WINDOW: Final = 100  # poses
 _MAX_AGE_NS: Final = 3_600 * 10**9  # a message that is older, or from the future, was stamped by another clock
@@ -119,8 +119,3 @@ class RobotState:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
         return plain(self.pose.state)
-
-
-def plain(text: str) -> str:
-    """Return a text from the network without control characters and of limited length, for a terminal."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_MAX_LINE]

@@ -10,7 +10,8 @@ from typing import IO, Final
 
 import numpy as np
 
-from omnid.monitor.robot_state import RobotState, plain
+from omnid.monitor.robot_state import RobotState
+from omnid.plain_text import plain
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Pose
 from omnid.transport.status_names import STAGE_PREFIX, short_name

@@ -19,7 +19,7 @@ from omnid.client import Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError
 from omnid.monitor.arming import driver_of
-from omnid.monitor.robot_state import plain
+from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.status_names import WHEELS, Key
 

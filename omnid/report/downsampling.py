@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
+from omnid.core.mapping.thinned_path import ThinnedPath
+
 BINS: Final = 500
 LARGEST: Final = 1e9  # values beyond are invalid
 _FINEST_S: Final = 1e-3
@@ -72,36 +74,14 @@ class Corner(NamedTuple):
     rank: int  # worst state since the previous vertex
 
 
-class PathTrace:
-    """A path in at most 4000 vertices, one for each step of a length that doubles whenever there are too many."""
+def path_trace() -> ThinnedPath[Corner]:
+    """Return an empty path of at most 4000 vertices; each has the worst state since the one before it."""
+    return ThinnedPath(_CORNERS, _FINEST_M, _is_step, _with_worse_rank)
 
-    def __init__(self) -> None:
-        self._step_m = _FINEST_M
-        self._corners: list[Corner] = []
-        self._newest: Corner | None = None
 
-    def add(self, corner: Corner) -> None:
-        """Add the next position."""
-        if self._newest is not None and self._newest is not self._last:
-            corner = corner._replace(rank=max(corner.rank, self._newest.rank))
-        self._newest = corner
-        if self._last is None or math.dist(corner[:2], self._last[:2]) >= self._step_m:
-            self._corners.append(corner)
-        while len(self._corners) > _CORNERS:
-            self._coarsen()
+def _is_step(last: Corner, new: Corner, step_m: float) -> bool:
+    return math.dist(last[:2], new[:2]) >= step_m
 
-    @property
-    def corners(self) -> list[Corner]:
-        """The vertices and the end of the path."""
-        unfinished = self._newest is not None and self._newest is not self._last
-        return [*self._corners, *([self._newest] if unfinished and self._newest else [])]
 
-    @property
-    def _last(self) -> Corner | None:
-        return self._corners[-1] if self._corners else None
-
-    def _coarsen(self) -> None:
-        corners, self._corners, self._newest = self._corners, [], None
-        self._step_m *= 2
-        for corner in corners:
-            self.add(corner)
+def _with_worse_rank(dropped: Corner, new: Corner) -> Corner:
+    return new._replace(rank=max(dropped.rank, new.rank))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.report.downsampling import Corner, Downsampled, PathTrace
+from omnid.report.downsampling import Corner, Downsampled, path_trace
 from omnid.transport.codec import OdometryRecord
 from omnid.transport.decode import PoseInMap
 
@@ -26,7 +26,7 @@ class MapPoseHistory:
 
     def __init__(self) -> None:
         self._odometry: OrderedDict[int, Array] = OrderedDict()
-        self.path = PathTrace()
+        self.path = path_trace()
         self.moved_m, self.turned_deg = Downsampled(), Downsampled()
         self.sigma_m = Downsampled()
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
-from omnid.report.downsampling import Corner, Downsampled, PathTrace
+from omnid.report.downsampling import Corner, Downsampled, path_trace
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import OdometryRecord
@@ -41,7 +41,7 @@ class PoseHistory:
         self.start_ns = 0  # stamp of the first pose
         self.end_s = 0.0
         self.first = np.eye(4)
-        self.path = PathTrace()
+        self.path = path_trace()
         self.series = {name: Downsampled() for name in _SERIES}
         self.gaps: list[tuple[float, float]] = []
         self.states: Counter[int] = Counter()

@@ -109,7 +109,7 @@ def _states_missing(data: ReportData) -> list[str]:
 
 
 def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
-    corners, cloud = data.poses.path.corners, data.cloud
+    corners, cloud = data.poses.path.with_end(), data.cloud
     drawn = cloud is not None and cloud.frame == data.frames[0]
     points = cloud.points if cloud and drawn else np.empty((0, 3), np.float32)
     finite = np.isfinite(points).all(axis=1)

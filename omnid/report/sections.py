@@ -130,13 +130,13 @@ def path_in_map(data: ReportData) -> list[tuple[float, float]]:
     history = data.map_poses
     if max((moved_m for _, moved_m in history.moved_m.points()), default=0.0) < _SAME_PATH_M:
         return []
-    return [(corner.x_m, corner.y_m) for corner in history.path.corners]
+    return [(corner.x_m, corner.y_m) for corner in history.path.with_end()]
 
 
 def in_map(data: ReportData, clock: Clock) -> list[str]:
     """Return the section with the map of places: its sizes, and the correction of odometry by it."""
     history, statuses = data.map_poses, data.statuses
-    if not history.path.corners:
+    if not history.path.vertices:
         return []
     values = statuses.values(PLACES)
     rows = [(escape(name.replace("_", " ")), escape(value)) for name, value in values.items()]

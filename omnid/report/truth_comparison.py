@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.report.downsampling import Corner, Downsampled, PathTrace, Point
+from omnid.report.downsampling import Corner, Downsampled, Point, path_trace
 from omnid.report.poses import PoseHistory
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ def compare_with_truth(poses: PoseHistory, T_base_rig: Array, truth: Trajectory)
     of_estimate, of_truth = _associated(estimate.stamps_ns, truth.stamps_ns)
     T_true = estimate.T[of_estimate[0]] @ se3.inverse(truth.T[of_truth[0]]) @ truth.T[of_truth]
     T_estimate = estimate.T[of_estimate]
-    position_m, heading_rad, trace = Downsampled(), Downsampled(), PathTrace()
+    position_m, heading_rad, trace = Downsampled(), Downsampled(), path_trace()
     errors_m = np.linalg.norm(T_estimate[:, :3, 3] - T_true[:, :3, 3], axis=1)
     errors_rad = se3.yaw(se3.inverse(T_true) @ T_estimate)
     base_xy = (T_base_rig @ T_true @ T_rig_base)[:, :2, 3]
@@ -47,7 +47,7 @@ def compare_with_truth(poses: PoseHistory, T_base_rig: Array, truth: Trajectory)
         position_m.add(t_s, float(error_m))
         heading_rad.add(t_s, float(error_rad))
         trace.add(Corner(float(x_m), float(y_m), t_s, 0))
-    return TruthComparison(metrics, [(c.x_m, c.y_m) for c in trace.corners], position_m, heading_rad)
+    return TruthComparison(metrics, [(c.x_m, c.y_m) for c in trace.with_end()], position_m, heading_rad)
 
 
 def _associated(stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

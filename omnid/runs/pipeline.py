@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -14,8 +13,8 @@ from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
-from omnid.engine.flow import Chain
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
+from omnid.load_level import Load, full_load
 from omnid.messages import (
     FramePair,
     GridUpdate,
@@ -28,18 +27,23 @@ from omnid.messages import (
 from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import Geometry, GeometryVersions
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import Geometry
 from omnid.stages.grid import MapGrid
 from omnid.stages.lockstep_drive import LockstepDrive
-from omnid.stages.mapping import Mapping, no_wait
+from omnid.stages.mapping import Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
-from omnid.stages.odometry import OdometryStage, all_features
 from omnid.stages.places import Places
-from omnid.stages.rig_gate import RigGate, never
 from omnid.stages.routes import Routes, RouteStore
-from omnid.stages.stereo import Stereo
+
+
+class RecordingSink(NamedTuple):
+    """The recorder of a run, which takes all messages that leave the run."""
+
+    sink: Sink[Any]
+    frames: tuple[Stream[Frame], ...] = ()  # recorded too
+    depth: int | None = None  # messages of each kind that may wait for the recorder; None: as for other sinks
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,23 +54,26 @@ class Sinks:
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
     rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
-    known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
-    localize_only: bool = False  # it stays as it is
-    recorder: Sink[Any] | None = None  # of all messages that leave the run, and of recorded_frames
     bus: Sink[Outgoing] | None = None
-    live_drive: LiveDrive | None = None  # its commands are those that are published and recorded
-    replay_drive: ReplayDrive | None = None  # beside the lock-step commands, which are published and recorded
-    rig_gate: RigGate | None = None  # that has seen pairs of the log already; None: the run's own
-    rig_monitor: Sink[OdometryUpdate] | None = None
-    rig_broken: Callable[[], bool] = never  # what the rig monitor has found
+    recording: RecordingSink | None = None
+
+    @property
+    def take_all(self) -> bool:
+        """True if a sink takes every message that leaves the run."""
+        return self.bus is not None or self.recording is not None
+
+
+@dataclass(frozen=True, slots=True)
+class RunParts:
+    """The differences between one run and another: its map of places, its wheels, its rates."""
+
+    known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
+    localize_only: bool = False  # the known map stays as it is
+    # LiveDrive: its commands are published and recorded. ReplayDrive: the lock-step commands are.
+    drive: LiveDrive | ReplayDrive | None = None
     navigation: NavigationParts | None = None
-    versions: GeometryVersions | None = None  # of a run that refines its rig; None: the rig stays
-    features: Callable[[], float] = all_features  # share of the landmarks of a keyframe, under overload
-    map_period_s: Callable[[], float] = no_wait  # least time between two pairs that enter the map, under overload
-    ring_period_s: Callable[[], float] = no_wait  # least time between two obstacle rings, under overload
+    load: Load = full_load
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
-    recorded_frames: tuple[Stream[Frame], ...] = ()
-    record_depth: int | None = None  # messages of each kind that may wait for the recorder
 
 
 class RequestSource(Protocol):
@@ -98,85 +105,80 @@ def wheel_state(state: ControllerState) -> WheelState:
 class WiredStages(NamedTuple):
     """The stages that are asked for counts and warnings at the end of a run."""
 
-    rig_gate: RigGate
-    odometry: OdometryStage
+    front_end: FrontEnd
     mapping: Mapping | None
     places: Places | None
 
 
-def wire(graph: Graph, pairs: Stream[FramePair], geometry: Geometry, config: Config, sinks: Sinks) -> WiredStages:
+def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Config, sinks: Sinks,
+         parts: RunParts | None = None) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
-    rig_gate = sinks.rig_gate or RigGate(geometry.cylinder, config.stereo.rig_check, sinks.rig_broken)
-    versions = sinks.versions or GeometryVersions(geometry)
-    stereo = Stereo(versions, config.stereo_settings(), rig_gate)
-    panoramas = graph.stage("dewarp", Dewarp(versions, config.panorama, config.camera), pairs, direct=True)
-    odometry_stage = OdometryStage(versions, config.odometry, sinks.features)
-    poses = Chain(stereo, odometry_stage)
-    odometry = graph.stage("odometry", poses, panoramas)
-    if sinks.rig_monitor:
-        graph.sink("rig", sinks.rig_monitor, odometry, policy=NEWEST, depth=1)
+    geometry, parts = front_end.geometry, parts or RunParts()
+    panoramas = graph.stage("dewarp", front_end.dewarp, pairs, direct=True)
+    odometry = graph.stage("odometry", front_end.poses, panoramas)
     outgoing: dict[str, Stream[Outgoing]] = {
-        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, sinks)}
-    mapping, maps = _mapping(graph, odometry, config, sinks)
-    places, in_map = _places(graph, odometry, geometry, config, sinks)
-    grids = _grids(graph, in_map, geometry, config, sinks)
-    rings = _rings(graph, odometry, geometry, config, sinks)
-    updates = _navigation(graph, geometry, config, sinks.navigation, places,
+        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, parts.drive)}
+    mapping, maps = _mapping(graph, odometry, front_end, config, sinks, parts)
+    places, in_map = _places(graph, odometry, front_end, config, sinks, parts)
+    grids = _grids(graph, in_map, geometry, config, parts) if sinks.take_all else None
+    rings = _rings(graph, odometry, front_end, config, sinks, parts)
+    updates = _navigation(graph, geometry, config, parts.navigation, places,
                           [odometry, *(stream for stream in (in_map, rings) if stream)])
     named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
     outgoing.update({name: stream for name, stream in named.items() if stream})
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
-    if sinks.recorder:
-        graph.sink("record", sinks.recorder, *sinks.recorded_frames, *outgoing.values(), depth=sinks.record_depth)
+    if sinks.recording:
+        recorder, frames, depth = sinks.recording
+        graph.sink("record", recorder, *frames, *outgoing.values(), depth=depth)
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(rig_gate, odometry_stage, mapping, places)
+    return WiredStages(front_end, mapping, places)
 
 
-def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], config: Config, sinks: Sinks
-             ) -> tuple[Mapping | None, Stream[MapUpdate] | None]:
+def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
+             parts: RunParts) -> tuple[Mapping | None, Stream[MapUpdate] | None]:
     """Join the map; None where no sink takes it."""
-    if not (sinks.maps or sinks.recorder or sinks.bus):
+    if not (sinks.maps or sinks.take_all):
         return None, None
-    mapping = Mapping(config.mapping, sinks.map_every_s, sinks.map_period_s)
+    mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s, parts.load)
     maps = graph.stage("mapping", mapping, odometry)
     for name, sink in sinks.maps.items():
         graph.sink(name, sink, maps)
     return mapping, maps
 
 
-def _places(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
-            ) -> tuple[Places | None, Stream[PlaceUpdate] | None]:
+def _places(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
+            parts: RunParts) -> tuple[Places | None, Stream[PlaceUpdate] | None]:
     """Join the places; None where they are not consumed."""
-    is_known = sinks.known_places is not None
-    if not config.places.enabled or not (sinks.places or sinks.recorder or sinks.bus or sinks.navigation or is_known):
+    is_consumed = sinks.places or sinks.take_all or parts.navigation or parts.known_places is not None
+    if not config.places.enabled or not is_consumed:
         return None, None
-    places = Places(geometry, config, sinks.known_places, localize_only=sinks.localize_only,
-                    is_overloaded=lambda: sinks.map_period_s() == math.inf)
+    places = Places(front_end.geometry, config, front_end.dense, parts.known_places, localize_only=parts.localize_only,
+                    load=parts.load)
     in_map = graph.stage("places", places, odometry)
     for name, sink in sinks.places.items():
         graph.sink(name, sink, in_map)
     return places, in_map
 
 
-def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry, config: Config, sinks: Sinks
+def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry, config: Config, parts: RunParts
            ) -> Stream[GridUpdate] | None:
-    """Join the occupancy grid of the places; None where it is not consumed."""
-    if in_map is None or not (sinks.recorder or sinks.bus):
+    """Join the occupancy grid of the places; None without places."""
+    if in_map is None:
         return None
     T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
-    return graph.stage("grid", MapGrid(config.mapping.voxel_m, T_base_rect, sinks.map_every_s, sinks.map_period_s),
-                       in_map)
+    return graph.stage("grid", MapGrid(config.mapping.voxel_m, T_base_rect, parts.map_every_s, parts.load), in_map)
 
 
-def _rings(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
-           ) -> Stream[ObstacleRing] | None:
+def _rings(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
+           parts: RunParts) -> Stream[ObstacleRing] | None:
     """Join the obstacle ring; None where it is not consumed."""
-    if not config.obstacles.enabled or not (sinks.rings or sinks.recorder or sinks.bus or sinks.navigation):
+    if not config.obstacles.enabled or not (sinks.rings or sinks.take_all or parts.navigation):
         return None
-    rings = graph.stage("obstacles", Obstacles(geometry, config.obstacles, sinks.ring_period_s), odometry)
+    obstacles = Obstacles(front_end.geometry, config.obstacles, front_end.dense, parts.load)
+    rings = graph.stage("obstacles", obstacles, odometry)
     for name, sink in sinks.rings.items():
         graph.sink(name, sink, rings)
     return rings
@@ -197,13 +199,13 @@ def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: Navigat
     return updates
 
 
-def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config, sinks: Sinks
-              ) -> Stream[VelocityCommand]:
+def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config,
+              drive: LiveDrive | ReplayDrive | None) -> Stream[VelocityCommand]:
     """Join the controller; return its commands. It never waits for a stage: it has a process of its own."""
-    if sinks.live_drive:
-        graph.sink("controller", sinks.live_drive, odometry, policy=NEWEST, depth=1)
-        return graph.source("drive", sinks.live_drive.commands, wake=sinks.live_drive.end)
-    if sinks.replay_drive:
-        graph.sink("controller", sinks.replay_drive, odometry)
+    if isinstance(drive, LiveDrive):
+        graph.sink("controller", drive, odometry, policy=NEWEST, depth=1)
+        return graph.source("drive", drive.commands, wake=drive.end)
+    if drive is not None:
+        graph.sink("controller", drive, odometry)
     period_s = 1.0 / config.motor.rate_hz
     return graph.stage("drive", LockstepDrive(config.controller, period_s, geometry.rig.T_base_rig), odometry)

@@ -17,7 +17,7 @@ from omnid.core.places.place_views import keep_only, parts
 from omnid.errors import OmnidError
 from omnid.formats.landmark_file import read_tags
 from omnid.formats.place_file import read_places, write_places
-from omnid.runs.pipeline import Sinks
+from omnid.runs.pipeline import RunParts
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
 
@@ -44,19 +44,19 @@ class RunPlaces:
         """
         settings, self._warn, self._tags = config.places, warn, config.places.tags
         _require_consistent(settings)
-        self._path = Path(settings.map) if settings.map and given is None and not build else None
+        uses_file = settings.map and given is None and not build
+        self._path = Path(settings.map) if uses_file else None
         self._writes = self._path is not None and not settings.localize_only
         self._rig = place_rig(geometry)
-        if self._path is not None and self._writes:
-            check_outputs([("--map", self._path)], [])
-        begins = self._path is not None and self._writes and not self._path.exists()
-        if begins:
-            self._warn(f"{self._path}: there is no such map: this run begins a new one")
-        elif self._path is not None:
-            given = RigPlaces(*read_places(self._path, new_places(settings)))
+        if self._path is not None:
+            given = self._read(self._path, settings)
+        begins = build or (self._path is not None and given is None)
         tags = read_tags(Path(settings.tags)) if settings.tags else {}
-        begins = begins or build
-        self.places = given.places if given else new_places(settings) if begins or tags else None
+        self.places: PlaceMap | None = None
+        if given is not None:
+            self.places = given.places
+        elif begins or tags:
+            self.places = new_places(settings)
         self._is_kept = given is not None or begins
         if self.places is not None:
             self._know(tags, self.places)
@@ -64,6 +64,15 @@ class RunPlaces:
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         if given is not None and self._known:
             self._compare(given)
+
+    def _read(self, path: Path, settings: PlacesConfig) -> RigPlaces | None:
+        """Return the map of the file; None, with a warning, where this run begins it."""
+        if self._writes:
+            check_outputs([("--map", path)], [])
+            if not path.exists():
+                self._warn(f"{path}: there is no such map: this run begins a new one")
+                return None
+        return RigPlaces(*read_places(path, new_places(settings)))
 
     def _know(self, tags: Mapping[int, MapTag], places: PlaceMap) -> None:
         """Let the map know the tags of the settings, under their names there."""
@@ -74,11 +83,11 @@ class RunPlaces:
                                  f"but {known.size_m:g} m in the map: correct it, or leave the tag out")
         places.tags.known |= tags
 
-    def known_to(self, sinks: Sinks) -> Sinks:
-        """Return the sinks of the run with this map, if there is one."""
+    def known_to(self, parts: RunParts) -> RunParts:
+        """Return the parts of the run with this map, if there is one."""
         if self.places is None:
-            return sinks
-        return replace(sinks, known_places=self.places, localize_only=self._path is not None and not self._writes)
+            return parts
+        return replace(parts, known_places=self.places, localize_only=self._path is not None and not self._writes)
 
     def _compare(self, given: RigPlaces) -> None:
         """Check that the map fits the rig, and adapt it to the panoramas of this run."""

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 import cv2
 
@@ -19,6 +19,7 @@ from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.places.place_map import PlaceMap
+from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
@@ -30,9 +31,9 @@ from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate
 from omnid.runs.log_rig import attached_rig
-from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.pipeline import RecordingSink, RunParts, Sinks, wire
 from omnid.runs.place_maps import RigPlaces, RunPlaces
-from omnid.runs.rig_examination import examined_gate
+from omnid.runs.rig_checks import examined_rig
 from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.sensor_sources import motion_topics
@@ -44,8 +45,8 @@ from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_trajectory
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
-from omnid.stages.geometry import Geometry, GeometryVersions
-from omnid.stages.rig_gate import RigContradictedError
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
@@ -82,7 +83,7 @@ class ReplayOptions:
     realtime: bool = False
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
-    observer: Callable[[Geometry, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
+    observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     places: PlaceMap | None = None  # the map to begin with; it is extended
     localize_only: bool = False  # ... it stays as it is
     rig_places: RigPlaces | None = None  # the same with its rig, which is compared with that of the log
@@ -128,16 +129,17 @@ class _Replay:
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
-            gate = examined_gate(reader, self._log, geometry, self._config)
+            health = examined_rig(reader, self._log, geometry, self._config)
             run_places = RunPlaces(self._config, geometry, session.warn, self._options.rig_places,
                                    build=self._options.build)
-            sinks = replace(run_places.known_to(self._sinks(session, geometry)), rig_gate=gate)
+            front_end = FrontEnd(geometry, self._config, health)
+            sinks, parts = self._sinks(session, front_end), run_places.known_to(self._parts(session, geometry))
             pairing = Synchronise(geometry.rig, self._config.pair, self._config.motion.R_base_imu)
             pairs = graph.stage("pair", pairing, self._messages(graph, reader, pairing))
-            stages = wire(graph, pairs, geometry, self._config, sinks)
+            stages = wire(graph, pairs, front_end, self._config, sinks, parts)
             result = RunReport(session, reader, pairing, stages)
-            if isinstance(sinks.recorder, Recorder):
-                sinks.recorder.final_status = result.final_status
+            if sinks.recording is not None and isinstance(sinks.recording.sink, Recorder):
+                sinks.recording.sink.final_status = result.final_status
             self._add_progress(session, reader)
             try:
                 with session.signals(self._on_signal):
@@ -192,19 +194,17 @@ class _Replay:
 
         return graph.source("read", frames, wake=clock.wake)
 
-    def _sinks(self, session: Session, geometry: Geometry) -> Sinks:
+    def _sinks(self, session: Session, front_end: FrontEnd) -> Sinks:
         """Open all outputs before the run, so that one that cannot be opened ends it now."""
-        options, config = self._options, self._config
-        sinks = Sinks(poses={"statistics": session.statistics}, map_every_s=options.map_every_s,
-                      known_places=options.places, localize_only=options.localize_only,
-                      recorder=options.observer(geometry, session.graph.telemetry) if options.observer else None,
-                      bus=self._bus(session, geometry) if options.publish else None)
-        if config.motor.port:
-            controller = session.start_controller(UNPRIVILEGED, of_replay=True)
-            self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
-            sinks = replace(sinks, replay_drive=self._drive)
+        options, geometry = self._options, front_end.geometry
+        recorder: Sink[Any] | None = None
+        if options.observer:
+            recorder = options.observer(front_end, session.graph.telemetry)
         if options.record:
-            sinks = replace(sinks, recorder=self._recorder(session, geometry, options.record))
+            recorder = self._recorder(session, geometry, options.record)
+        sinks = Sinks(poses={"statistics": session.statistics},
+                      bus=self._bus(session, geometry) if options.publish else None,
+                      recording=None if recorder is None else RecordingSink(recorder))
         if options.collect:
             sinks.poses["collect-poses"] = self._poses
             sinks.maps["collect-map"] = self._map
@@ -218,6 +218,15 @@ class _Replay:
             sinks.maps["plan"] = PlanFile(options.plan)
         return sinks
 
+    def _parts(self, session: Session, geometry: Geometry) -> RunParts:
+        """Return the wheels of the run, and the map that it begins with."""
+        options, config = self._options, self._config
+        if config.motor.port:
+            controller = session.start_controller(UNPRIVILEGED, of_replay=True)
+            self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
+        return RunParts(known_places=options.places, localize_only=options.localize_only, drive=self._drive,
+                        map_every_s=options.map_every_s)
+
     def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
         try:
             bus = session.open_bus(geometry.rig)
@@ -226,12 +235,12 @@ class _Replay:
                 raise
             session.warn(f"the run goes on without a bus: {error}")
             return None
-        return BusSink(bus, session.encoder(GeometryVersions(geometry), self._config.record.cloud_points))
+        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points))
 
     def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
         config = self._config
         attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
-        encode = session.encoder(GeometryVersions(geometry), config.record.cloud_points)
+        encode = session.encoder(geometry.rig, config.record.cloud_points)
         recorder = Recorder(SingleLog(path, attachments), config.bus.robot, encode)
         session.outputs.callback(recorder.close)
         return recorder

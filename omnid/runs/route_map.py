@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.se2_arrays import planar
 from omnid.core.navigation.route import KeyframePose
-from omnid.core.places.planar import planar
 from omnid.stages.places import Places
 
 MOST_NOTED: Final = 200  # keyframes that tell a map from others

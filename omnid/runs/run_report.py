@@ -63,7 +63,8 @@ class RunReport:
         if statistics.poses or not self._session.signal:
             if self._has_motion and self._motion().message:
                 yield f"wheels and gyro: {self._motion().message}"
-            yield from input_warnings(self._pairing, self._stages.rig_gate, statistics, self._session.config.pair)
+            health = self._stages.front_end.health
+            yield from input_warnings(self._pairing, health, statistics, self._session.config.pair)
 
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
@@ -77,7 +78,7 @@ class RunReport:
         return bool(inbox.wheels or inbox.gyro)
 
     def _motion(self) -> DiagnosticStatus:
-        return motion_status(self._stages.odometry.sensors, self._pairing.motion)()
+        return motion_status(self._stages.front_end.odometry.sensors, self._pairing.motion)()
 
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""

@@ -33,7 +33,7 @@ class RunResult:
 
     stamps_ns: NDArray[np.int64]  # (N,) as in the log: ns of Unix time
     T_odom_rig: NDArray[np.float64]  # (N, 4, 4)
-    covariances: NDArray[np.float64]  # (N, 6, 6) of the poses, x y z rx ry rz in odom axes, m^2 and rad^2
+    covariances: NDArray[np.float64]  # (N, 6, 6) of the poses, [t; r] in the axes of the rig, m^2 and rad^2
     states: tuple[TrackingState, ...]  # (N,)
     counters: RunCounters
     timings: Mapping[str, SummaryRow]  # by stage: messages, drops, p50, p99 and maximum of the time of one [ms]

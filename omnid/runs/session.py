@@ -21,7 +21,7 @@ from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
 from omnid.settings_dump import dump
 from omnid.sinks.encoder import Encoder, map_encoding
-from omnid.stages.geometry import Geometry, GeometryVersions, geometry, with_rims
+from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
 CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
@@ -81,10 +81,10 @@ class Session:
         self.outputs.callback(link.close)
         return link
 
-    def encoder(self, versions: GeometryVersions, cloud_points: int) -> Encoder:
+    def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
         """Return an encoder that gives at most so many points of the map."""
         encoding = map_encoding(self.config, cloud_points)
-        return Encoder(versions[0].rig.T_base_rig, encoding, self.offset_ns, versions)
+        return Encoder(rig.T_base_rig, encoding, self.offset_ns, rig)
 
     def dropped_messages(self) -> int:
         """Return the number of messages that were dropped in front of the stages and sinks."""

@@ -24,6 +24,7 @@ from omnid.controller.statistics import ControllerState
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.frames import of_base
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.requests import Request as NavigationRequest
 from omnid.core.navigation.situation import WheelState
@@ -32,17 +33,17 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.runs.pipeline import NavigationParts, Sinks, WiredStages, wheel_state, wire
+from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-from omnid.stages.odometry import of_base
 from omnid.stages.synchronise import Synchronise
 
 T = TypeVar("T")
@@ -155,11 +156,12 @@ class _Lockstep:
         shape = geometry(self._rig, config.panorama)
         pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
         run_places = RunPlaces(config, shape, nothing)
-        parts = NavigationParts(self._requests, self._wheels, Take(self._take_navigation),
-                                RouteFolder(Path(config.navigation.routes)), config.places.map)
-        sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)}, navigation=parts,
+        navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation),
+                                     RouteFolder(Path(config.navigation.routes)), config.places.map)
+        sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)},
                       places={"in map": Take(self._places.append)} if config.places.map else {})
-        self._stages = wire(graph, pairs, shape, config, run_places.known_to(sinks))
+        self._stages = wire(graph, pairs, FrontEnd(shape, config), config, sinks,
+                            run_places.known_to(RunParts(navigation=navigation)))
         graph.run()
         run_places.finish()
         return SimulatedRun(
@@ -225,7 +227,7 @@ class _Lockstep:
         T_base_rig = self._rig.T_base_rig
         self._odometry = odometry
         self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state))
-        self._slipping.append(self._stages is not None and self._stages.odometry.sensors.is_slipping)
+        self._slipping.append(self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping)
         pose = controller_pose(odometry, T_base_rig)
         self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_pose(pose))
 

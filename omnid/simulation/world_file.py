@@ -36,8 +36,9 @@ SCHEMA: Final = 1
 MAX_BYTES: Final = 1 << 18
 MOST_WALLS, MOST_BOXES, MOST_PEOPLE, MOST_POINTS, MOST_DOORS = 200, 200, 20, 100, 8
 LARGEST_M: Final = 60.0  # side of a world: its textures must fit into memory
-LARGEST_AREA_M2: Final = 1200.0  # of all painted surfaces
+LARGEST_AREA_M2: Final = 1200.0  # of all painted surfaces, without posters
 PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # of the textures of walls, and of floor and ceiling
+ROUNDING_M: Final = 1e-6
 PERSON_M: Final = (0.25, 0.45, 1.7)  # depth, width, height
 RANDOM: Final = "random"
 KINDS: Final = ("brick", "plaster", "granite", "plaster")  # of a random wall
@@ -87,18 +88,28 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     require_schema(top, SCHEMA)
     rng = np.random.default_rng([seed, 41])
     space = _Space.of(top.table("space"))
-    standing = space.floor_and_ceiling(rng)
-    for wall in top.tables("wall", MOST_WALLS):
-        standing += _wall(rng, wall, space.ceiling_m)
-    for table in top.tables("box", MOST_BOXES):
-        standing += _box(rng, table)
-    area_m2 = sum(rectangle.width_m * rectangle.height_m for rectangle in standing)
+    walls, boxes, persons = (top.tables(key, most) for key, most in (
+        ("wall", MOST_WALLS), ("box", MOST_BOXES), ("person", MOST_PEOPLE)))
+    x_m, y_m, heading_deg = top.numbers("start", 3)
+    # 1. What cannot be is refused before any texture is painted, which takes time and memory.
+    if not space.contains((x_m, y_m)):
+        top.fail("start", "a place within the space")
+    for table in boxes:
+        _check_box(table, space, (x_m, y_m))
+    area_m2 = (space.area_m2 + sum(_wall_area_m2(table, space.ceiling_m) for table in walls)
+               + sum(_box_area_m2(_size(table)) for table in boxes)
+               + sum(_box_area_m2(_person_size(table)) for table in persons))
     if area_m2 > LARGEST_AREA_M2:
         raise CalibError(f"{name}: the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}")
-    people = tuple(_person(rng, table) for table in top.tables("person", MOST_PEOPLE))
+    # 2. Surfaces with their textures, in the order in which the seed is used.
+    standing = space.floor_and_ceiling(rng)
+    for table in walls:
+        standing += _wall(rng, table, space.ceiling_m)
+    for table in boxes:
+        standing += _box(rng, table)
+    people = tuple(_person(rng, table) for table in persons)
     if options.other_posters:
         standing = _exchanged(standing, options)
-    x_m, y_m, heading_deg = top.numbers("start", 3)
     brightness = options.brightness * (_positive(top, "light", 0.05, 3.0) if top.has("light") else 1.0)
     return World(name, tuple(standing), people if options.people else (), (x_m, y_m, math.radians(heading_deg)),
                  brightness)
@@ -124,6 +135,15 @@ class _Space:
                           for key in ("floor", "ceiling"))
         return _Space((x0, y0), (x1, y1), ceiling_m, (floor, ceiling))
 
+    @property
+    def area_m2(self) -> float:
+        (x0, y0), (x1, y1) = self.low, self.high
+        return 2 * (x1 - x0) * (y1 - y0)
+
+    def contains(self, point: Point) -> bool:
+        return all(low - ROUNDING_M <= value <= high + ROUNDING_M
+                   for low, value, high in zip(self.low, point, self.high, strict=True))
+
     def floor_and_ceiling(self, rng: Random) -> list[Rectangle]:
         (x0, y0), (x1, y1) = self.low, self.high
         along, across = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
@@ -132,11 +152,45 @@ class _Space:
                 Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling")]
 
 
+def _check_box(table: ValidatedTable, space: _Space, start: Point) -> None:
+    """Check that a box lies within the space, and that the robot does not start in it."""
+    x_m, y_m, yaw_rad = _box_pose(table)
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    along_m, across_m = (side / 2 for side in _size(table)[:2])
+    corners = [(x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
+               for i in (-1, 1) for j in (-1, 1)]
+    if not all(map(space.contains, corners)):
+        table.fail("at", "a place where the whole box is within the space")
+    dx_m, dy_m = start[0] - x_m, start[1] - y_m
+    if abs(c * dx_m + s * dy_m) <= along_m and abs(c * dy_m - s * dx_m) <= across_m:
+        table.fail("at", "a place where the robot does not start inside the box")
+
+
+def _box_pose(table: ValidatedTable) -> tuple[float, float, float]:
+    x_m, y_m = table.numbers("at", 2)
+    return x_m, y_m, math.radians(table.number("yaw_deg")) if table.has("yaw_deg") else 0.0
+
+
+def _box_area_m2(size_m: tuple[float, float, float]) -> float:
+    x_m, y_m, z_m = size_m
+    return 2 * (x_m + y_m) * z_m + x_m * y_m
+
+
+def _wall_area_m2(table: ValidatedTable, ceiling_m: float) -> float:
+    """Return the area of a wall, of which doors are a part."""
+    return _wall_height_m(table, ceiling_m) * sum(
+        math.dist(a, b) for a, b in pairwise(table.points("points", 2, MOST_POINTS)))
+
+
+def _wall_height_m(table: ValidatedTable, ceiling_m: float) -> float:
+    return _positive(table, "height_m", 0.05, 20.0) if table.has("height_m") else ceiling_m
+
+
 def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangle]:
     """Return the parts of a wall along a polyline, with its posters; doors are in the first part of the polyline."""
     table.allow_only(("points", "texture", "height_m", "posters_per_m", "poster_sides", "doors"))
     points = table.points("points", 2, MOST_POINTS)
-    height_m = _positive(table, "height_m", 0.05, 20.0) if table.has("height_m") else ceiling_m
+    height_m = _wall_height_m(table, ceiling_m)
     kind = table.choice("texture", TEXTURES) if table.has("texture") else RANDOM
     per_m = _positive(table, "posters_per_m", 0.0, 4.0) if table.has("posters_per_m") else 0.0
     both = table.has("poster_sides") and table.choice("poster_sides", ("front", "both")) == "both"
@@ -190,8 +244,7 @@ def _other_side(side: Rectangle) -> Rectangle:
 
 def _box(rng: Random, table: ValidatedTable) -> list[Rectangle]:
     table.allow_only(("at", "size_m", "yaw_deg", "texture"))
-    x_m, y_m = table.numbers("at", 2)
-    yaw_rad = math.radians(table.number("yaw_deg")) if table.has("yaw_deg") else 0.0
+    x_m, y_m, yaw_rad = _box_pose(table)
     faces = box(rng, (x_m, y_m), _size(table), yaw_rad)
     kind = table.choice("texture", BOX_TEXTURES) if table.has("texture") else "poster"
     if kind == "poster":
@@ -201,15 +254,18 @@ def _box(rng: Random, table: ValidatedTable) -> list[Rectangle]:
 
 def _person(rng: Random, table: ValidatedTable) -> Person:
     table.allow_only(("path", "speed_mps", "repeat", "start_s", "starts_within_m", "waits_within_m", "size_m"))
-    size = _size(table) if table.has("size_m") else PERSON_M
     return Person(
-        tuple(box(rng, (0.0, 0.0), size, 0.0)),
+        tuple(box(rng, (0.0, 0.0), _person_size(table), 0.0)),
         tuple(table.points("path", 2, MOST_POINTS)),
         _positive(table, "speed_mps", 0.0, 5.0) if table.has("speed_mps") else 1.0,
         table.choice("repeat", ("once", "loop", "back and forth")) if table.has("repeat") else "once",
         _positive(table, "start_s", 0.0, 1e5) if table.has("start_s") else 0.0,
         *(_positive(table, key, 0.0, 100.0) if table.has(key) else 0.0
           for key in ("starts_within_m", "waits_within_m")))
+
+
+def _person_size(table: ValidatedTable) -> tuple[float, float, float]:
+    return _size(table) if table.has("size_m") else PERSON_M
 
 
 def _size(table: ValidatedTable) -> tuple[float, float, float]:

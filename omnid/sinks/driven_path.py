@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, OutgoingMessage
 from omnid.transport.navigation_codec import PATH_SCHEMA
@@ -20,6 +21,16 @@ _COS_HALF_TURN: Final = float(np.cos(np.radians(5.0)))  # a turn by 10 degrees i
 _PERIOD_NS: Final = 10**9
 
 
+class _Vertex(NamedTuple):
+    stamp_ns: int
+    pose: NDArray[np.float64]  # (7,) x y z [m], quaternion x y z w
+
+
+def _is_step(last: _Vertex, new: _Vertex, step_m: float) -> bool:
+    has_moved = np.linalg.norm(new.pose[:3] - last.pose[:3]) >= step_m
+    return bool(has_moved or abs(new.pose[3:] @ last.pose[3:]) < _COS_HALF_TURN)
+
+
 class DrivenPath:
     """Yields the path each second in which it has grown; each call adds a pose.
 
@@ -29,10 +40,8 @@ class DrivenPath:
 
     def __init__(self, encode: Encoder, s_per_pose: float = 0.0) -> None:
         self._encode, self._ns_per_pose = encode, 1e9 * s_per_pose
-        self._stamps_ns = np.zeros(MOST_POSES, np.int64)
-        self._poses = np.zeros((MOST_POSES, 7))  # x y z [m], quaternion x y z w
-        self._kept, self._step_m = 0, _STEP_M
-        self._added, self._given = 0, 0  # poses since the start: all, those before the last message
+        self._path = ThinnedPath(MOST_POSES, _STEP_M, _is_step)
+        self._has_grown = False  # since the last message
         self._newest_ns, self._due_ns = 0, 0
 
     def __call__(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
@@ -42,29 +51,17 @@ class DrivenPath:
         T = T_base_rig @ odometry.T_odom_rig @ se3.inverse(T_base_rig)
         pose = np.concatenate([T[:3, 3], se3.quaternion(T[:3, :3])])
         self._newest_ns = stamp_ns
-        if self._kept == 0 or self._has_moved(pose):
-            self._add(stamp_ns, pose)
+        self._has_grown |= self._path.add(_Vertex(stamp_ns, pose))
         if stamp_ns >= self._due_ns:
             yield from self.finish()
 
     def finish(self) -> Iterator[OutgoingMessage]:
         """Yield the path if it has grown since the last message."""
-        if self._given == self._added:
+        if not self._has_grown:
             return
-        self._given = self._added
-        self._due_ns = self._newest_ns + max(_PERIOD_NS, round(self._ns_per_pose * self._kept))
-        payload = driven_path_cdr(self._newest_ns, self._stamps_ns[: self._kept], self._poses[: self._kept])
+        self._has_grown = False
+        vertices = self._path.vertices
+        self._due_ns = self._newest_ns + max(_PERIOD_NS, round(self._ns_per_pose * len(vertices)))
+        stamps_ns = np.array([vertex.stamp_ns for vertex in vertices], np.int64)
+        payload = driven_path_cdr(self._newest_ns, stamps_ns, np.array([vertex.pose for vertex in vertices]))
         yield OutgoingMessage("path", PATH_SCHEMA, payload)
-
-    def _has_moved(self, pose: NDArray[np.float64]) -> bool:
-        last = self._poses[self._kept - 1]
-        return bool(np.linalg.norm(pose[:3] - last[:3]) >= self._step_m or abs(pose[3:] @ last[3:]) < _COS_HALF_TURN)
-
-    def _add(self, stamp_ns: int, pose: NDArray[np.float64]) -> None:
-        if self._kept == MOST_POSES:  # every second one is dropped
-            self._kept, self._step_m = MOST_POSES // 2, 2 * self._step_m
-            for kept in (self._stamps_ns, self._poses):
-                kept[: self._kept] = kept[1::2].copy()
-        self._stamps_ns[self._kept], self._poses[self._kept] = stamp_ns, pose
-        self._kept += 1
-        self._added += 1

@@ -8,15 +8,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig import Rig
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.core.mapping.occupancy_grid import Grid, occupancy
+from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.navigation_status import navigation_status
-from omnid.stages.geometry import GeometryVersions
-from omnid.stages.odometry import base_pose, of_base
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, navigation_codec
 from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
@@ -40,29 +39,25 @@ class MapEncoding(NamedTuple):
     """Encoding of the map and of the scan."""
 
     points: int  # largest number of points of the cloud: the most confident ones
-    heights_m: tuple[float, float] = (-1.0, 1.5)  # of obstacles, in the base's frame at the start
-    cell_m: float = 0.05  # of the grid
     max_range_m: float = 6.0  # of the scan
-    has_places: bool = False  # the grid comes from their keyframes, in the frame map, not from the points in odom
 
 
 def map_encoding(config: Config, points: int) -> MapEncoding:
     """Return the encoding of the configuration, with at most so many points."""
-    return MapEncoding(points, config.mapping.heights_m, config.mapping.voxel_m, config.obstacles.ring.max_range_m,
-                       config.places.enabled)
+    return MapEncoding(points, config.obstacles.ring.max_range_m)
 
 
 class Encoder:
     """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
     def __init__(self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0,
-                 versions: GeometryVersions | None = None) -> None:
+                 rig: Rig | None = None) -> None:
         """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
 
-        versions: with the mounting of the cameras, for the static frames; None: they are left out.
+        rig: with the mounting of the cameras, for the static frames; None: they are left out.
         """
         self.T_base_rig, self._map_encoding, self.offset_ns = T_base_rig, map_encoding, offset_ns
-        self.versions = versions
+        self.rig = rig
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """Yield the encoded messages of a message."""
@@ -83,14 +78,17 @@ class Encoder:
             case MapUpdate():
                 yield from self._map(message)
             case GridUpdate():
-                yield self._grid("map", message.stamp_ns, message.grid)
+                grid = message.grid
+                payload = codec.grid_cdr(message.stamp_ns + self.offset_ns, "map", grid.cells, grid.cell_m, grid.corner)
+                yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
             case NavigationUpdate():
                 yield from self._navigation(message)
 
     def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
-        T_odom_base, covariance, *velocity = of_base(odometry, self.T_base_rig)
-        pose = codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity[0], velocity[1])
+        T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
+        pose = codec.odometry_cdr(stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity,
+                                  velocity_covariance)
         yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
         yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
         edge = codec.FrameTransform("odom", "base_link", T_odom_base)
@@ -112,7 +110,7 @@ class Encoder:
         stamp_ns = update.stamp_ns + self.offset_ns
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
         T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
-        pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, covariance)
+        pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
         yield OutgoingMessage("map_pose", codec.MAP_POSE_SCHEMA, pose)
         edge = codec.FrameTransform("map", "odom", T_map_odom)
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
@@ -122,16 +120,6 @@ class Encoder:
         points = _most_confident(update.points, self._map_encoding.points)
         payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
-        if self._map_encoding.has_places:
-            return
-        path_xy = self._in_base(_on_ground(update.path_xy))[:, :2]
-        grid = occupancy(self._in_base(update.points.xyz), update.points.confidence, path_xy,
-                         self._map_encoding.heights_m, self._map_encoding.cell_m)
-        yield self._grid("odom", update.stamp_ns, grid)
-
-    def _grid(self, frame: str, stamp_ns: int, grid: Grid) -> OutgoingMessage:
-        payload = codec.grid_cdr(stamp_ns + self.offset_ns, frame, grid.cells, grid.cell_m, grid.corner)
-        return OutgoingMessage("map", codec.GRID_SCHEMA, payload)
 
     def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
@@ -141,13 +129,6 @@ class Encoder:
             plan = update.plan
             payload = navigation_codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
             yield OutgoingMessage("plan", navigation_codec.PATH_SCHEMA, payload)
-
-    def _in_base(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return points (N, 3) of the rig's first frame in the base's; float32 is enough for a grid of large cells."""
-        T = self.T_base_rig.astype(np.float32)
-        if np.array_equal(T, np.eye(4)):
-            return points.astype(np.float32, copy=False)
-        return np.asarray(points.astype(np.float32, copy=False) @ T[:3, :3].T + T[:3, 3])
 
 
 class StateReports:
@@ -184,11 +165,6 @@ class StateReports:
 def status_report(stamp_ns: int, statuses: Sequence[codec.DiagnosticStatus]) -> OutgoingMessage:
     """Return statuses as one encoded message."""
     return OutgoingMessage("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
-
-
-def _on_ground(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points (N, 2) as points (N, 3) with z = 0."""
-    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -50,7 +50,7 @@ class PoseCollector:
 
     @property
     def covariances(self) -> NDArray[np.float64]:
-        """Covariances (N, 6, 6) of the poses: x y z rx ry rz in odom axes, m^2 and rad^2."""
+        """Covariances (N, 6, 6) of the poses: [t; r] in the axes of the rig, m^2 and rad^2."""
         return self._covariances[: self._count]
 
     @property

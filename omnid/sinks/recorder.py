@@ -38,9 +38,6 @@ class MessageLog(Protocol):
     def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
         """Add a message."""
 
-    def attach(self, name: str, data: bytes) -> None:
-        """Replace or add an attachment of the files that begin from now on."""
-
     def close(self) -> None:
         """Complete the last file."""
 
@@ -64,10 +61,6 @@ class SingleLog:
             self.state.files, self.state.file, self.state.status = 1, str(self._path), "recording"
         self._writer.write(topic, schema_name, data, stamp_ns)
         self.state.messages += 1
-
-    def attach(self, name: str, data: bytes) -> None:
-        """Replace or add an attachment, if the file has not begun."""
-        self._attachments = {**self._attachments, name: data}
 
     def close(self) -> None:
         """Complete the file; a second call does nothing."""
@@ -142,10 +135,6 @@ class Recorder:
         The state of the odometry is recorded at the time of its images: statuses in the log keep the order of time.
         """
         self._added.append((message, stamp_ns))
-
-    def attach(self, name: str, data: bytes) -> None:
-        """Replace or add an attachment of the files that begin from now on; from any thread."""
-        self._log.attach(name, data)
 
     def finish(self) -> None:
         """Write the final status and complete the last file."""

@@ -13,22 +13,20 @@ TF_STATIC: Final = "/tf_static"
 
 
 class StaticFrames:
-    """Yields the frames at the first call, and again when a run goes on with a refined rig."""
+    """Yields the frames at the first call."""
 
     def __init__(self, encode: Encoder) -> None:
-        self._encode, self._version = encode, -1
+        self._encode, self._is_given = encode, False
 
     def __call__(self, stamp_ns: int) -> Iterator[OutgoingMessage]:
-        """Yield the message if its content differs from the last one; stamp_ns: of a pose."""
-        versions = self._encode.versions
-        newest = 0 if versions is None else versions.newest
-        if newest == self._version:
+        """Yield the message the first time; stamp_ns: of a pose."""
+        if self._is_given:
             return
         edges = [FrameTransform("base_link", "rig", self._encode.T_base_rig)]
-        if versions is not None:
-            rig = versions[newest].rig
+        rig = self._encode.rig
+        if rig is not None:
             edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig))
                       for name, camera in (("lower", rig.lower), ("upper", rig.upper))]
         payload = transform_cdr(stamp_ns + self._encode.offset_ns, edges)
-        self._version = newest
+        self._is_given = True
         yield OutgoingMessage(TF_STATIC, TRANSFORM_SCHEMA, payload)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig, TimingConfig
-from omnid.core.odometry.exposure_times import ExposureTimes
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.pixel_times import PixelTimes
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
-from omnid.stages.geometry import Geometry, GeometryVersions
+from omnid.stages.geometry import Geometry
 
 NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
 BLUR_SHARE = 0.6  # sigma of the blur by the pixels that a pixel of the panorama covers beside its own
@@ -23,21 +23,14 @@ MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 
 
 class Dewarp:
-    """Rectifies both images of a pair; the remap tables are computed once for each version of the geometry."""
+    """Rectifies both images of a pair; the remap tables are computed once."""
 
-    def __init__(self, geometry: Geometry | GeometryVersions, config: PanoramaConfig,
-                 timing: TimingConfig | None = None) -> None:
-        self._versions = geometry if isinstance(geometry, GeometryVersions) else GeometryVersions(geometry)
-        self._config, self._timing = config, timing or TimingConfig()
+    def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
         self._noise_grey: dict[str, float] = {}  # of each camera before its gain
         self._pairs = 0
         self._pad_px = config.pad_px
-        self._use(self._versions.newest)
-
-    def _use(self, version: int) -> None:
-        """Compute the tables of a version of the geometry."""
-        self._version, config, timing = version, self._config, self._timing
-        rig, cylinder = self._versions[version].rig, self._versions[version].cylinder
+        timing = timing or TimingConfig()
+        rig, cylinder = geometry.rig, geometry.cylinder
         self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
         self._blur_px = _blur_px((self._lower, self._upper))
         both = visible(rig.lower, self._lower, config.rim_margin_px)
@@ -48,7 +41,7 @@ class Dewarp:
         line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
         tables = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper)]
-        self._rows_s = tables if line_s else [None, None]
+        self._rows_s = tables if line_s else []
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(
                 f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
@@ -57,21 +50,13 @@ class Dewarp:
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
-        if self._versions.newest != self._version:
-            self._use(self._versions.newest)
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
         lower, lower_light = self._panorama(pair.lower, self._lower, "lower", measured)
         upper, upper_light = self._panorama(pair.upper, self._upper, "upper", measured)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, self._times(pair.skew_s), dimmer,
-                         pair.motion, self._version)
-
-    def _times(self, skew_s: float) -> ExposureTimes | None:
-        """Return the times of the pixels of a pair; None if both images show the instant of the stamp."""
-        skew_s += self.upper_delay_s
-        lower_s, upper_s = self._rows_s
-        return None if skew_s == 0 and lower_s is None else ExposureTimes(skew_s, lower_s, upper_s)
+        times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion)
 
     def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool
                   ) -> tuple[PaddedPanorama, Light]:

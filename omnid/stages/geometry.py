@@ -16,7 +16,7 @@ from calib.panorama import Cylinder, fit_cylinder
 from calib.rig import MountedCamera, Rig
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
-from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.types.stereo_model import StereoModel
 from omnid.stages.decoder import Decoder
 
 Array = NDArray[np.float64]
@@ -40,30 +40,6 @@ class Geometry:
     def model(self, noise_px: float) -> StereoModel:
         """Return the measurement model of corners located with a standard deviation of noise_px."""
         return StereoModel(self.cylinder, self.rig.baseline_m, noise_px)
-
-
-class GeometryVersions:
-    """The geometries of a run, the newest last: a run that refines its rig begins a new one while the robot stands.
-
-    The panoramas name theirs by its number. The cylinder of all is that of the first, so that panoramas, thumbnails and
-    keyframes of different versions can be compared. Any thread may read; one thread adds.
-    """
-
-    def __init__(self, first: Geometry) -> None:
-        self._versions = [first]
-
-    def __getitem__(self, number: int) -> Geometry:
-        """Return the geometry of a version."""
-        return self._versions[number]
-
-    @property
-    def newest(self) -> int:
-        """Number of the newest version."""
-        return len(self._versions) - 1
-
-    def add(self, rig: Rig) -> None:
-        """Begin a version with another rig; the next pair that is dewarped uses it."""
-        self._versions.append(Geometry(rig, self._versions[0].cylinder))
 
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:

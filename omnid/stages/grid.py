@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.keyframe_grid import KeyframeGrid
+from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import GridUpdate, PlaceUpdate
-from omnid.stages.mapping import no_wait
 
 Array = NDArray[np.float64]
 
@@ -18,12 +15,11 @@ Array = NDArray[np.float64]
 class MapGrid:
     """Draw the map periodically and at the end, where it has changed: it moves when a loop closes."""
 
-    def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0,
-                 min_period_s: Callable[[], float] = no_wait) -> None:
-        """every_s: between two grids, by the stamps; 0: one, at the end. min_period_s: infinite for none."""
+    def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0, load: Load = full_load) -> None:
+        """every_s: between two grids, by the stamps; 0: one, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
-        self._min_period_s = min_period_s
+        self._load = load
         self._given: object = None  # scans of the last grid
         self._newest: PlaceUpdate | None = None
 
@@ -32,7 +28,7 @@ class MapGrid:
         self._newest = update
         if not self._every_ns or update.stamp_ns - self._given_ns < self._every_ns or update.scans is self._given:
             return None
-        return None if self._min_period_s() == math.inf else self._drawn(update)
+        return None if self._load() >= LoadLevel.NO_MAP else self._drawn(update)
 
     def finish(self) -> list[GridUpdate]:
         """Return the final grid, if there was a keyframe."""

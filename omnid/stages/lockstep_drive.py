@@ -24,8 +24,8 @@ from omnid.core.control.control_law import (
     ControlOutput,
 )
 from omnid.core.control.velocity_limits import STOP
+from omnid.core.frames import of_base
 from omnid.messages import OdometryUpdate
-from omnid.stages.odometry import of_base
 from omnid.tracking_state import TrackingState
 
 

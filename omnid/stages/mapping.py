@@ -3,72 +3,49 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import MappingConfig
+from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.core.mapping.voxel_map import VoxelMap
+from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
+Position: TypeAlias = tuple[float, float]  # x, y [m]
 
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
-
-
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2  # less motion shows the same points again
 STANDING_NS = 1_000_000_000  # between two pairs of the same view that enter the map
+FINEST_STEP_M = 0.001  # between two vertices of the path: a robot at rest adds none
+SPARSE_NS = 1_000_000_000  # between two pairs that enter the map at LoadLevel.SPARSE_MAP
 STAMP_JITTER_NS = 5_000_000  # so that a period of the cameras that divides that of the map does divide it
 
 
-def no_wait() -> float:
-    """Return 0 s."""
-    return 0.0
-
-
-class ThinnedPath:
-    """Path of the rig in preallocated memory; when it is full, every second point is dropped."""
-
-    def __init__(self, limit: int) -> None:
-        self._points = np.full((limit + 1, 2), np.nan)  # written now, so that its pages are resident from the start
-        self._kept, self._step, self._seen = 0, 1, 0
-        self._last: tuple[float, float] | None = None
-
-    def add(self, x_m: float, y_m: float) -> None:
-        """Add the next point."""
-        self._last = (x_m, y_m)
-        if self._seen % self._step == 0:
-            self._points[self._kept] = self._last
-            self._kept += 1
-        self._seen += 1
-        if self._kept == len(self._points):
-            thinned = self._points[::2].copy()
-            self._kept, self._step = len(thinned), 2 * self._step
-            self._points[: self._kept] = thinned
-
-    def xy(self) -> Array:
-        """Return the points (N, 2) kept, and the last one."""
-        ends = np.zeros((0, 2)) if self._last is None else np.array([self._last])
-        return np.concatenate([self._points[: self._kept], ends])
+def _is_step(last: Position, new: Position, step_m: float) -> bool:
+    return math.dist(last, new) >= step_m
 
 
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(self, config: MappingConfig, every_s: float = 0.0, min_period_s: Callable[[], float] = no_wait
+    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0, load: Load = full_load
                  ) -> None:
-        """every_s: between two maps, by the stamps; 0: one map, at the end. min_period_s: called for each pair, the
-        least time between two pairs that enter the map, infinite for none.
+        """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
+        at the end.
         """
-        self._min_period_s = min_period_s
-        self._config = config
+        self._load = load
+        self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
-        self._path = ThinnedPath(config.path_poses)
+        self._path = ThinnedPath(config.path_poses, FINEST_STEP_M, _is_step)
         self._newest: tuple[int, int] | None = None
         self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
@@ -82,11 +59,11 @@ class Mapping:
     def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
         """Add the points of a pair; return the map when it is due."""
         self._newest = odometry.seq, odometry.stamp_ns
-        self._path.add(*map(float, odometry.T_odom_rig[:2, 3]))
+        self._path.add((float(odometry.T_odom_rig[0, 3]), float(odometry.T_odom_rig[1, 3])))
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
             self._mapped = odometry.stamp_ns, odometry.T_odom_rig
             self._frames += 1
-            depth = odometry.depth
+            depth = self._dense.of(odometry.depth)
             sure = depth.variance_m2 < self._config.max_sigma_m**2
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])
             self._map.insert(points, depth.variance_m2[sure], odometry.seq)
@@ -101,14 +78,15 @@ class Mapping:
         Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new. A keyframe, whose dense
         stereo the odometry needs anyway, is due after half the time: then another pair can do without.
         """
-        period_s = self._min_period_s()
-        if period_s == math.inf:
+        load = self._load()
+        if load >= LoadLevel.NO_MAP:
             return False
-        if self._mapped is None or not (self._min_gap_ns or period_s):
+        shed_ns = SPARSE_NS if load is LoadLevel.SPARSE_MAP else 0
+        if self._mapped is None or not (self._min_gap_ns or shed_ns):
             return True
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
         is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
-        wait_ns = max(self._min_gap_ns, period_s * 1e9, STANDING_NS if is_same_view else 0)
+        wait_ns = max(self._min_gap_ns, shed_ns, STANDING_NS if is_same_view else 0)
         return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:
@@ -118,4 +96,5 @@ class Mapping:
     def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
         """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
         enough = min(self._config.min_frames, max(MIN_VOXEL_FRAMES, self._frames // FRAMES_PER_VOXEL_FRAME))
-        return MapUpdate(seq, stamp_ns, self._map.points(enough), self._path.xy())
+        return MapUpdate(seq, stamp_ns, self._map.points(enough),
+                         np.array(self._path.with_end(), float).reshape(-1, 2))

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.se2_arrays import planar
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import Forecast, forecast
@@ -29,10 +31,8 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
-from omnid.core.places.planar import planar
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
-from omnid.stages.odometry import base_pose, of_base
 from omnid.stages.routes import KeyframeTie, Routes
 
 Array = NDArray[np.float64]
@@ -119,7 +119,8 @@ class NavigationStage:
     def _place(self, update: PlaceUpdate) -> None:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
         T_map_odom = self._T_base_rig @ update.T_map_odom @ self._T_rig_base
-        sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
+        in_plane = in_outer_axes(T_map_base, covariance)[:2, :2]
+        sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(in_plane)[-1])))
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
         self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -12,18 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.frames import of_base
 from omnid.core.obstacles.floor_plane import FloorPlane
 from omnid.core.obstacles.floor_view import FloorCamera, unmeasured
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.observation import observe, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
+from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
-from omnid.stages.mapping import STAMP_JITTER_NS, no_wait
-from omnid.stages.odometry import of_base
+from omnid.stages.mapping import STAMP_JITTER_NS
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -31,6 +33,9 @@ Array = NDArray[np.float64]
 
 ASSUMED_HEIGHT_M: Final = 1.1  # of the cameras, where the rig's T_base_rig does not say it
 LEAST_HEIGHT_M: Final = 0.1  # of the cameras over the floor, in a T_base_rig that says it
+# Least time between two rings; the collision monitor slows the base down by their age.
+SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
+    LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 300_000_000, LoadLevel.REDUCED: 450_000_000}
 
 
 def ring_settings(geometry: Geometry, config: ObstaclesConfig) -> RingSettings:
@@ -53,11 +58,10 @@ def viewpoint(geometry: Geometry) -> Array:
 class Obstacles:
     """Makes a ring of each pair that is due; dense stereo of a pair is shared with the map."""
 
-    def __init__(self, geometry: Geometry, config: ObstaclesConfig, min_period_s: Callable[[], float] = no_wait
-                 ) -> None:
-        """min_period_s: called for each pair, the least time between two rings under overload."""
+    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths, load: Load = full_load) -> None:
+        """dense: computes the depth of a pair that is due."""
         self._T_base_rig = geometry.rig.T_base_rig
-        self._min_period_s = min_period_s
+        self._load, self._dense = load, dense
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
         self._settings = ring_settings(geometry, config)
         self._filter, self._tracker = RingFilter(self._settings), MovingTracker()
@@ -80,15 +84,15 @@ class Obstacles:
             self._filter.clear()
             self._tracker.clear()
             self._resets = odometry.reset_counter
-        depth = odometry.depth
+        depth = self._dense.of(odometry.depth)
         points = se3.apply(self._T_base_rig, depth.points)
         seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
-        panoramas, view = depth.panoramas, partial(unmeasured, seen.floor_from_m)
+        panoramas, view = odometry.depth.panoramas, partial(unmeasured, seen.floor_from_m)
         if self._is_measured:
             seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
             view = partial(self._floor.view, panoramas.lower, panoramas.visible)
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
-        pose = planar(T_odom_base)
+        pose = transform(planar(T_odom_base))
         ring = self._filter.update(odometry.stamp_ns, pose, seen, view)
         moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
@@ -106,7 +110,7 @@ class Obstacles:
         """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""
         if self._last_ns is None:
             return True
-        wait_ns = max(self._period_ns, self._min_period_s() * 1e9)
+        wait_ns = max(self._period_ns, SHED_PERIOD_NS[self._load()])
         since_ns = odometry.stamp_ns - self._last_ns
         return since_ns < 0 or since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
@@ -114,7 +118,7 @@ class Obstacles:
 def controller_ring(ring: ObstacleRing) -> ControllerRing:
     """Return the part of a ring that the controller needs: ranges less their sigma, moving obstacles in base axes."""
     nearest = np.where(np.isfinite(ring.ranges_m), ring.ranges_m - np.nan_to_num(ring.sigma_m), ring.ranges_m)
-    T = planar(ring.T_odom_base)
+    T = transform(planar(ring.T_odom_base))
     moving = []
     for obstacle in ring.moving:
         x, y = (np.array([obstacle.x_m, obstacle.y_m]) - T[:2, 3]) @ T[:2, :2]
@@ -122,10 +126,3 @@ def controller_ring(ring: ObstacleRing) -> ControllerRing:
         moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m))
     return ControllerRing(ring.stamp_ns, tuple(np.maximum(nearest, 0.0).tolist()), tuple(ring.free_m.tolist()),
                           tuple(moving))
-
-
-def planar(T_odom_base: Array) -> Array:
-    """Return the pose in the plane: its yaw, and x and y."""
-    yaw = float(se3.yaw(T_odom_base))
-    R = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-    return se3.transform(R, [T_odom_base[0, 3], T_odom_base[1, 3], 0.0])

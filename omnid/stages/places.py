@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,25 +11,31 @@ from omnid.core.mapping.range_scan import RangeScan, range_scan
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
+from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import OdometryUpdate, PlaceUpdate, StereoDepth
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
-from omnid.stages.odometry import in_axes
-from omnid.stages.rig_gate import never
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
 
+def never() -> bool:
+    """Return False."""
+    return False
+
+
 class Places:
     """Localise the poses of odometry in a map of places, which grows with them."""
 
-    def __init__(self, geometry: Geometry, config: Config, places: PlaceMap | None = None, *,
-                 localize_only: bool = False, is_overloaded: Callable[[], bool] = never) -> None:
-        """places: a map to be extended, None: a new one. localize_only: the map stays as it is.
+    def __init__(self, geometry: Geometry, config: Config, dense: DenseDepths, places: PlaceMap | None = None, *,
+                 localize_only: bool = False, load: Load = full_load) -> None:
+        """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
+        stays as it is.
 
-        is_overloaded: called for each pose; while it is True nothing is recognised or kept.
+        Nothing is recognised or kept from LoadLevel.NO_MAP on.
         """
-        self._is_overloaded = is_overloaded
+        self._dense, self._load = dense, load
         self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places,
                                        localize_only=localize_only)
         self._T_rig_rect = geometry.T_rig_rect
@@ -65,13 +69,13 @@ class Places:
 
     def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
         """Return the pose in the map at a pair."""
-        pose = self._localiser.process(self._frame(odometry), idle=self._is_overloaded())
+        pose = self._localiser.process(self._frame(odometry), idle=self._load() >= LoadLevel.NO_MAP)
         self.state = pose.state
         if self._copy_wanted:
             self._copy_wanted, self._copy = False, self._localiser.places.part(self._localiser.places.keyframes)
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig
-        covariance = in_axes(T_map_rig, self._to_rig @ pose.covariance @ self._to_rig.T)
+        covariance = self._to_rig @ pose.covariance @ self._to_rig.T
         T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
         return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
                            pose.keyframe, T_keyframe_rig, self._localiser.scans())
@@ -99,13 +103,13 @@ class Places:
         """Return the frame in terms of the rectified frame."""
         depth, pair = odometry.depth, odometry.depth.panoramas
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
-        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, depth.disparity_at, usable, pair.times)
+        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable,
+                             pair.times)
         T_odom_rect = self._T_rect_rig @ odometry.T_odom_rig @ self._T_rig_rect
-        of_rig = in_axes(se3.inverse(odometry.T_odom_rig), odometry.covariance)
-        return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, self._to_rect @ of_rig @ self._to_rect.T,
-                             odometry.state is TrackingState.LOST, odometry.reset_counter,
-                             odometry.is_keyframe, lambda: self._scan(odometry.depth))
+        covariance = self._to_rect @ odometry.covariance @ self._to_rect.T
+        return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, covariance, odometry.state is TrackingState.LOST,
+                             odometry.reset_counter, odometry.is_keyframe, lambda: self._scan(depth))
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""
-        return range_scan(se3.apply(self._T_rect_rig, depth.points), self._heights_m)
+        return range_scan(se3.apply(self._T_rect_rig, self._dense.of(depth).points), self._heights_m)

@@ -9,13 +9,14 @@ from typing import Final
 import numpy as np
 
 from calib import se3
+from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.range_scan import azimuths
 from omnid.engine.telemetry import Telemetry
 from omnid.messages import MapUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Outgoing
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.odometry import base_pose, of_base
 from omnid.transport.decode import Cloud, Pose
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.scan_codec import Scan
@@ -30,8 +31,8 @@ MAP_EVERY_S: Final = 2.0
 class ReplayView:
     """A sink of a run that draws poses, frames and maps."""
 
-    def __init__(self, scene: RerunScene, geometry: Geometry, telemetry: Telemetry) -> None:
-        self._scene, self._geometry = scene, geometry
+    def __init__(self, scene: RerunScene, front_end: FrontEnd, telemetry: Telemetry) -> None:
+        self._scene, self._geometry, self._dense = scene, front_end.geometry, front_end.dense
         self._latencies = StageLatencies(telemetry)
         self._drawn: KeyframeScans | None = None  # keyframes that were drawn last
 
@@ -58,8 +59,8 @@ class ReplayView:
             self._frame(odometry)
 
     def _frame(self, odometry: OdometryUpdate) -> None:
-        scene, depth, stamp_ns = self._scene, odometry.depth, odometry.stamp_ns
-        scene.panorama(stamp_ns, jpeg(depth.panoramas.lower.panorama))
+        scene, depth, stamp_ns = self._scene, self._dense.of(odometry.depth), odometry.stamp_ns
+        scene.panorama(stamp_ns, jpeg(odometry.depth.panoramas.lower.panorama))
         scene.features(stamp_ns, odometry.features)
         focal_baseline = self._geometry.cylinder.focal_px * self._geometry.rig.baseline_m
         scene.depth(stamp_ns, depth_image(depth.disparity, focal_baseline), depth.points)
@@ -88,7 +89,9 @@ def pose_of(odometry: OdometryUpdate, geometry: Geometry) -> Pose:
     """Return the pose of the base, as subscribers of the bus receive it."""
     attachment = PoseAttachment(odometry.seq, odometry.state, resets=odometry.reset_counter, inliers=odometry.inliers,
                                 tracked=odometry.tracks)
-    return Pose(odometry.stamp_ns, *of_base(odometry, geometry.rig.T_base_rig), attachment, odometry.stamp_ns)
+    base = of_base(odometry, geometry.rig.T_base_rig)
+    in_odom_axes = base._replace(covariance=in_outer_axes(base.T_odom_base, base.covariance))
+    return Pose(odometry.stamp_ns, *in_odom_axes, attachment, odometry.stamp_ns)
 
 
 class StageLatencies:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, Protocol
 
-from omnid.monitor.robot_state import plain
+from omnid.plain_text import plain
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus

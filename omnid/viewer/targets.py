@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 import rerun as rr
 
+from omnid.engine.python_program import python, python_environment
 from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 
@@ -187,7 +188,8 @@ def _flush(stream: rr.RecordingStream, fault: str) -> None:
 def opt_out() -> None:
     """Turn rerun's usage statistics off for this user; `rerun analytics enable` turns them on again."""
     with suppress(OSError, subprocess.SubprocessError):
-        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=TIMEOUT_S, check=False)
+        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=TIMEOUT_S, check=False,
+                       env=python_environment())
 
 
 def _require_display() -> None:
@@ -197,13 +199,13 @@ def _require_display() -> None:
 
 def _rerun(arguments: list[str]) -> list[str]:
     """Return the command line of rerun's viewer; `python -m rerun_cli` does not return its exit code."""
-    return [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())", *arguments]
+    return python("-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())", *arguments)
 
 
 def _started(output: IO[bytes], arguments: list[str]) -> subprocess.Popen[bytes]:
     """Start the viewer in a session of its own, which Ctrl-C does not end."""
     return subprocess.Popen(_rerun(arguments), stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                            start_new_session=True, env=os.environ | {"RUST_LOG": "warn"})
+                            start_new_session=True, env=python_environment(RUST_LOG="warn"))
 
 
 def _wait_for(port: int, process: subprocess.Popen[bytes], output: IO[bytes]) -> None:

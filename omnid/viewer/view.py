@@ -106,7 +106,7 @@ def _closing(scene: RerunScene, target: ViewerTarget) -> Iterator[None]:
 
 def _replayed(log: Log, config: Config, scene: RerunScene, replay: Replay) -> int:
     options = ReplayOptions(rig=log.rig, topics=log.topics, settings=log.settings, map_every_s=MAP_EVERY_S,
-                            observer=lambda geometry, telemetry: ReplayView(scene, geometry, telemetry))
+                            observer=lambda front_end, telemetry: ReplayView(scene, front_end, telemetry))
     return replay(log.path, config, options)
 
 

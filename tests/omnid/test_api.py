@@ -118,8 +118,8 @@ def test_images_give_the_bytes_of_a_replay(scene: Path, pairs: list[Pair], resul
     assert np.array_equal([pose.covariance for pose in poses], result.covariances)
     rows = [tum_row(pose.stamp_ns, pose.T_odom_rig) for pose in poses]
     assert rows == [tum_row(int(s), T) for s, T in zip(result.stamps_ns, result.T_odom_rig, strict=True)]
-    depth = poses[-1].depth
-    assert depth.disparity.shape == depth.panoramas.lower.panorama.shape == depth.panoramas.upper.panorama.shape
+    depth, seen = odometry.depth(poses[-1]), poses[-1].depth.panoramas
+    assert depth.disparity.shape == seen.lower.panorama.shape == seen.upper.panorama.shape
     assert depth.points.shape == (len(depth.variance_m2), 3) and len(depth.points) > 500
 
 
@@ -173,7 +173,7 @@ def test_images_may_be_views(scene: Path, pairs: list[Pair]) -> None:
     stamp_ns, lower, upper = pairs[0]
     wide = np.repeat(lower, 2, axis=1)[:, ::2]
     assert not wide.flags.c_contiguous
-    assert len(odometry.process(np.int64(stamp_ns), wide, upper).depth.points) > 500  # type: ignore[arg-type]
+    assert len(odometry.depth(odometry.process(np.int64(stamp_ns), wide, upper)).points) > 500  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,11 @@ from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_S
 from omnid.core.control.safety_rules import FAILED
 from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
 
-# A busy machine is late with everything, and each fault would disarm.
+# A busy machine is late with everything: each fault would disarm, and another sender would take over.
 PATIENT = ("controller.arming=manual", "controller.deadlines.pose_s=8", "controller.deadlines.command_s=8",
            "controller.deadlines.tick_s=8", "motor.watchdog_ms=8000", "controller.trust.velocity_sigma_mps=0",
-           "controller.trust.yaw_rate_sigma_radps=0", "controller.trust.odometry_reset=ignore")
+           "controller.trust.yaw_rate_sigma_radps=0", "controller.trust.odometry_reset=ignore",
+           "controller.sources.hold_s=8")
 MANUAL = tuple(word for setting in PATIENT for word in ("--set", setting))
 WATCH_S = 0.5  # during which nothing may move
 HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
@@ -44,8 +45,8 @@ def expect_stand(operator: Operator, base: Base) -> None:
     assert not base.line.moved_since(since_s)
 
 
-def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, scene: Path) -> None:
-    with robot(scene, tmp_path, *MANUAL) as (daemon, operator, base):
+def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, course: Path) -> None:
+    with robot(course, tmp_path, *MANUAL) as (daemon, operator, base):
         operator.drive(0.3)
         expect_stand(operator, base)
         assert operator.message("wheels") == "not armed since the start"
@@ -83,7 +84,7 @@ def expect_the_operator_drives(daemon: Daemon, operator: Operator, base: Base) -
     assert all(note.wheels_mps[0] > 0.25 for note in list(base.line.notes) if note.at_s > since_s)
 
 
-def test_without_a_robot_the_error_says_what_to_do(scene: Path) -> None:
+def test_without_a_robot_the_error_says_what_to_do(course: Path) -> None:
     for command in ("arm", "stop"):
         line = [sys.executable, "-m", "omnid", command, "--connect", f"tcp/127.0.0.1:{free_port()}"]
         done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
@@ -93,10 +94,10 @@ def test_without_a_robot_the_error_says_what_to_do(scene: Path) -> None:
 
 @pytest.mark.slow
 def test_sigterm_with_subscribers_that_do_not_read_stops_the_wheels_and_ends_in_time(
-    tmp_path: Path, scene: Path
+    tmp_path: Path, course: Path
 ) -> None:
     """Three listeners get no processor; the daemon publishes panoramas for them. zenoh alone would wait for 20 s."""
-    with ExitStack() as ends, robot(scene, tmp_path, "--set", "bus.panorama_hz=10") as (daemon, operator, base):
+    with ExitStack() as ends, robot(course, tmp_path, "--set", "bus.panorama_hz=10") as (daemon, operator, base):
         listeners = [_started_listener(ends, daemon) for _ in range(3)]
         operator.drive(0.3)
         wait_until(lambda: base.drives, "motion")

@@ -38,7 +38,7 @@ def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene
 
 
 def test_a_refused_rig_may_be_a_warning(omnid: Command, scene: Path) -> None:
-    words = (*EXCHANGED, "--set", "stereo.rig_check=warn", "--inline")
+    words = (*EXCHANGED, "--set", "rig.check=warn", "--inline")
     wrong = omnid.replay(scene / "log.mcap", *words, rig=scene / "rig.toml")
     assert wrong.code < 2 and "warning: the images match better the other way round" in wrong.err
     states = re.search(r"states +tracking ([0-9.]+)%", wrong.out)

@@ -20,6 +20,7 @@ from omnid.engine.graph import Graph
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Synchronise
 
@@ -60,7 +61,7 @@ def test_memory_stays_constant(tmp_path: Path, threaded: bool) -> None:
     graph = Graph(threaded=threaded)
     ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, ends)
+    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), FrontEnd(place, config), config, ends)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == PAIRS

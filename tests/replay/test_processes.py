@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,11 +24,13 @@ from omnid.formats.tum import read_tum
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
 from tests.replay.command import Command, rows
+from tests.replay.edited import images, save
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
+PAUSE_PAIRS = 36_000  # an hour
 
 
 def replaying(scene: Path, *words: object) -> list[str]:
@@ -54,13 +57,23 @@ def wait_until(happens: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
+@pytest.fixture(scope="module")
+def paused(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene with a pause of an hour before its last pairs: a replay in real time does not end by itself."""
+    folder = tmp_path_factory.mktemp("paused")
+    shutil.copy(scene / "rig.toml", folder / "rig.toml")
+    save(folder / "log.mcap", (image.later(PAUSE_PAIRS) if image.pair >= PAIRS - 4 else image
+                               for image in images(scene / "log.mcap")))
+    return folder
+
+
 @pytest.mark.parametrize(("number", "code", "manner"), [
     (signal.SIGINT, 130, []), (signal.SIGINT, 130, ["--inline"]), (signal.SIGTERM, 143, []),
     (signal.SIGHUP, 129, ["--inline"]), pytest.param(signal.SIGTERM, 143, ["--inline"], marks=pytest.mark.slow),
     pytest.param(signal.SIGHUP, 129, [], marks=pytest.mark.slow)])
-def test_signals_leave_whole_results(tmp_path: Path, scene: Path, number: int, code: int, manner: list[str]) -> None:
+def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, code: int, manner: list[str]) -> None:
     tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
-    command = replaying(scene, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, *manner)
+    command = replaying(paused, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, *manner)
     with started(command) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         process.send_signal(number)

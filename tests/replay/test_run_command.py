@@ -26,8 +26,8 @@ SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
 
-def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, scene: Path) -> None:
-    with robot(scene, tmp_path) as (daemon, operator, base):
+def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, course: Path) -> None:
+    with robot(course, tmp_path) as (daemon, operator, base):
         time.sleep(0.5)
         assert not base.line.moved_since(0.0), "no command yet"
         operator.drive(0.3)
@@ -69,21 +69,21 @@ def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> No
     assert "the images match better the other way round" in done.stderr
 
 
-def test_every_part_has_a_status(tmp_path: Path, scene: Path) -> None:
-    settings = ("record.enabled=true", f'record.folder="{tmp_path / "log"}"', "live.check_s=0.1")
+def test_every_part_has_a_status(tmp_path: Path, course: Path) -> None:
+    settings = ("record.enabled=true", f'record.folder="{tmp_path / "log"}"', "rig.check_s=0.1")
     words = (word for setting in settings for word in ("--set", setting))
-    with robot(scene, tmp_path, *words) as (daemon, operator, _):
+    with robot(course, tmp_path, *words) as (daemon, operator, _):
         wait_until(lambda: operator.message("recording") == "recording", "the recording's word")
         assert operator.message("bus") == "open"
         wait_until(lambda: operator.values("rig").get("new_views") == "1", "a first look at the rig")
         assert daemon.end()[0] == 0
 
 
-def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
+def test_poses_are_those_of_the_scene(tmp_path: Path, course: Path) -> None:
     """On the path of the log, forwards and backwards, no pose is farther from the start than its end."""
-    truth = read_tum(scene / "truth.txt")
+    truth = read_tum(course / "truth.txt")
     longest_m = max(float(np.linalg.norm(T[:3, 3] - truth.T[0][:3, 3])) for T in truth.T)
-    with robot(scene, tmp_path) as (_, operator, _):
+    with robot(course, tmp_path) as (_, operator, _):
         wait_until(lambda: len(operator.poses) >= 15, "fifteen poses")
         now_s = time.time()
         away_m = [float(np.linalg.norm(record.T_odom_base[:3, 3])) for record in operator.poses]
@@ -93,8 +93,8 @@ def test_poses_are_those_of_the_scene(tmp_path: Path, scene: Path) -> None:
         assert (steps_ns > 0).all()
 
 
-def test_a_camera_fails_and_recovers(tmp_path: Path, scene: Path) -> None:
-    with robot(scene, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
+def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
+    with robot(course, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.drives, "motion")
         daemon.write_line("upper mute")

@@ -31,8 +31,8 @@ def keyboard(port: int) -> Iterator[tuple[int, subprocess.Popen[bytes]]]:
             os.close(keys)
 
 
-def test_keys_arm_drive_and_stop(tmp_path: Path, scene: Path) -> None:
-    with robot(scene, tmp_path, *MANUAL) as (daemon, operator, base), keyboard(daemon.port) as (keys, process):
+def test_keys_arm_drive_and_stop(tmp_path: Path, course: Path) -> None:
+    with robot(course, tmp_path, *MANUAL) as (daemon, operator, base), keyboard(daemon.port) as (keys, process):
 
         def pressed(key: bytes) -> bool:
             os.set_blocking(keys, False)

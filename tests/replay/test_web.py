@@ -26,9 +26,9 @@ def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[
         return Shown(live).until("state", holds=holds)
 
 
-def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, scene: Path) -> None:
+def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, course: Path) -> None:
     folder = tmp_path / "recordings"
-    with robot(scene, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base), \
+    with robot(course, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base), \
             served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", folder) as server:
         operator.drive(0.3)
         assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
@@ -52,7 +52,7 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         gone = state(server, lambda found: found["alive"] is False and len(found["warnings"]) == 1)
         assert gone["wheels"] is None and gone["warnings"][0]["name"] == "robot"
         assert '"state":"whole"' in server.request("/recordings", headers=server.bearer).text
-        with started(command_line(scene, daemon.port, base.port, *MANUAL), daemon.port):
+        with started(command_line(course, daemon.port, base.port, *MANUAL), daemon.port):
             again = state(server, lambda found: found["alive"] and found["fresh"] and found["wheels"])
             assert not again["wheels"]["armed"]
             with server.live(server.bearer) as live:

@@ -12,19 +12,21 @@ import math
 from collections import deque
 from typing import Final, NamedTuple
 
+from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.collision_geometry import Outline, contact_s
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 
-S_PER_NS: Final = 1e-9
+S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
-TURN_MPS: Final = 0.01  # slower motions turn on the spot
-LEAST_MPS: Final = 0.02  # slower than this the base stops
-BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on
-UNKNOWN_SECTORS: Final = 5  # consecutive ones without a range that make a direction unknown
-MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles
-MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once
-MOST_MOVING: Final = 16
+TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
+LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
+BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on; because the rest is for lag
+# Consecutive ones without a range that make a direction unknown; by trial on development seeds.
+UNKNOWN_SECTORS: Final = 5
+MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles; 0.15 m of a person at 1.5 m/s: fine enough
+MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
+MOST_MOVING: Final = 16  # so that the time of a tick is bounded (docs/results/speed.md has it with so many)
 
 BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"
@@ -78,8 +80,8 @@ class CollisionMonitor:
         self._settings, self._deceleration = settings, deceleration_mps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
         self._stamp_ns: int | None = None
-        self._points: list[tuple[float, float]] = []  # obstacles in the frame of the ring
-        self._unknown: list[tuple[float, float]] = []  # where the way that was seen to be free ends, nothing is known
+        self._points: list[Point] = []  # obstacles in the frame of the ring
+        self._unknown: list[Point] = []  # where the way that was seen to be free ends, nothing is known
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
         self.reason = ""  # of the last step: why the motion was changed
@@ -127,20 +129,20 @@ class CollisionMonitor:
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
         reach_m = way_m + self._outline.radius_m + settings.stop_m + settings.slow_m
-        points = _seen_from(self._points, moved, reach_m)
+        points = _within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
-            allowances.append(self._into_unknown(_seen_from(self._unknown, moved, reach_m), motion))
+            allowances.append(self._into_unknown(_within_reach(self._unknown, moved, reach_m), motion))
         if self._moving:
             allowances.append(self._before_moving(moved, age_s, motion))
         return min(allowances)
 
-    def _before(self, points: list[tuple[float, float]], motion: Twist) -> Allowance:
+    def _before(self, points: list[Point], motion: Twist) -> Allowance:
         """Keep the time to collision, and stop before what is in the stop polygon."""
         share = self._share_before(points, motion)
         return FREE if share >= 1.0 else Allowance(share, BLOCKED if share == 0.0 else NEAR)
 
-    def _share_before(self, points: list[tuple[float, float]], motion: Twist) -> float:
+    def _share_before(self, points: list[Point], motion: Twist) -> float:
         settings = self._settings
         stop = self._stop_polygon(motion)
         first_s = math.inf
@@ -167,7 +169,7 @@ class CollisionMonitor:
         behind_m = settings.stop_m if motion.velocity_mps < -TURN_MPS else 0.0
         return Outline(outline.front_m + ahead_m, outline.rear_m + behind_m, outline.half_width_m + settings.side_m)
 
-    def _near(self, points: list[tuple[float, float]], motion: Twist) -> Allowance:
+    def _near(self, points: list[Point], motion: Twist) -> Allowance:
         """Drive slowly while something is in the slow polygon, on the side to which the base moves."""
         settings, outline = self._settings, self._outline
         if abs(motion.velocity_mps) <= settings.slow_mps:
@@ -178,7 +180,7 @@ class CollisionMonitor:
         is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
 
-    def _into_unknown(self, unknown: list[tuple[float, float]], motion: Twist) -> Allowance:
+    def _into_unknown(self, unknown: list[Point], motion: Twist) -> Allowance:
         """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all."""
         if abs(motion.velocity_mps) <= TURN_MPS:
             return FREE
@@ -188,16 +190,17 @@ class CollisionMonitor:
         share = max(self._share_before(unknown, motion), least)
         return FREE if share >= 1.0 else Allowance(share, UNKNOWN)
 
-    def _before_moving(self, moved: tuple[float, float, float], age_s: float, motion: Twist) -> Allowance:
+    def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
         """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be."""
         settings, stop = self._settings, self._stop_polygon(motion)
         steps = math.ceil(settings.time_s / MOVING_STEP_S)
         for step in range(steps):
             ahead_s = step * MOVING_STEP_S
-            pose = _composed(moved, _on_arc(motion, ahead_s))
-            for obstacle in self._moving:
-                at_s = age_s + ahead_s
-                x, y = _in_frame(pose, obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
+            pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
+            at_s = age_s + ahead_s
+            places = [(obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
+                      for obstacle in self._moving]
+            for obstacle, (x, y) in zip(self._moving, seen_from(pose, places), strict=True):
                 if stop.gap_m(x, y) <= obstacle.radius_m and (step or self._outline.is_approached(x, y, motion)):
                     return Allowance(0.0 if ahead_s <= MOVING_STOP_S else ahead_s / settings.time_s, MOVING)
         return FREE
@@ -209,9 +212,9 @@ class CollisionMonitor:
         edge_mps = max(abs(motion.velocity_mps), abs(motion.yaw_rate_radps) * self._outline.radius_m)
         return FREE if edge_mps <= speed_mps else Allowance(speed_mps / edge_mps, reason)
 
-    def _moved_since(self, stamp_ns: int, now_ns: int) -> tuple[float, float, float]:
-        """Return x, y and yaw of the base now in the frame of the ring, by the motions since its images."""
-        pose, until_ns = (0.0, 0.0, 0.0), now_ns
+    def _moved_since(self, stamp_ns: int, now_ns: int) -> Pose2:
+        """Return the pose of the base now in the frame of the ring, by the motions since its images."""
+        pose, until_ns = IDENTITY, now_ns
         pieces = []
         for at_ns, motion in reversed(self._motions):
             begin_ns = max(at_ns, stamp_ns)
@@ -221,7 +224,7 @@ class CollisionMonitor:
             if at_ns <= stamp_ns:
                 break
         for motion, dt_s in reversed(pieces):
-            pose = _composed(pose, _on_arc(motion, dt_s))
+            pose = composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, dt_s))
         return pose
 
 
@@ -243,31 +246,7 @@ def _unknown_sectors(ranges_m: tuple[float, ...]) -> list[int]:
     return found
 
 
-def _on_arc(motion: Twist, dt_s: float) -> tuple[float, float, float]:
-    """Return x, y and yaw after a time of a constant motion."""
-    turn = motion.yaw_rate_radps * dt_s
-    chord = motion.velocity_mps * dt_s
-    if abs(turn) > 1e-9:
-        chord *= 2 * math.sin(turn / 2) / turn
-    return chord * math.cos(turn / 2), chord * math.sin(turn / 2), turn
-
-
-def _composed(first: tuple[float, float, float], then: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the pose of `then`, which is given in the frame of `first`."""
-    c, s = math.cos(first[2]), math.sin(first[2])
-    return first[0] + c * then[0] - s * then[1], first[1] + s * then[0] + c * then[1], first[2] + then[2]
-
-
-def _in_frame(pose: tuple[float, float, float], x_m: float, y_m: float) -> tuple[float, float]:
-    """Return a point in the frame at a pose."""
-    dx, dy, c, s = x_m - pose[0], y_m - pose[1], math.cos(pose[2]), math.sin(pose[2])
-    return c * dx + s * dy, c * dy - s * dx
-
-
-def _seen_from(points: list[tuple[float, float]], pose: tuple[float, float, float], reach_m: float
-               ) -> list[tuple[float, float]]:
-    """Return points in the frame at a pose, those within reach."""
-    px, py, c, s = pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])
+def _within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point]:
+    """Return the points within reach of a pose, in its axes."""
     reach2 = reach_m * reach_m
-    return [(c * (x - px) + s * (y - py), c * (y - py) - s * (x - px)) for x, y in points
-            if (x - px) ** 2 + (y - py) ** 2 <= reach2]
+    return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])

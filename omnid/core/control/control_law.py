@@ -30,7 +30,7 @@ from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9
+S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 JUMP_RAD: Final = 0.3  # of the heading, beyond what the base can turn: odometry was corrected, or is wrong
 
 
@@ -160,28 +160,36 @@ class ControlLaw:
         """Ask to arm; the next step answers (arming.answer)."""
         self.arming.request(request)
 
+    def stand(self) -> None:
+        """Take the base to stand now, because its motor controller has stopped it: the next step starts from there."""
+        self.motion = STOP
+
     def end(self) -> None:
-        """Stop the wheels for good."""
+        """Stop the wheels until the process ends."""
         self._ending = True
 
     def step(self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False,
              motor_stopped: bool = False) -> ControlOutput:
         """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
+        # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
         inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
         deadlines = self._settings.deadlines
         accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
         if accepted is not None:
             self._void_ns = max(self._void_ns, accepted.arrival_ns)
+        # 2. The reason to stop, of all rules; it voids the setpoints that have arrived so far.
         self.reason = stop_reason(replace(inputs, stop_asked=self.arming.stop_asked, armed=self.arming.armed,
                                           command_age_s=self._command_age_s(now_ns)), deadlines)
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
+        # 3. The motion: a ramp to a stand, or towards the setpoint as far as trust and obstacles allow.
         pose, command = self._pose, self.commands.current
         if self.reason or pose is None or command is None:
             self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
         else:
             heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), now_ns, dt_s)
+        # 4. The collision monitor follows the motion, so that it knows where an older ring is now.
         self.collision.follow(now_ns, self.motion)
         return ControlOutput(self.motion, heading_rad, self.reason)
 

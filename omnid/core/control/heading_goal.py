@@ -8,7 +8,9 @@ from typing import Final
 from omnid.core.control.heading_controller import HeadingLimits, wrap_angle
 from omnid.core.control.velocity_limits import VelocityLimits
 
-REACTION_S: Final = 0.15  # between the heading that the motor controller reported and its turn to the next goal
+# Between the heading that the motor controller reported and its turn to the next goal; by trial with simulated
+# controllers.
+REACTION_S: Final = 0.15
 OVERSPEED: Final = 1.1  # times the yaw rate's limit, reported: the goal is the present heading until it is slower
 
 

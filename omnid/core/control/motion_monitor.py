@@ -23,11 +23,13 @@ from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.control.velocity_limits import STOP
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9
+S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
-SIGMAS: Final = 3.0
-RECOVERY: Final = 0.5  # of the motion that stops, per second in which nothing is unexplained
-REST_S: Final = 2.0  # commanded to stand for so long, the base begins again with nothing unexplained
+SIGMAS: Final = 3.0  # so that 0.3 % of honest differences exceed it
+# Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
+RECOVERY: Final = 0.5
+# Commanded to stand for so long, the base begins again with nothing unexplained; by trial on development seeds.
+REST_S: Final = 2.0
 
 NOT_SEEN: Final = "the images do not show the commanded motion"
 NOT_COMMANDED: Final = "the images show a motion that was not commanded"

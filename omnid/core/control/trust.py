@@ -7,9 +7,10 @@ from typing import Final
 
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9
-BATTERY_S: Final = 2.0  # a voltage that is low for a shorter time is that of a motor that starts
-OFF: Final = 0.0
+S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
+# A voltage that is low for a shorter time is that of a motor that starts; by trial on development seeds.
+BATTERY_S: Final = 2.0
+OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed, relative
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
@@ -22,16 +23,15 @@ from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation, refusal_of_map, refusal_to_drive
-from omnid.core.places.planar import composed, relative
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
 STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
-PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)
-BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left
-PLANNED_M: Final = 4.0  # of the path that the local planner is given
+PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # by trial on development seeds
+BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left; by trial on development seeds
+PLANNED_M: Final = 4.0  # of the path that the local planner is given; enough: its grid ends at 3.2 m
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
 AROUND: Final = "it looks for a way around an obstacle"
 

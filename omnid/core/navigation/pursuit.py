@@ -18,11 +18,12 @@ from omnid.core.navigation.settings import PursuitSettings
 
 Array = NDArray[np.float64]
 
-TURN_RAD: Final = math.radians(45)  # the base turns, standing, towards a point that is farther aside
-TURNED_RAD: Final = math.radians(4)  # and until it is nearer than that
+# The base turns, standing, towards a point that is farther aside; by trial on development seeds.
+TURN_RAD: Final = math.radians(45)
+TURNED_RAD: Final = math.radians(4)  # and until it is nearer than that; by trial on development seeds
 BRAKE_SHARE: Final = 0.7  # of the deceleration is planned: the base follows with a lag
 APPROACH_HZ: Final = 1.2  # speed per distance to the end: the last centimetres are slow
-LAST_MPS: Final = 0.02  # least speed before the end
+LAST_MPS: Final = 0.02  # least speed before the end; by trial on development seeds
 
 
 class Approach(NamedTuple):

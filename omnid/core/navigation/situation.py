@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed
 from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.requests import NavigationFrame
-from omnid.core.places.planar import composed
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Greys = NDArray[np.float32]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Greys = NDArray[np.float32]

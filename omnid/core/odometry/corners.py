@@ -6,15 +6,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, flow, track
+from omnid.core.odometry.tracking import KltSettings, flow, track
+from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-CELL_PX = 48  # side of the cells among which the corners are shared out evenly
-MAX_CELLS = 4096  # more cells than a row of any panorama has: one index for row and column
+# Side of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are about 200
+# cells, so that each has two or three of the 500 landmarks wanted.
+CELL_PX = 48
+# More cells than a row of any panorama has, so that one index stands for row and column.
+MAX_CELLS = 4096
 BLOCK_PX = 5  # window over which the gradients of a corner are summed
-APART_PX = 9  # side of the square in which a corner is the maximum
+# Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
+# landmarks of one piece of texture.
+APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
 NOISE_RESPONSE = 2.5e-5  # that noise of one grey level reaches in one pixel of a hundred: it grows with its square
 CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
+from omnid.core.odometry.exposure_times import NOTHING_ASSUMED, AssumedMotion, Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-JUMP_M, JUMP_RAD = 0.5, math.radians(30)  # from a published pose, which odom does not make unannounced
+# A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
+# reset_counter, or the gap stays open.
+JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +37,13 @@ class PoseEstimate:
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
-    assumed: AssumedMotion | None = None  # by which the disparities were corrected; None: exposed at once
+    assumed: AssumedMotion = NOTHING_ASSUMED  # by which the disparities were corrected
 
     @property
     def without_landmarks(self) -> PoseEstimate:
         """The pose alone, where its landmarks are no longer in the map."""
         return replace(self, landmarks=self.landmarks[:0], views=self.views[:0], pixels=self.pixels[:0],
-                       variance=self.variance[:0], assumed=None)
+                       variance=self.variance[:0], assumed=NOTHING_ASSUMED)
 
     @property
     def inlier_ratio(self) -> float:
@@ -64,7 +66,8 @@ class OdometryEstimate:
     features: Features = field(default_factory=Features)
     step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
     is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
-    keyframe_exposure: Exposure | None = None  # the motion that it is then corrected for; None: exposed at once
+    # The motion during the exposures, for dense stereo of the frame; None: not known.
+    exposure: Exposure | None = None
 
 
 @dataclass(frozen=True, slots=True)

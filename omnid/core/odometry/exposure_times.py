@@ -14,31 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.types.pixel_times import PixelTimes
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-ROUNDS = 3  # of triangulation and correction: each reduces the error by the ratio of motion to distance
-
-KNOWN_SIGMA = 0.2  # m/s and rad/s: in 15 ms 3 mm and 0.2 deg
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ExposureTimes:
-    """Times of exposure of a pair's panorama pixels, s after the stamp of the pair."""
-
-    skew_s: float = 0.0  # of the upper image's first row
-    lower_rows_s: NDArray[np.float32] | None = None  # (H, W) of each pixel after the first image row; None: at once
-    upper_rows_s: NDArray[np.float32] | None = None
-
-    def lower(self, pixels: Array) -> Array:
-        """Return the times (N,) of pixels (N, 2) of the lower panorama."""
-        return _read(self.lower_rows_s, pixels)
-
-    def upper(self, pixels: Array) -> Array:
-        """Return the times (N,) of pixels (N, 2) of the upper panorama."""
-        return self.skew_s + _read(self.upper_rows_s, pixels)
+# Rounds of triangulation and correction: each reduces the error by the ratio of motion to distance.
+ROUNDS = 3
+# Standard deviation, m/s and rad/s, below which a velocity is known well enough to check a rig: in 15 ms between two
+# exposures that is an error of 3 mm and 0.2 degrees of the motion.
+KNOWN_SIGMA = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +35,24 @@ class RigVelocity:
     covariance: Array
 
 
+# Velocity of frames that are exposed at once: it needs no components, because no view depends on it.
+NO_VELOCITY = RigVelocity(np.zeros(0), np.zeros((0, 0)))
+
+
 class AssumedMotion(NamedTuple):
-    """The velocity for which views were corrected, and their derivatives by it."""
+    """The velocity of K components for which views were corrected, and their derivatives by it."""
 
     velocity: RigVelocity
-    derivatives: Array  # (N, 6) px of the disparities, or (N, 3, 6) px of the views
+    derivatives: Array  # (N, K) px of the disparities, or (N, 3, K) px of the views
+
+    @property
+    def is_final(self) -> bool:
+        """True if no velocity that is found later changes the views."""
+        return len(self.velocity.twist) == 0
+
+
+# Of views that need no correction.
+NOTHING_ASSUMED = AssumedMotion(NO_VELOCITY, np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ class ViewShift:
 
     lower: Array  # (N, 2) px: column, row
     upper: Array  # (N, 2) px
-    by_motion: Array  # (N, 4, 6) derivatives by the velocity: of lower column and row, upper row and column
+    by_motion: Array  # (N, 4, K) derivatives by the velocity: of lower column and row, upper row and column
 
     def noise(self, motion: RigVelocity) -> Array:
         """Return the covariance (N, 3, 3) [px^2] of corrected views by the uncertainty of the velocity."""
@@ -79,9 +78,14 @@ class ViewShift:
 class Exposure:
     """Times of exposure of a frame and the motion during it."""
 
-    times: ExposureTimes
+    times: PixelTimes
     motion: RigVelocity
     model: StereoModel
+
+    @staticmethod
+    def of(times: PixelTimes, motion: RigVelocity, model: StereoModel) -> Exposure:
+        """Return the exposure of a frame; one that corrects nothing where all pixels are exposed at the stamp."""
+        return _AtOnce(times, NO_VELOCITY, model) if times.is_at_once else Exposure(times, motion, model)
 
     @property
     def is_known(self) -> bool:
@@ -160,10 +164,28 @@ class Exposure:
         return views, noise
 
 
-def _read(table: NDArray[np.float32] | None, pixels: Array) -> Array:
-    """Return the values (N,) of a table (H, W) at the nearest of pixels (N, 2); zeros without a table."""
-    if table is None:
-        return np.zeros(len(pixels))
-    columns = np.rint(pixels[:, 0]).astype(np.intp) % table.shape[1]
-    rows = np.clip(np.rint(pixels[:, 1]), 0, len(table) - 1).astype(np.intp)
-    return np.asarray(table[rows, columns], float)
+class _AtOnce(Exposure):
+    """Exposure of all pixels at the stamp: views are left as seen, and no component of a velocity matters."""
+
+    __slots__ = ()
+
+    def shift(self, points: Array) -> ViewShift:
+        """Return shifts of zero."""
+        count = len(points)
+        return ViewShift(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros((count, 4, 0)))
+
+    def derivatives(self, views: Array) -> Array:
+        """Return no derivatives (N, 3, 0)."""
+        return np.zeros((len(views), 3, 0))
+
+    def upper_columns(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
+        """Return the columns (N,) of the pixels, without spread."""
+        return pixels[:, 0].copy(), np.zeros(len(pixels))
+
+    def upper_pixels(self, pixels: Array, disparity: Array) -> tuple[Array, Array]:
+        """Return the pixels (N, 2) that are higher by the disparities (N,), without spread."""
+        return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
+
+    def corrected(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
+        """Return the views (N, 3) as seen, without noise."""
+        return np.column_stack([pixels, rows]), np.zeros((len(pixels), 3, 3))

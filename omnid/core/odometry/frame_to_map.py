@@ -14,23 +14,20 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
-from omnid.core.odometry.pose_estimation import (
-    CONVERGED,
-    GaussNewtonResult,
-    SharedError,
-    StereoModel,
-    gauss_newton,
-    ransac,
-)
+from omnid.core.odometry.pose_estimation import CONVERGED, GaussNewtonResult, SharedError, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-MIN_LANDMARKS = 6  # below which six unknowns are no estimate
-OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
+# Fewer landmarks are no estimate of six unknowns: three determine them, and as many must confirm it.
+MIN_LANDMARKS = 6
+# Squared Mahalanobis distance from which a view is an outlier: 4 sigma in one of its three components. Of views with
+# normal errors one in a thousand is farther away, so that hardly any is lost.
+OUTLIER_SQUARED = 16.0
 # Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
 COARSE_STEPS, STEPS = (3,), (2, 4)
 FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
@@ -42,7 +39,9 @@ COARSE_SIGMA_PX = 0.3  # standard deviation of a track whose patch was not yet w
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
 # errors are correlated.
 CORRELATED_LANDMARKS = 4.0
-VIEW_DIMENSIONS = 3  # expected value of the squared Mahalanobis distance of a view
+# Expected value of the squared Mahalanobis distance of a view, because that is a sum of three squares, each with an
+# expected value of 1.
+VIEW_DIMENSIONS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,29 +63,27 @@ class FrameToMap:
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         self._stereo_klt = replace(klt, levels=0)  # the predicted disparity is good to a few pixels
 
-    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure | None = None
+    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure
                  ) -> CoarsePose | None:
         """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
 
         RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
-        place of the paper's eq. (9). exposure: None where all pixels are exposed at the stamp.
+        place of the paper's eq. (9).
         """
         if len(tracks.landmarks) < MIN_LANDMARKS:
             return None
         T_guess_odom = se3.inverse(T_odom_guess)
         in_guess = se3.apply(T_guess_odom, self._map.store.table.points[tracks.landmarks])
         slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
-        shift = exposure.shift(in_guess) if exposure else None
-        spread_px = 2 * shift.column_sigma(exposure.motion) if exposure and shift else 0.0
-        views, variance = self._views(frame, tracks, slopes, shift, spread_px)
+        shift = exposure.shift(in_guess)
+        views, variance = self._views(frame, tracks, slopes, shift, 2 * shift.column_sigma(exposure.motion))
         disparity = views[:, 2] - views[:, 1]
-        if shift:
-            views += np.column_stack([shift.lower, shift.upper[:, 1]])
+        views += np.column_stack([shift.lower, shift.upper[:, 1]])
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
         landmarks = tracks.landmarks[is_inlier]
-        noise = shift.noise(exposure.motion)[is_inlier] if exposure and shift else None
+        noise = shift.noise(exposure.motion)[is_inlier]
         solution, kept = self._solve(landmarks, views[is_inlier], T_curr_guess @ T_guess_odom, self._coarse_model,
-                                     noise, converged=COARSE_CONVERGED)
+                                     noise, SharedError.none(len(landmarks)), converged=COARSE_CONVERGED)
         if solution is None:
             return None
         chosen = np.flatnonzero(is_inlier)[kept]
@@ -101,7 +98,7 @@ class FrameToMap:
             return replace(coarse, T_curr_odom=se3.inverse(T_odom_rect))
         return found
 
-    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None = None) -> PoseEstimate | None:
+    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
 
         The disparity of the tracked landmarks was measured between the images of this frame, so it is kept and goes
@@ -111,30 +108,27 @@ class FrameToMap:
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
         landmarks, _ = self._map.visible(T_odom_curr)
         in_curr = se3.apply(coarse.T_curr_odom, self._map.store.table.points[landmarks])
-        shift = exposure.shift(in_curr) if exposure else None
-        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower if shift else 0.0)
+        shift = exposure.shift(in_curr)
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower)
         landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
         disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
         disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
         noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
-        by_motion: SharedError | None = None
-        if exposure and shift:
-            # The velocity is estimated along with the pose. Its prior is one measurement, no correlated ones.
-            views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
-            covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
-            by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
+        # The velocity is estimated along with the pose. Its prior is one measurement, no correlated ones.
+        views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
+        covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
+        by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
         solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
         # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
-        variance, assumed = variance[landmarks], None
-        if exposure and by_motion:
-            # The velocity found here agrees with the depths in the map, so it must not correct them: a vertical one
-            # has the effect of another baseline, and the scale would drift. That of the steps is independent.
-            of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
-            assumed = AssumedMotion(exposure.motion, of_depth[kept])
+        variance = variance[landmarks]
+        # The velocity found here agrees with the depths in the map, so it must not correct them: a vertical one has the
+        # effect of another baseline, and the scale would drift. That of the steps is independent.
+        of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
+        assumed = AssumedMotion(exposure.motion, of_depth[kept])
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
         visible, tracked, supporting = (
@@ -163,8 +157,8 @@ class FrameToMap:
                 break
         return best
 
-    def _views(self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift | None,
-               spread_px: Array | float) -> tuple[Array, Array]:
+    def _views(self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift, spread_px: Array
+               ) -> tuple[Array, Array]:
         """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
 
         slopes (M, 2) of their disparities; spread_px: standard deviations (M,) of the columns there, twice. Also
@@ -173,16 +167,15 @@ class FrameToMap:
         pair = frame.lower, frame.upper
         guess = tracks.pixels.copy()
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        if shift:
-            guess += shift.lower - shift.upper
+        guess += shift.lower - shift.upper
         # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
         near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
         rows, variance = align_rows(pair, tracks.pixels, near, slopes, self._model)
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
-        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array | None = None,
-        shared: SharedError | None = None, converged: float = CONVERGED,
+        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array,
+        shared: SharedError, converged: float = CONVERGED,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
@@ -191,10 +184,8 @@ class FrameToMap:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
-            of_views = None if noise is None else noise[kept]
-            of_all = None if shared is None else shared.of(kept)
             solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
-                                    of_views, steps, of_all, converged)
+                                    noise[kept], steps, shared.of(kept), converged)
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,15 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.new_landmarks import located
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-LANDMARK_SPACING_PX = 9  # smallest distance of a new landmark from a known one
+# Smallest distance of a new landmark from a known one: nearer ones would share most of their patches of 13 px, and so
+# their errors.
+LANDMARK_SPACING_PX = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +34,7 @@ class KeyframeRequest:
     usable: NDArray[np.bool_]  # (H, W) pixels in which landmarks may lie
     T_odom_rect: Array  # (4, 4)
     covariance: Array  # (6, 6) [t; r] in the rectified frame
-    exposure: Exposure | None  # None: all pixels are exposed at the stamp
+    exposure: Exposure
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px of the known landmarks
     ids: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (N,) of them; () to observe none
     views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) px of them at the stamp
@@ -70,7 +72,7 @@ class Keyframes:
         ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
         self._map.late_depths.added(ids, new)
         if len(self._map) >= self._limits.min_inliers:
-            self._relocaliser.add(frame, keyframe)
+            self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers = self._frames = 0
         self._map.store.add_observations(frame.seq, request.ids, request.views)
         return new.pixels

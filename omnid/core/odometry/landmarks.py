@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry import landmark_kernels
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import point_covariance, triangulate
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -32,7 +32,7 @@ class LateDepths:
 
     def seen(self, ids: Indices, estimate: PoseEstimate) -> None:
         """Correct the depths of the landmarks (N,) of an estimate, at once or when the velocity is known."""
-        if estimate.assumed is None:
+        if estimate.assumed.is_final:
             disparity = estimate.views[:, 2] - estimate.views[:, 1]
             self._store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
         else:
@@ -40,19 +40,17 @@ class LateDepths:
 
     def added(self, ids: Indices, new: NewLandmarks) -> None:
         """Correct the landmarks of a new keyframe, whose ids are (N,), when the velocity is known."""
-        self._added = None if new.assumed is None else (ids, new)
+        self._added = None if new.assumed.is_final else (ids, new)
 
     def settle(self, velocity: RigVelocity | None) -> None:
         """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
         if self._added is not None and velocity is not None:
             ids, new = self._added
-            assert new.assumed is not None
             assumed, J = new.assumed
             views = new.views + J @ (velocity.twist - assumed.twist)
             self._store.replace_views(ids, views, new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
         if self._seen is not None:
             ids, estimate = self._seen
-            assert estimate.assumed is not None
             assumed, J = estimate.assumed
             known = assumed if velocity is None else velocity
             disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)

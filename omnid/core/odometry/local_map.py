@@ -12,9 +12,10 @@ from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.late_depths import LateDepths
 from omnid.core.odometry.patch_alignment import AlignedPatches, align
 from omnid.core.odometry.plane_patches import moved_slopes, plane_templates
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
+from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -96,8 +97,8 @@ class LocalMap:
         rows = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices,
-              shift: Array | float = 0.0) -> AlignedPatches:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, shift: Array
+              ) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
         A patch is found where it has texture and moved little from its prediction. shift: see ViewShift.lower.

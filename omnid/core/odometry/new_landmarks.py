@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,9 @@ from omnid.core.odometry.corners import nearby_disparity, pixels_in_upper
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
@@ -28,30 +28,27 @@ class NewLandmarks:
     views: Array  # (N, 3) px, at the stamp
     slopes: Array  # (N, 2) px/px of the disparity, at the stamp
     noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
-    assumed: AssumedMotion | None = None  # by which the views were corrected; None: exposed at once
+    assumed: AssumedMotion  # by which the views were corrected
 
     @property
     def whole_noise(self) -> Array:
         """Covariance (N, 3, 3) [px^2] of the views, also by the uncertain motion."""
-        if self.assumed is None:
-            return self.noise
         velocity, J = self.assumed
         return np.asarray(self.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
 
 
-def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure | None
+def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure
             ) -> NewLandmarks:
     """Return those of the corners (N, 2) of the lower panorama that are found in the upper one as well.
 
-    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel. exposure: None where
-    all pixels are exposed at the stamp.
+    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
     """
-    dense = frame.disparity_at(exposure)
-    guess = np.column_stack([corners[:, 0], corners[:, 1] + nearby_disparity(dense, corners)])
-    spread_px: Array | float = 0.0
-    if exposure:
-        guess, spread_px = exposure.upper_pixels(corners, guess[:, 1] - corners[:, 1])
+    # 1. Disparity by dense stereo.
+    dense = replace(frame, exposure=exposure).disparity
+    guess, spread_px = exposure.upper_pixels(corners, nearby_disparity(dense, corners))
     pair = frame.lower, frame.upper
+
+    # 2. Track into the upper panorama, and align the patch there with the slopes of its surface.
     near = pixels_in_upper(pair, corners, guess, klt, spread_px)
     slopes = disparity_slopes(dense, corners, near[:, 1] - corners[:, 1])
     slopes = fitted_slopes(pair, corners, near, slopes, model)
@@ -59,8 +56,8 @@ def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSett
     found = np.isfinite(rows)
     pixels, rows, slopes = corners[found], rows[found], slopes[found]
     noise = view_noise(np.zeros((2, 2)), variance[found])
-    if exposure is None:
-        return NewLandmarks(pixels, np.column_stack([pixels, rows]), slopes, noise)
+
+    # 3. Correct the views for the motion during the exposures.
     views, _ = exposure.corrected(pixels, rows)
     assumed = AssumedMotion(exposure.motion, exposure.derivatives(views))
     return NewLandmarks(pixels, views, _at_stamp(slopes, pixels, rows, exposure), noise, assumed)
@@ -72,8 +69,8 @@ def _at_stamp(slopes: Array, pixels: Array, rows: Array, exposure: Exposure) -> 
     for axis, step in enumerate(SLOPE_STEP_PX * np.eye(2)):
         ends = []
         for sign in (1, -1):
-            there = rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis])
-            views, _ = exposure.corrected(pixels + sign * step, there)
-            ends.append(views[:, 2] - views[:, 1])
-        corrected[:, axis] = (ends[0] - ends[1]) / (2 * SLOPE_STEP_PX)
+            there, above = pixels + sign * step, rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis])
+            views, _ = exposure.corrected(there, above)
+            ends.append((views[:, 2] - views[:, 1]) - (above - there[:, 1]))
+        corrected[:, axis] = slopes[:, axis] + (ends[0] - ends[1]) / (2 * SLOPE_STEP_PX)
     return np.where(np.isfinite(corrected), corrected, slopes)

@@ -15,19 +15,20 @@ from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
-from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
+from omnid.core.odometry.frame_exposures import FrameExposures
+from omnid.core.odometry.frame_to_map import FrameToMap
 from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
 from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
+from omnid.core.odometry.tracking import KltSettings
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
 from omnid.core.odometry.yaw_search import correlation_peaks, steps
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -39,7 +40,6 @@ SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two
 NEAR_RATIO = 0.5
 GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
-START_ROUNDS = 2  # of starting a map again, once the velocity is known
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.
 TRACKED_SHARE = 0.6
@@ -66,8 +66,8 @@ class VisualOdometry:
         self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # by the last frame, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
-        # The frame that started the map, if it was exposed at several times, until the velocity is known.
-        self._unmoved: StereoFrame | None = None
+        self._exposures = FrameExposures(self._motion, model, max_gap_s=limits.max_gap_s, local_map=self._map,
+                                         keyframes=self._keyframes, frame_to_map=self._frame_to_map)
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -83,12 +83,11 @@ class VisualOdometry:
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
         T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
-        exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
 
         # 2. to 4. Once a frame was refused, those without corners (darkness, a blank wall) are left out to save time.
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
-        estimate = self._estimate(frame, usable, T_predicted, exposure, dt_s) if searched else None
+        estimate = self._estimate(frame, usable, T_predicted, dt_s) if searched else None
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
@@ -101,22 +100,25 @@ class VisualOdometry:
             return self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
         self._resets += gap.is_turned  # odom has another heading than it was published with
 
-        if self._unmoved is not None:
-            estimate = self._start_again(frame, usable, estimate, dt_s)
+        estimate = self._exposures.start_again(frame, usable, estimate, dt_s, request=self._request,
+                                               tracked=self._tracked())
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
         new = estimate.pixels[self._map.store.table.anchor[estimate.landmarks] == self._added]
         self._added = None
-        exposure = self._exposure(frame, self._motion.at_exposure(dt_s))
+        exposure = self._exposures.predicted(frame, dt_s)
         self._requested = self._update_map(frame, usable, estimate, exposure)
-        result = self._result(estimate.tracked, estimate.inliers, Features(estimate.pixels, estimate.rejected, new))
-        return result if self._requested is None else replace(result, is_keyframe=True, keyframe_exposure=exposure)
+        features = Features(estimate.pixels, estimate.rejected, new)
+        if self._requested is None:
+            return self._result(estimate.tracked, estimate.inliers, features, self._exposures.now(frame))
+        result = self._result(estimate.tracked, estimate.inliers, features, exposure)
+        return replace(result, is_keyframe=True)
 
-    def _estimate(self, frame: StereoFrame, usable: Flags, T_predicted: Array, exposure: Exposure | None,
-                  dt_s: float) -> PoseEstimate | None:
+    def _estimate(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
         """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
         estimate: PoseEstimate | None = None
+        exposure = self._exposures.predicted(frame, dt_s)
         for T_guess, is_near in self._guesses(frame, usable, T_predicted):
             # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
             tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=is_near)
@@ -126,7 +128,7 @@ class VisualOdometry:
             coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
 
             # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-            refined = self._refine(frame, coarse, exposure, dt_s) if coarse else None
+            refined = self._exposures.refine(frame, coarse, exposure, self._T_odom_rect, dt_s) if coarse else None
             estimate = with_more_inliers(estimate, refined)
             if self._is_good(estimate, is_near):
                 break
@@ -141,45 +143,6 @@ class VisualOdometry:
         if requested is not None:
             self._keyframes.add(requested)
             self._added = requested.frame.seq
-
-    def _exposure(self, frame: StereoFrame, motion: RigVelocity | None) -> Exposure | None:
-        """Return the exposure of a frame, None where one instant is shown; motion: None for that of the filter."""
-        if frame.times is None:
-            return None
-        return Exposure(frame.times, motion or self._motion.now(), self._model)
-
-    def _refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure | None, dt_s: float
-                ) -> PoseEstimate | None:
-        """Refine a pose; where the velocity matters, once more with that which the pose implies, or with none."""
-        refined = self._frame_to_map.refine(frame, coarse, exposure)
-        if refined is None or exposure is None or not 0 < dt_s <= self._limits.max_gap_s:
-            return refined
-        T_prev_curr = se3.inverse(self._T_odom_rect) @ refined.T_odom_rect
-        is_sudden = self._motion.is_sudden(T_prev_curr, dt_s)
-        motion = UNKNOWN_VELOCITY if is_sudden else self._motion.after(T_prev_curr, refined.covariance, dt_s)
-        settled = Exposure(exposure.times, motion, self._model)
-        coarse = self._frame_to_map.again(frame, coarse, refined.T_odom_rect, settled)
-        return self._frame_to_map.refine(frame, coarse, settled)
-
-    def _start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float) -> PoseEstimate:
-        """Start the map again at its first frame, whose motion the second one shows; return the second one's pose.
-
-        The depths of the first frame were measured as if it stood still, so the motion is wrong by a few per cent of
-        what happens between two exposures: each round reduces the error so much.
-        """
-        first, self._unmoved = self._unmoved, None
-        for _ in range(START_ROUNDS if first is not None and 0 < dt_s <= self._limits.max_gap_s else 0):
-            assert first is not None
-            T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            motion = self._motion.after(T_prev_curr, estimate.covariance, dt_s)
-            self._map.clear()
-            self._keyframes.add(self._request(first, usable & first.usable, self._exposure(first, motion)))
-            exposure = self._exposure(frame, motion)
-            tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked(), turn=frame.seq)
-            coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
-            again = self._refine(frame, coarse, exposure, dt_s) if coarse else None
-            estimate = again if again is not None else estimate.without_landmarks
-        return estimate
 
     def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[tuple[Array, bool]]:
         """Yield guesses of the pose, and whether they count as near: the prediction, which nearly always is near.
@@ -227,7 +190,7 @@ class VisualOdometry:
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             at_previous = self._motion.accept(T_prev_curr, estimate.covariance, dt_s,
-                                              exposed_at_once=frame.times is None)
+                                              exposed_at_once=frame.times.is_at_once)
             if estimate.inliers >= self._limits.good_inliers:
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
@@ -249,7 +212,7 @@ class VisualOdometry:
         self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=self._is_textured(frame, usable),
                                  elsewhere=elsewhere is not None, carried=carried))
         if not self._status.restart:
-            return self._result(0, 0)
+            return self._result(0, 0, exposure=self._exposures.now(frame))
         self._map.clear()
         self._previous = None
         self._relocaliser.clear()
@@ -278,16 +241,17 @@ class VisualOdometry:
 
     def _start_map(self, frame: StereoFrame, usable: Flags, failed: FrameFacts) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks; failed: the facts where it has not."""
-        new = self._keyframes.add(self._request(frame, usable, self._exposure(frame, None)))
+        exposure = self._exposures.now(frame)
+        new = self._keyframes.add(self._request(frame, usable, exposure))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._advance(failed)
-            return self._result(0, 0)
+            return self._result(0, 0, exposure=exposure)
         self._previous = frame.lower
-        self._unmoved = frame if frame.times is not None else None
+        self._exposures.map_started(frame)
         self._motion.found()
         self._advance(FrameFacts(FrameOutcome.STARTED, failed.dt_s))
-        return replace(self._result(len(self._map), len(self._map), Features(new=new)), is_keyframe=True)
+        return replace(self._result(len(self._map), len(self._map), Features(new=new), exposure), is_keyframe=True)
 
     def _advance(self, facts: FrameFacts) -> None:
         """Advance the tracking state; while it has no fix the covariance grows as under an unknown steady velocity."""
@@ -297,7 +261,7 @@ class VisualOdometry:
         if after_s > before_s and not facts.carried:
             self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
 
-    def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure | None
+    def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure
                     ) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
         store = self._map.store
@@ -311,7 +275,7 @@ class VisualOdometry:
             return request
         return replace(request, pixels=estimate.pixels, ids=ids, views=estimate.views)
 
-    def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure | None) -> KeyframeRequest:
+    def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
         """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
         return KeyframeRequest(frame, usable, self._T_odom_rect, self._covariance, exposure)
 
@@ -328,7 +292,8 @@ class VisualOdometry:
             total = total + share * A @ keyframes[seq].covariance @ A.T
         return total
 
-    def _result(self, tracked: int, inliers: int, features: Features | None = None) -> OdometryEstimate:
+    def _result(self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
+                ) -> OdometryEstimate:
         return OdometryEstimate(
             self._T_odom_rect,
             self._covariance,
@@ -340,4 +305,5 @@ class VisualOdometry:
             inliers,
             features or Features(),
             self._step,
+            exposure=exposure,
         )

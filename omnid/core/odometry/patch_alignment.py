@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from omnid.core.odometry.patch_fit import WINDOW_PX, PatchFit, fit_patches
 from omnid.core.odometry.plane_patches import plane_templates
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import triangulate
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -149,25 +149,11 @@ def group_medians(ratio: Array, groups: Indices) -> Array:
             if groups[k] == groups[n]:
                 chosen[count] = ratio[k]
                 count += 1
-        sort(chosen, count)
-        median = (chosen[(count - 1) // 2] + chosen[count // 2]) / 2
-        median = min(max(median, LEAST_GAIN), LARGEST_GAIN)
+        median = min(max(np.median(chosen[:count]), LEAST_GAIN), LARGEST_GAIN)
         for k in range(n, len(ratio)):
             if groups[k] == groups[n]:
                 gain[k] = median
     return gain
-
-
-@inner
-def sort(values: Array, count: int) -> None:
-    """Sort the first values (Shell 1959, gaps of Ciura 2001): numpy's sort takes seconds to compile."""
-    for gap in (1750, 701, 301, 132, 57, 23, 10, 4, 1):
-        for last in range(gap, count):
-            value, place = values[last], last
-            while place >= gap and values[place - gap] > value:
-                values[place] = values[place - gap]
-                place -= gap
-            values[place] = value
 
 
 @inner

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from omnid.core.odometry import plane_kernels, slope_kernels
 from omnid.core.odometry.patch_fit import TEMPLATE_PX
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.panorama import Cylinder
 from omnid.core.odometry import pose_kernels, ransac_kernels
-from omnid.core.odometry.view_kernels import CameraNumbers
 from omnid.core.stereo.triangulation import triangulate
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -19,6 +18,7 @@ Flags = NDArray[np.bool_]
 RANSAC_THRESHOLD_PX = 2.0  # largest error of a view in the consensus set
 GAUSS_NEWTON_STEPS = 6  # at most
 CONVERGED = 1e-5  # m and rad: a smaller step is the last one
+# Noise of no views: the compiled function would not take None.
 NO_NOISE = np.zeros((0, 3, 3))
 
 
@@ -37,20 +37,6 @@ class SharedError:
     def of(self, chosen: Flags) -> SharedError:
         """Return the error of the views that are flagged (N,)."""
         return SharedError(self.derivatives[chosen], self.covariance)
-
-
-@dataclass(frozen=True, slots=True)
-class StereoModel:
-    """Projection of points into views: the panorama's cylinder, the baseline, and the noise of a tracked corner."""
-
-    cylinder: Cylinder
-    baseline_m: float
-    sigma_px: float = 0.1  # standard deviation
-
-    @property
-    def camera(self) -> CameraNumbers:
-        """Focal length [px], row0, width [px] and baseline [m]: the arguments of compiled functions."""
-        return self.cylinder.focal_px, self.cylinder.row0, float(self.cylinder.width), self.baseline_m
 
 
 def rigid_fit(a: Array, b: Array) -> Array:

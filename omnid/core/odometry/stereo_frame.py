@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.sensed_motion import SensedMotion
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +24,15 @@ class StereoFrame:
     # The image, or the function that returns it for a motion during the exposures; None: unknown, or exposed at once.
     disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
-    times: ExposureTimes | None = None  # None: all pixels are exposed at the stamp
+    times: PixelTimes = AT_ONCE
     sensed: SensedMotion | None = None  # since the frame before, by wheels and gyro; None: not known
+    # The motion for which disparities are corrected; None: not known, so that they are as seen.
+    exposure: Exposure | None = None
 
     @property
     def disparity(self) -> NDArray[np.float32]:
-        """Disparities (H, W) [px] of the lower panorama, NaN: unknown."""
-        return self.disparity_at(None)
-
-    def disparity_at(self, exposure: Exposure | None) -> NDArray[np.float32]:
-        """Return the disparities (H, W) [px] at the stamp of the lower panorama's pixels, NaN: unknown."""
-        return self.disparities(exposure) if callable(self.disparities) else self.disparities
+        """Disparities (H, W) [px] of the lower panorama's pixels at the stamp, NaN: unknown."""
+        return self.disparities(self.exposure) if callable(self.disparities) else self.disparities
 
 
 def _no_pixels() -> NDArray[np.float64]:

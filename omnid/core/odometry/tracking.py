@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.settings import knob
 
 Array = NDArray[np.float64]
@@ -15,28 +16,9 @@ Image = NDArray[np.uint8]
 
 
 CONVERGED_PX = 0.01  # an iteration that moves the window less is the last one
+# Levels of a pyramid: a panorama of 380 rows has 6 rows left on the sixth, too few for a window.
 MAX_LEVELS = 6
 MIN_EIGENVALUE = 1e-4  # of the window's gradients, OpenCV's default: below it the window has no texture
-
-
-@dataclass(frozen=True, slots=True)
-class PaddedPanorama:
-    """Panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
-
-    image: Image  # (H, W + 2 pad) uint8
-    pad_px: int
-    noise_grey: float = 1.0  # standard deviation of the noise, grey levels
-    gain: float = 1.0  # by which the image was multiplied because it was dim
-
-    @property
-    def width(self) -> int:
-        """Columns of one full turn [px]."""
-        return int(self.image.shape[1]) - 2 * self.pad_px
-
-    @property
-    def panorama(self) -> Image:
-        """The panorama itself (H, W), a view."""
-        return self.image[:, self.pad_px : self.pad_px + self.width]
 
 
 @dataclass(frozen=True, slots=True)

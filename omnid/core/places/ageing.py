@@ -15,6 +15,7 @@ from omnid.core.places.place_map import UNUSED, KeyframeUse, PlaceMap
 
 Array = NDArray[np.float64]
 
+# Set by trial on development seeds, where a line gives no other reason.
 BESIDE_M: Final = 0.3  # a keyframe so near to a frame shows the same, if nothing has changed
 FOUND_INLIERS: Final = 20  # with which a keyframe counts as recognised
 VISIT_M: Final = 3.0  # of path between two visits of a place

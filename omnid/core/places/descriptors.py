@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.places.descriptor_kernels import BINS, CELLS, SAMPLES, describe
+from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-LEVELS: Final = 4  # of the pyramid
-WINDOW: Final = 0.5  # standard deviation of the weights of a patch, as a share of its side
+LEVELS: Final = 4  # of the pyramid; because sides are 16 to 240 px, log2(240 / 16) = 3.9
+# Standard deviation of the weights of a patch, as a share of its side; half of it, as in SIFT (Lowe 2004).
+WINDOW: Final = 0.5
 
 
 def describe_patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -> NDArray[np.uint8]:

@@ -15,10 +15,10 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.descriptors import describe_patches
 from omnid.core.places.place_map import PlaceFeatures
 
-FEATURES: Final = 200  # kept of a frame
-CORNERS: Final = 450  # detected, as the depth of some is not known
+FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
+CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
 PATCH_BASELINES: Final = 2.0  # side of a feature, in baselines of the rig: disparity times this is its side in px
-SIDES_PX: Final = (16.0, 240.0)  # smallest and largest side
+SIDES_PX: Final = (16.0, 240.0)  # smallest and largest side; one sample a pixel at 16; by trial on development seeds
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:

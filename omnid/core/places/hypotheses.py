@@ -17,6 +17,7 @@ from omnid.core.places.recognition import Recognition
 
 Array = NDArray[np.float64]
 
+# Set by trial on development seeds, where a line gives no other reason.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
 KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two

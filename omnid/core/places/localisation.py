@@ -15,37 +15,34 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.keyframe_grid import KeyframeScans
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
-from omnid.core.places.hypotheses import Hypotheses, Hypothesis, angle_rad, length_m
+from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
 from omnid.core.places.limits import PlaceLimits
+from omnid.core.places.map_parts import MapParts
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_search import Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
 from omnid.core.places.scan_localiser import ScanLocaliser
+from omnid.core.places.search_schedule import SearchSchedule
 from omnid.core.places.signature import Thumbnail, thumbnail
 from omnid.core.places.tag_recognition import TagRecogniser
 from omnid.core.places.tags import TagPose
+from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 
-WAIT_FACTOR: Final = 2.0  # of the distance between keyframes: then one is added where odometry adds none
-CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # motion after which a recognition is checked in another frame
-SEARCH_NS: Final = 200_000_000  # between two searches while it is not known where odom is in the map
-JITTER_NS: Final = 5_000_000  # of stamps, so that a rate that divides that of the cameras is reached
-SEARCHES: Final = 10  # after which only new keyframes are searched for
-LOCAL_M: Final = 3.0  # of path: what odometry itself still sees is no loop
-NO_KEYFRAME: Final = -1  # in place of an id
-TIES: Final = 50  # newest keyframes that are kept where the map stays as it is
-GATE_M, GATE_PER_M = 0.15, 0.05  # largest error of odometry, and its growth with the path
-GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
-FAILED_SEARCHES: Final = 3  # one after the other, after which range scans are compared, if the settings say so
-TAG_SIGMAS: Final = 3.0  # by which a pose that a tag told may err
+LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
+NO_KEYFRAME: Final = -1  # in place of an id; ids are never negative
+TIES: Final = 50  # newest keyframes that are kept where the map stays as it is, so that memory is bounded
+# Largest error of odometry, and its growth with the path; by trial on development seeds.
+GATE_M, GATE_PER_M = 0.15, 0.05
+GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # by trial on development seeds
+TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
 RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
 
 
@@ -94,9 +91,8 @@ class MapLocaliser:
         self.correction = MapCorrection(self.places)
         self.ageing = Ageing(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
-        # Parts of the map between which no pose is known have numbers; this run begins a new part.
-        self._part_of = dict.fromkeys(self.places.keyframes, 0)
-        self._part = 1 if self.places.keyframes else 0
+        self._parts = MapParts(self.places)
+        self._schedule = SearchSchedule(limits)
         self._hypotheses = Hypotheses()
         self._newest: PlaceKeyframe | None = None  # of this part, by odometry
         self._T_map_odom = np.eye(4)
@@ -106,9 +102,7 @@ class MapLocaliser:
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
         self._by_tag = False  # it was a tag, which tells the pose less exactly than a view
         self._last_T: Array | None = None
-        self._searched: tuple[int, Array] | None = None  # stamp and pose of the last search
         self._scans: tuple[object, KeyframeScans] | None = None  # what they depend on, and they
-        self._failed = 0  # searches of this part that found nothing
         self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
 
     def process(self, frame: OdometryFrame, *, idle: bool = False) -> MapPose:
@@ -118,7 +112,8 @@ class MapLocaliser:
             return self._pose(frame, MapState.LOST)
         if idle:
             return self._pose(frame, self._state())
-        is_keyframe = self._keyframe_is_due(frame)
+        is_keyframe = self._schedule.keyframe_is_due(self._newest, frame.stamp_ns, frame.T_odom_rect,
+                                                     has_depth=frame.is_keyframe)
         if is_keyframe or self._search_is_due(frame):
             small = thumbnail(frame.stereo.lower.panorama)
             features = describe(frame.stereo)
@@ -134,7 +129,7 @@ class MapLocaliser:
                 if not found.by_tag:
                     self._age(found)
         # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
-        if self._by_scan is not None and self._recognised_at is None and self._failed >= FAILED_SEARCHES:
+        if self._by_scan is not None and self._recognised_at is None and self._schedule.wants_scans:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
             if by_scan is not None:
                 return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED, NO_KEYFRAME, np.eye(4))
@@ -145,7 +140,7 @@ class MapLocaliser:
         """Sizes and counters, for the status."""
         return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
                 "dropped": self.places.dropped, "aged": self.ageing.aged, "rejected": self.correction.rejected,
-                "unjoined": len(set(self._part_of.values())) - 1 if self._part_of else 0,
+                "unjoined": max(0, len(self._parts) - 1),
                 "ambiguous": self.search.ambiguous, "refused": self.search.refused} | self._counts_of_tags() | (
                     {} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
 
@@ -158,18 +153,17 @@ class MapLocaliser:
 
     def map(self) -> PlaceMap:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
-        oldest = self._part_of.get(min(self._part_of, default=0))
-        return self.places.part(id for id, part in self._part_of.items() if part == oldest)
+        return self.places.part(self._parts.oldest())
 
     def scans(self) -> KeyframeScans:
         """Return the range scans of the part of the map in which the pose is: the submaps that move with keyframes.
 
         Of a map that stays as it is, its own ones only.
         """
-        now = (self.places.next_id, len(self.places), self._part, len(self._part_of), self.correction.optimisations,
-               len(self.places.links))
+        now = (self.places.next_id, len(self.places), self._parts.current, len(self._parts),
+               self.correction.optimisations, len(self.places.links))
         if self._scans is None or self._scans[0] != now:
-            ids = sorted(id for id, part in self._part_of.items() if part == self._part)
+            ids = sorted(self._parts.ids())
             ids = [id for id in ids if id in self._fixed] or ids
             poses = np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4)
             loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
@@ -184,38 +178,23 @@ class MapLocaliser:
         if frame.resets != self._resets:
             self._resets = frame.resets
             self._hypotheses.clear()
-            self._newest, self._recognised_at, self._searched, self._failed = None, None, None, 0
+            self._newest, self._recognised_at = None, None
+            self._schedule.restart()
             if self._by_scan is not None:
                 self._by_scan.restart()
-            self._part = 1 + max(self._part_of.values(), default=-1)
+            self._parts.begin()
             self.correction.forget()
-
-    def _keyframe_is_due(self, frame: OdometryFrame) -> bool:
-        """True if the view has changed enough; better at a keyframe of odometry, whose depth is known already."""
-        if self._newest is None:
-            return True
-        if frame.stamp_ns - self._newest.stamp_ns < 1e9 / self._limits.rate_hz - JITTER_NS:
-            return False
-        moved = se3.inverse(self._newest.T_odom_rect) @ frame.T_odom_rect
-        change = max(length_m(moved) / self._limits.keyframe_m,
-                     angle_rad(moved) / math.radians(self._limits.keyframe_deg))
-        return change >= (1.0 if frame.is_keyframe else WAIT_FACTOR)
 
     def _search_is_due(self, frame: OdometryFrame) -> bool:
         """True if a recognition is to be checked, or where odom is in the map is not known."""
-        if self._searched is None:
-            return True
-        since_ns, moved = frame.stamp_ns - self._searched[0], se3.inverse(self._searched[1]) @ frame.T_odom_rect
-        if since_ns < SEARCH_NS:
-            return False
-        if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
-            return True
-        pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
-        return pending and (length_m(moved) > CHECK_M or angle_rad(moved) > CHECK_RAD)
+        is_unknown = self._recognised_at is None and bool(self._elsewhere())
+        is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
+        return self._schedule.search_is_due(frame.stamp_ns, frame.T_odom_rect, is_unknown=is_unknown,
+                                            is_pending=is_pending)
 
     def _elsewhere(self) -> list[int]:
         """Return the keyframes of other parts of the map."""
-        return [id for id, part in self._part_of.items() if part != self._part and self._is_place(id)]
+        return [id for id in self._parts.others() if self._is_place(id)]
 
     def _is_place(self, id: int) -> bool:
         """True if a keyframe holds what recognises it."""
@@ -224,7 +203,7 @@ class MapLocaliser:
     def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
                    ) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
-        self._searched = frame.stamp_ns, frame.T_odom_rect
+        self._schedule.begin(frame.stamp_ns, frame.T_odom_rect)
         expected = self._expected(frame)
         found = self.search.near(small, features, self.places, expected)
         if found is None and (far := self._elsewhere()):
@@ -232,10 +211,7 @@ class MapLocaliser:
             found = self.search.far(small, features, self.places, far, by_scan)
         if found is None and tags and self._tags is not None:
             found = self._recognise_by_tag(self._tags, tags, expected)
-        if found is not None:
-            self._failed = 0
-        elif len(features.views) >= MIN_MATCHES:  # in the dark there is nothing to fail
-            self._failed += 1
+        self._schedule.end(found=found is not None, could_find=len(features.views) >= MIN_MATCHES)
         return found
 
     def _recognise_by_tag(self, recogniser: TagRecogniser, tags: list[TagPose], expected: Expected
@@ -245,23 +221,23 @@ class MapLocaliser:
         if near is not None:
             return self.search.expected_only(near, self.places, expected)
         far = self._elsewhere()
-        for part in sorted({self._part_of[id] for id in far}):
-            found = recogniser.recognise(tags, {id for id in far if self._part_of[id] == part})
+        for part in sorted({self._parts.number(id) for id in far}):
+            found = recogniser.recognise(tags, {id for id in far if self._parts.number(id) == part})
             if found is not None:
                 return found
         return None
 
     def _proposed(self, frame: OdometryFrame) -> list[Array]:
         """Return the poses (4, 4) in the map that the last search suggests for a frame, ambiguous ones too."""
-        if self._searched is None:
+        if not self._schedule.has_searched:
             return []
-        since = se3.inverse(self._searched[1]) @ frame.T_odom_rect
+        since = self._schedule.motion_since(frame.T_odom_rect)
         return [T @ since for T in self.search.proposed(self.places.poses)]
 
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
         T_map_rect = self._T_map_odom @ frame.T_odom_rect
-        ids = [id for id, part in self._part_of.items() if part == self._part and self._is_place(id)]
+        ids = [id for id in self._parts.ids() if self._is_place(id)]
         drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
         left = drift_m >= LOCAL_M
         ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
@@ -289,7 +265,8 @@ class MapLocaliser:
                                  frame.scan().astype(np.float16), features)
         link = None if self._newest is None else _by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
-        self._part_of[keyframe.id], self._path_at[keyframe.id] = self._part, self._path_m
+        self._parts.add(keyframe.id)
+        self._path_at[keyframe.id] = self._path_m
         self._newest = keyframe
         if self._tags is not None and not self._localize_only:
             self.places.tags.add(self._tags.views(tags, keyframe.id))
@@ -297,8 +274,7 @@ class MapLocaliser:
 
     def _forget_dropped(self) -> None:
         """Forget the keyframes that are no longer in the map."""
-        if self.places.keyframes.keys() != self._part_of.keys():
-            self._part_of = {id: part for id, part in self._part_of.items() if id in self.places.keyframes}
+        if self._parts.forget_dropped():
             self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
             self.search.forget(self.places)
 
@@ -318,25 +294,15 @@ class MapLocaliser:
         consistent = self._hypotheses.add(hypothesis, self.places.poses)
         if not consistent:
             return
-        other = self._part_of[found.id]
-        if other != self._part:
-            self._join(other, hypothesis.T_map_odom(self.places.poses))
+        other = self._parts.number(found.id)
+        if other != self._parts.current:
+            T_other_odom = hypothesis.T_map_odom(self.places.poses)
+            self._parts.join(other, T_other_odom @ se3.inverse(self._T_map_odom))
         links = [one.link() for one in consistent if self._hypotheses.take(one)]
-        part = sorted(id for id, number in self._part_of.items() if number == self._part)
-        self.correction.close([link for link in links if link.a != link.b], part, self._fixed)
+        self.correction.close([link for link in links if link.a != link.b], sorted(self._parts.ids()), self._fixed)
         self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
         self._by_tag = found.by_tag
-
-    def _join(self, other: int, T_map_odom: Array) -> None:
-        """Join this part of the map with another one, in whose frame T_map_odom is given; the older one stays."""
-        T_other_own = T_map_odom @ se3.inverse(self._T_map_odom)
-        stays = min(other, self._part)
-        moved = self._part if stays == other else other
-        by = T_other_own if moved == self._part else se3.inverse(T_other_own)
-        self.places.move({id: by @ self.places.poses[id] for id, part in self._part_of.items() if part == moved})
-        self._part_of = {id: stays if part == moved else part for id, part in self._part_of.items()}
-        self._part = stays
 
     def _state(self) -> MapState:
         """Return the state of a frame whose pose in odom is known."""

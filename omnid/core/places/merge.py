@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import Link, PlaceMap
 from omnid.core.places.place_search import PlaceSearch
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-SAME_M: Final = 0.5  # difference up to which two recognised keyframes agree about where the maps lie
-SAME_RAD: Final = math.radians(5)
+# Difference up to which two recognised keyframes agree about where the maps lie; by trial on development seeds.
+SAME_M: Final = 0.5
+SAME_RAD: Final = math.radians(5)  # by trial on development seeds
 MIN_CONSISTENT: Final = 3  # keyframes that must agree
 MIN_SHARE: Final = 0.6  # of the recognised keyframes that must agree
 

@@ -11,19 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition, recognise
 from omnid.core.places.signature import Signature, signature_of, similarities
 from omnid.core.places.votes import votes
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
+# Set by trial on development seeds, where a line gives no other reason.
 NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
 NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
-FAR_INLIERS, FAR_SECTORS = 24, 5  # least support where it cannot tell
+# Least support where it cannot tell; other worlds gave 10 in 600 queries: docs/notes/places.md.
+FAR_INLIERS, FAR_SECTORS = 24, 5
 PER_PLACE, SAME_PLACE_M = 3, 1.5  # at most so many of the keyframes that are compared lie so near together
 ENOUGH_INLIERS: Final = 50  # of a place that is enough
 RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
@@ -37,8 +39,8 @@ class Effort(NamedTuple):
     compared: int  # of them, those with most votes
 
 
-NEAR_EFFORT: Final = Effort(16, 3)  # where odometry tells about where the robot is
-FAR_EFFORT: Final = Effort(200, 8)  # where it does not
+NEAR_EFFORT: Final = Effort(16, 3)  # where odometry says about where the robot is; by trial on development seeds
+FAR_EFFORT: Final = Effort(200, 8)  # where it does not; by trial on development seeds
 
 
 @dataclass(frozen=True, slots=True, eq=False)

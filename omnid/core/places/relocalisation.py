@@ -13,20 +13,23 @@ from calib import se3
 from omnid.core.odometry.corners import nearby_disparity
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
+from omnid.core.odometry.pose_estimation import gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.signature import Signature, signature, similarity
 from omnid.core.stereo.triangulation import point_covariance, triangulate
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# Set by trial on development seeds, where a line gives no other reason.
 RATIO = 0.8  # largest distance of a match, as a share of the second best one's (Lowe 2004)
 FEATURES = 1500  # SIFT features detected in a frame
 SIGMA_PX = 0.7  # standard deviation of SIFT positions and of the disparities beside them
 THRESHOLD_PX = 3.0  # largest error of a view in the consensus set
 MIN_MATCHES = 12  # matches, and inliers among them, below which a keyframe is not recognised
-OUTLIER_SQUARED = 16.0  # squared Mahalanobis distance (4 sigma) from which a view is an outlier
+# Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
+OUTLIER_SQUARED = 16.0
 MAX_KEYFRAMES = 8  # kept in memory
 MAX_MATCHED, MAX_DESCRIBED = 4, 1  # keyframes in one search, and those among them whose features are not yet known
 ENOUGH_INLIERS = 60  # that end a search

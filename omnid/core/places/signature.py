@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-ROWS, COLUMNS = 16, 128
+ROWS, COLUMNS = 16, 128  # 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
 SMOOTH: Final = (31, 5)  # columns, rows: brightness that is taken out, as it changes with the light
 LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare
 THUMBNAIL_SCALE: Final = 30.0  # of a thumbnail's values: so many are the root mean square of its contrast

@@ -8,14 +8,14 @@ from typing import Final
 import numpy as np
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.map_tags import TagView
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.recognition import Recognition
 from omnid.core.places.tags import TagFinder, TagPose, in_tag_axes
+from omnid.core.types.stereo_model import StereoModel
 
-CORNERS_SEEN: Final = 8  # of a tag, in both panoramas
+CORNERS_SEEN: Final = 8  # of a tag, in both panoramas; because all four are needed in each
 
 
 class TagRecogniser:

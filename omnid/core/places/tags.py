@@ -15,18 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, rigid_fit
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.odometry.pose_estimation import gauss_newton, rigid_fit
 from omnid.core.places.pose_graph import PoseEdges, optimise
 from omnid.core.stereo.triangulation import triangulate
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-MAX_TAG: Final = 586  # of the family 36h11
-MAX_NAME: Final = 64  # characters
-SIZES_M: Final = (0.005, 10.0)  # of a tag's edge
-SIGMA_PX: Final = 0.35  # standard deviation of a corner, that of the curvature in the panorama included
-LARGEST_SQUARED: Final = 9.0  # mean squared error of the corners, in SIGMA_PX, of what is a tag of the known size
+MAX_TAG: Final = 586  # of the family 36h11; exact: it has 587
+MAX_NAME: Final = 64  # characters; so that files of any origin are bounded
+SIZES_M: Final = (0.005, 10.0)  # of a tag's edge; so that nonsense is refused
+# Standard deviation of a corner, that of the curvature in the panorama included; by trial on development seeds.
+SIGMA_PX: Final = 0.35
+# Mean squared error of the corners, in SIGMA_PX, of what is a tag of the known size; because it is three standard
+# deviations.
+LARGEST_SQUARED: Final = 9.0
 CORRELATED_VIEWS: Final = 4.0  # views of a tag that count as one: errors of the rig are common to them
 # Corners of a tag of edge 1, as the detector orders them, seen from the front: x to the right, y up, z out of the face.
 CORNERS: Final = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])

@@ -1,1 +1,1 @@
-"""Check of the rig's calibration by its panoramas."""
+"""Is the rig right? Evidence by the columns of its panoramas, and one state machine; see `rig_state.py`."""

@@ -8,6 +8,7 @@ which is some tenths of a per cent of the scale.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,22 +19,30 @@ from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.patch_alignment import align
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, plane_templates
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama, track
+from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import triangulate, view
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-LANDMARKS = 500  # in view of a keyframe
-MAX_KEYFRAMES = 25  # that see a landmark: its patch looks different from farther away
-MIN_KEYFRAMES = 3  # that must see a landmark before it says anything of the rig
-APART_PX = 9
-EDGE_ROWS = 4
-REACH_PX = 2  # of patches: the rig is not known well yet
-TRACK = KltSettings(window_px=15, levels=3, max_error_px=0.5)
-TRACK_UPPER = KltSettings(window_px=15, levels=1, max_error_px=0.5)
+# Landmarks in view of a keyframe: the time of the adjustment grows with them, the sigmas fall with their root.
+LANDMARKS: Final = 500
+# Most keyframes that see one landmark: from farther away its patch has another appearance, and images are kept so long.
+MAX_KEYFRAMES: Final = 25
+# Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict.
+MIN_KEYFRAMES: Final = 3
+# Least distance of a new landmark from another, as that of corners (`corners.py`).
+APART_PX: Final = 9
+# Rows along the upper and the lower border in which a patch would reach beyond the panorama.
+EDGE_ROWS: Final = 4
+# Largest step of a patch: twice that of patches whose depth is known well, since the rig is not yet.
+REACH_PX: Final = 2
+# As the odometry's tracker. In the upper panorama the disparity predicts the place, so that one level is enough.
+TRACK: Final = KltSettings(window_px=15, levels=3, max_error_px=0.5)
+TRACK_UPPER: Final = KltSettings(window_px=15, levels=1, max_error_px=0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +70,18 @@ class PanoramaObservations:
 class DriveLandmarks:
     """Tracks landmarks from keyframe to keyframe; keeps the images of the newest MAX_KEYFRAMES keyframes only."""
 
-    def __init__(self, model: StereoModel, most: int = LANDMARKS) -> None:
-        """most: landmarks in view of a keyframe."""
-        self._model, self._most = model, most
-        self._keyframes: dict[int, View] = {}  # the newest ones
-        self._number = -1  # of the newest keyframe
-        self._points = np.zeros((0, 3))  # (L, 3) m in odom
-        self._views = np.zeros((0, 3))  # (L, 3) px in the first keyframe
-        self._slopes = np.zeros((0, 2))
-        self._anchor = np.zeros(0, np.intp)  # (L,) index of the first keyframe
-        self._tracked = np.zeros(0, np.intp)  # landmarks seen in the newest keyframe,
-        self._pixels = np.zeros((0, 2))  # and where
+    def __init__(self, model: StereoModel, max_count: int = LANDMARKS) -> None:
+        """max_count: landmarks in view of a keyframe."""
+        self._model, self._max_count = model, max_count
+        # The newest keyframes by their numbers, and the number of the last one.
+        self._keyframes: dict[int, View] = {}
+        self._number = -1
+        # Landmarks (L): points [m] in odom; views [px], slopes of their surfaces and number of their first keyframe.
+        self._points, self._views, self._slopes = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
+        self._anchor = np.zeros(0, np.intp)
+        # Landmarks that the newest keyframe shows, and their pixels in it.
+        self._tracked, self._pixels = np.zeros(0, np.intp), np.zeros((0, 2))
+        # Observations of each call: keyframe, landmark, camera, pixels.
         self._found: list[tuple[Indices, Indices, Indices, Array]] = []
 
     def add(self, view: View) -> None:
@@ -94,38 +104,46 @@ class DriveLandmarks:
 
     def _follow(self, current: View) -> None:
         """Find the landmarks of the newest keyframe in the next one, in both of its panoramas."""
+        # 1. Predict by the pose, and track in the lower panorama.
         index, before = self._tracked, self._pixels
         predicted = self._predicted(current, index)
         inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < self._model.cylinder.height - 1 - EDGE_ROWS)
         index, before, predicted = index[inside], before[inside], predicted[inside]
         there, found = track(self._keyframes[self._number - 1].lower, current.lower, before, predicted[:, :2], TRACK)
         index, there, predicted = index[found], there[found], predicted[found]
+        # 2. Align the first keyframe's patches, so that the error does not grow from keyframe to keyframe.
         pixels, fits = self._aligned(current, index, there, upper=False)
         fits &= _is_set(current.visible, pixels)
         index, pixels, predicted = index[fits], pixels[fits], predicted[fits]
         self._observe(index, 0, pixels)
+        # 3. The same in the upper panorama.
         guess = np.column_stack([pixels[:, 0], pixels[:, 1] + predicted[:, 2] - predicted[:, 1]])
         above, found = track(current.lower, current.upper, pixels, guess, TRACK_UPPER)
         in_upper, fits = self._aligned(current, index[found], above[found], upper=True)
         self._observe(index[found][fits], 1, in_upper[fits])
-        young = self._number - self._anchor[index] < MAX_KEYFRAMES  # its patch is still there at the next one
+        # 4. Keep those whose first keyframe is still in memory at the next one.
+        young = self._number - self._anchor[index] < MAX_KEYFRAMES
         self._tracked, self._pixels = index[young], pixels[young]
 
     def _start_landmarks(self, current: View) -> None:
         """Begin new landmarks in the gaps, where both panoramas show the same patch."""
+        # 1. Corners in the gaps, with the disparity of the pixels around them.
         model = self._model
         free = clear_around(current.visible, self._pixels, APART_PX)
-        pixels = corners(current.lower, free, self._most - len(self._pixels))
+        pixels = corners(current.lower, free, self._max_count - len(self._pixels))
         disparity = nearby_disparity(current.disparity, pixels)
         pixels, disparity = pixels[np.isfinite(disparity)], disparity[np.isfinite(disparity)]
+        # 2. Track them into the upper panorama.
         guess = pixels + np.column_stack([np.zeros(len(pixels)), disparity])
         above, found = track(current.lower, current.upper, pixels, guess, TRACK_UPPER)
         found &= above[:, 1] > pixels[:, 1] + 0.5
         pixels, above = pixels[found], above[found]
+        # 3. Surfaces and points, by the rig as it is.
         views = np.column_stack([pixels, above[:, 1]])
         slopes = disparity_slopes(current.disparity, pixels, above[:, 1] - pixels[:, 1])
         slopes = fitted_slopes((current.lower, current.upper), pixels, above, slopes, model)
         points = triangulate(views, model.cylinder, model.baseline_m)
+        # 4. Keep those whose patch fits in the upper panorama as well.
         first = len(self._points)
         self._points = np.concatenate([self._points, se3.apply(current.T_odom_rect, points)])
         self._views, self._slopes = np.concatenate([self._views, views]), np.concatenate([self._slopes, slopes])

@@ -26,9 +26,11 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
 METHODS = ("sad", "enhanced", "semiglobal")
-MIN_DISPARITY_PX = 0.5  # a smaller one is a point at infinity, within the noise
-LEFT_RIGHT_PX = 1  # largest disagreement of the disparities that both panoramas choose
-EDGE_NOISE = 6.0  # Sobel response that noise of one grey level reaches in one pixel of a hundred
+MIN_DISPARITY_PX = 0.5  # a smaller one is a point at infinity, within the noise; by trial on development seeds
+# Largest disagreement of the disparities that both panoramas choose; as in OpenCV's samples (disp12MaxDiff).
+LEFT_RIGHT_PX = 1
+# Sobel response that noise of one grey level reaches in one pixel of a hundred; by trial on development seeds.
+EDGE_NOISE = 6.0
 
 
 @dataclass(frozen=True, slots=True)

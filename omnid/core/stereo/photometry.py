@@ -18,7 +18,7 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
-LEAST_CONTRAST_TO_NOISE = 1.0
+LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
 NOTHING_BUT_NOISE = 0.5  # contrast to noise: corners and patches are then those of noise
 LEAST_NOISE_GREY = 0.3  # that of rounding
 MAX_GAIN = 8.0  # of 8 bit images: more only magnifies their steps

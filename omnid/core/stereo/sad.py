@@ -10,7 +10,7 @@ Image = NDArray[np.uint8]
 Costs = NDArray[np.uint16]
 Indices = NDArray[np.intp]
 
-NO_MATCH = np.uint16(65535)  # cost of a match outside the image
+NO_MATCH = np.uint16(65535)  # cost of a match outside the image; the largest of uint16, so that it is never chosen
 MIN_SLOPE = 1.0  # grey levels per pixel of the sum, so that a flat minimum divides by no zero
 
 

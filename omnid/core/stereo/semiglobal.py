@@ -18,16 +18,16 @@ from omnid.core.stereo.sad import Costs, Indices, subpixel
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
-BLOCK_PX = 3  # side of StereoSGBM's matching window at the prior's resolution
+BLOCK_PX = 3  # side of StereoSGBM's matching window at the prior's resolution; the least of OpenCV's range of 3 to 11
 SMALL_STEP_PENALTY = 100  # for a change of disparity by one: walls are smooth
 LARGE_STEP_PENALTY = 3200  # for a larger change: depth edges are rare
-LEFT_RIGHT_PX = 1  # largest disagreement of the disparities of both panoramas
-PREFILTER_CAP = 31  # at which StereoSGBM cuts off the gradients it compares
-SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel
-STEP_ROWS = 16  # StereoSGBM searches a multiple of so many disparities
+LEFT_RIGHT_PX = 1  # largest disagreement of the disparities of both panoramas; as in OpenCV's samples
+PREFILTER_CAP = 31  # at which StereoSGBM cuts off the gradients it compares; by trial on development seeds
+SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel; exact, by OpenCV
+STEP_ROWS = 16  # StereoSGBM searches a multiple of so many disparities; exact, by OpenCV
 SCALE = 2  # the prior is computed at half the resolution: at a quarter the courses of a brick wall are one grey
 FILL_PX = 5  # at the prior's resolution: unknown pixels take the largest disparity so near: no holes
-REACH_PX = 2  # searched about the prior
+REACH_PX = 2  # searched about the prior; because a pixel of the prior is two here
 
 
 class ColumnShift(NamedTuple):

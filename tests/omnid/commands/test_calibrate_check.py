@@ -1,4 +1,4 @@
-"""`omnid calibrate check` on rendered logs: good, drifted and broken rigs, correction of the drift."""
+"""`omnid calibrate check` on rendered logs: right, drifted and broken rigs, correction of the drift."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.log_rig_check import RigCheckResult, check_rig, open_log, read_rig_pairs
+from omnid.calibration.image_pairs import open_log
+from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig
+from omnid.core.rig.rig_state import RigState
 from omnid.messages import FramePair
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
@@ -49,7 +51,7 @@ def test_motion_between_the_exposures_is_no_drift_to_correct(tmp_path: Path, cap
     words = ["calibrate", "check", str(tmp_path / "log.mcap"), "--rig", str(tmp_path / "rig.toml")]
     assert main(words) == 0
     found = capsys.readouterr().out
-    assert found.startswith("good") and "the upper images are 20.0 ms earlier than the lower ones: the motion" in found
+    assert found.startswith("fits") and "the upper images are 20.0 ms earlier than the lower ones: the motion" in found
     write_rig(tmp_path / "turned.toml", with_upper_rotated(read_rig(tmp_path / "rig.toml"), (0.0, 0.5, 0.0)))
     assert main([*words[:-1], str(tmp_path / "turned.toml")]) == 1
     assert capsys.readouterr().out.startswith("drifted")
@@ -59,14 +61,14 @@ def test_motion_between_the_exposures_is_no_drift_to_correct(tmp_path: Path, cap
 
 def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
     found = check_rotated(scene, pairs, (0, 0, 0))
-    assert found.good and found.finding.condition == "good" and found.finding.turn_deg < 0.05
+    assert found.state is RigState.FITS and found.finding.state is RigState.FITS and found.finding.turn_deg < 0.05
     assert abs(found.finding.offset_px) < 0.03 and found.finding.left_px < 0.15 and None not in found.rims
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0, 0, -0.5)])
 def test_measures_half_a_degree_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
     found = check_rotated(scene, pairs, turn_deg).finding
-    assert found.condition == "drifted" and found.drift is not None
+    assert found.state is RigState.DRIFTED and found.drift is not None
     assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05)
 
 
@@ -79,13 +81,13 @@ def test_rotation_about_the_vertical_is_constant_and_a_tilt_a_wave(scene: Path, 
 
 def test_measures_many_degrees(scene: Path, pairs: list[FramePair]) -> None:
     found = check_rotated(scene, pairs, (0.0, 0.0, 11.0)).finding
-    assert found.condition == "broken" and found.turn_deg == pytest.approx(11.0, abs=0.1)
+    assert found.state is RigState.BROKEN and found.turn_deg == pytest.approx(11.0, abs=0.1)
 
 
 def test_reports_large_errors_as_broken(scene: Path, pairs: list[FramePair]) -> None:
-    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.condition == "broken"
+    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.state is RigState.BROKEN
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
-    assert not check_rotated(scene, exchanged, (0, 0, 0)).good
+    assert check_rotated(scene, exchanged, (0, 0, 0)).state is not RigState.FITS
 
 
 def run(*words: object) -> int:
@@ -98,7 +100,7 @@ def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path,
     truth = read_rig(scene / "rig.toml")
     write_rig(wrong, with_upper_rotated(truth, (0.6, -0.4, 1.5)))
     assert run(log, "--rig", scene / "rig.toml") == 0
-    assert capsys.readouterr().out.startswith("good: ")
+    assert capsys.readouterr().out.startswith("fits: ")
     assert run(log, "--rig", wrong, "--refine", "-o", right) == 1
     output = capsys.readouterr().out
     assert output.startswith("drifted: ") and "lower rim: " in output
@@ -156,4 +158,4 @@ def test_images_of_another_size_are_a_one_line_error(scene: Path, tmp_path: Path
 def test_dark_log_is_unknown(scene: Path, pairs: list[FramePair]) -> None:
     dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
     found = check_rotated(scene, dark, (0, 0, 0))
-    assert found.finding.condition == "unknown" and found.rims == (None, None)
+    assert found.finding.state is RigState.UNCHECKED and found.rims == (None, None)

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
+from omnid.core.control.arming import AUTOMATIC, MANUAL, OLDER_THAN_STOP, STARTED, TOO_LATE, Arming, ArmRequest
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from tests.omnid.controller.bench import UNATTENDED, Bench
 
@@ -249,3 +249,19 @@ def test_the_state_names_the_source_that_drives(driving: Bench) -> None:
     driving.stop()
     driving.tick()
     assert driving.controller.state.source == ""
+
+
+@pytest.mark.parametrize("mode", [AUTOMATIC, MANUAL])
+def test_an_old_stop_that_is_repeated_does_not_release_a_newer_one(mode: str) -> None:
+    arming = Arming(mode)
+    arming.stop(5)
+    arming.request(ArmRequest(10))
+    arming.step("", 10, 1.0)
+    assert arming.armed
+    arming.stop(20)
+    arming.stop(5)
+    arming.step("", 30, 1.0)
+    assert arming.stop_asked and not arming.armed
+    arming.request(ArmRequest(15))
+    arming.step("", 30, 1.0)
+    assert not arming.armed and arming.answer.refusal == OLDER_THAN_STOP

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
 from calib.rig import Rig
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 from tests.simulation import MountedSensor, Scene, Sensor, render_grey
 
 Array = NDArray[np.float64]

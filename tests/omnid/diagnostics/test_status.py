@@ -32,6 +32,7 @@ from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name
 from tests.simulation import build
 
@@ -63,7 +64,7 @@ class Daemon:
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
         self.controller_statistics = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(self, 0.5)
+        self.commands = CommandReceiver(self, StampRule(0.5))
         self.report = StatusCollector(
             StatusSources(
                 self.telemetry,

@@ -6,7 +6,6 @@ import contextlib
 import math
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor.wheel_wiring import Seen, WiringTest, toml_with, wiring
 from omnid.errors import OmnidError
 from tests.replay.command import Command
+from tests.replay.live import wait_until
 
 ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02
@@ -59,7 +59,8 @@ class Person:
         if "forwards first" in question:
             return "y" if sum(self._first) > 0 else "n"
         if "How many" in question:
-            time.sleep(0.3)  # until the wheels stand
+            wait_until(lambda: not any(self._base.base.commanded_mps) and self._base.base.velocity_mps == 0
+                       and self._base.base.yaw_rate_radps == 0, "wheels that stand")
             return f"{(self._base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
         self._travel_m = self._base.base.travel_m[0]
         return "yes"

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from omnid.report.downsampling import BINS, Corner, Downsampled, PathTrace
+from omnid.report.downsampling import BINS, Corner, Downsampled, path_trace
 
 
 def test_few_values_are_kept() -> None:
@@ -50,11 +50,11 @@ def test_scattered_times_stay_within_bounds() -> None:
 
 @pytest.mark.parametrize("moment", [12_345, 12_346, 12_347])
 def test_path_keeps_corners_and_the_worst_state_between(moment: int) -> None:
-    trace = PathTrace()
+    trace = path_trace()
     for k in range(20_000):
         rank = 2 if k == moment else 0
         trace.add(Corner(0.02 * min(k, 10_000), 0.02 * max(0, k - 10_000), 0.1 * k, rank))
-    corners = trace.corners
+    corners = trace.with_end()
     assert 1000 < len(corners) <= 4001
     assert corners[0][:2] == (0.0, 0.0) and corners[-1][:2] == (200.0, 0.02 * 9999)
     assert max(math.dist(a[:2], b[:2]) for a, b in pairwise(corners)) < 0.5
@@ -63,7 +63,7 @@ def test_path_keeps_corners_and_the_worst_state_between(moment: int) -> None:
 
 
 def test_standing_still_is_one_place() -> None:
-    trace = PathTrace()
+    trace = path_trace()
     for k in range(50_000):
         trace.add(Corner(0.001 * (k % 2), 0.0, float(k), k % 3))
-    assert len(trace.corners) == 2 and trace.corners[-1].t_s == 49_999.0
+    assert len(trace.with_end()) == 2 and trace.with_end()[-1].t_s == 49_999.0

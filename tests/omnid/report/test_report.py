@@ -388,4 +388,4 @@ def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction
 
 def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:
     data = collect_report_data(save(tmp_path / "a.mcap", [odom(0), map_pose(1, np.eye(4)), odom(2)]))
-    assert not data.map_poses.path.corners
+    assert not data.map_poses.path.vertices

@@ -10,6 +10,7 @@ import pytest
 from omnid.errors import OmnidError
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.people import IMPATIENT, PATIENCE_S, Walkers
+from omnid.simulation.rendering import shapes
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
 HALL = """
@@ -116,6 +117,11 @@ def test_posters_are_exchanged() -> None:
     ("size_m = [0.4, 0.2, 0.5]", "size_m = [0.4, 0.2]", "box\\[0\\].size_m"),
     ("path = [[3.0, 1.5], [3.0, 0.5]]", "path = [[3.0, 1.5]]", "2 to 100 points"),
     ("[space]", "[space", "not a TOML file"),
+    ("at = [0.0, 1.0]", "at = [0.15, 0.0]", "box\\[0\\].at: expected a place where the robot does not start inside"),
+    ("at = [0.0, 1.0]", "at = [0.0, 0.15]\nyaw_deg = 90.0", "the robot does not start inside"),
+    ("at = [0.0, 1.0]", "at = [0.0, 5.0]", "box\\[0\\].at: expected a place where the whole box is within"),
+    ("at = [0.0, 1.0]", "at = [0.0, 1.85]\nyaw_deg = 90.0", "the whole box is within"),
+    ("start = [0.0, 0.0, 90.0]", "start = [0.0, 2.1, 90.0]", "start: expected a place within"),
 ])
 def test_wrong_worlds_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(OmnidError, match=message):
@@ -129,3 +135,17 @@ def test_unknown_worlds_and_options_are_refused(tmp_path: Path) -> None:
         load_world(str(tmp_path / "none.toml"), 1)
     with pytest.raises(OmnidError, match="brightness 9"):
         WorldOptions(brightness=9.0)
+
+
+@pytest.mark.parametrize("text", [
+    HALL.replace("[4.0, 2.0]", "[24.0, 22.0]") + 199 * "[[box]]\nat = [12.0, 11.0]\nsize_m = [20.0, 20.0, 20.0]\n",
+    HALL + 18 * "[[person]]\npath = [[0.0, 0.0], [1.0, 0.0]]\nsize_m = [20.0, 20.0, 20.0]\n",
+    HALL.replace("[[2.0, 1.0], [2.0, -1.0]]", "[[2.0, 1.0], [2.0, -1e9]]"),
+])
+def test_the_area_is_checked_before_anything_is_painted(
+    tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shapes.textures, "PAINTERS", {name: None for name in shapes.textures.PAINTERS})
+    monkeypatch.setattr(shapes.textures, "poster", None)
+    with pytest.raises(OmnidError, match=r"the surfaces are \d+ m2; expected at most 1200"):
+        load_world(write(tmp_path, text), 1)

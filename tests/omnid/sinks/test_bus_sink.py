@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from omnid.client import Robot
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink

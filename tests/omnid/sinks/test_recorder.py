@@ -122,7 +122,7 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
             written_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
             assert START_NS <= written_ns <= START_NS + 3 and stamp_ns == written_ns
     assert counts == {"/omnid/odom": 4, "/omnid/pose": 4, "/tf": 4, "/omnid/drive": 4, "/omnid/status": 3,
-                      "/omnid/cloud": 1, "/omnid/map": 1, "/tf_static": 1, "/omnid/path": 1}
+                      "/omnid/cloud": 1, "/tf_static": 1, "/omnid/path": 1}
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
 
 

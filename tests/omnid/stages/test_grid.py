@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from omnid.core.mapping.keyframe_grid import KeyframeScans
+from omnid.load_level import LoadLevel
 from omnid.messages import PlaceUpdate
 from omnid.stages.grid import MapGrid
 from omnid.tracking_state import MapState
@@ -47,7 +46,7 @@ def test_without_a_period_it_is_drawn_at_the_end() -> None:
 
 def test_nothing_is_drawn_while_the_computer_is_too_slow() -> None:
     slow = [True]
-    stage = MapGrid(0.05, np.eye(4), 1.0, lambda: math.inf if slow[0] else 0.0)
+    stage = MapGrid(0.05, np.eye(4), 1.0, lambda: LoadLevel.NO_MAP if slow[0] else LoadLevel.FULL)
     assert given(stage, [update(k, scans(k)) for k in range(1, 5)]) == []
     slow[0] = False
     assert given(stage, [update(6, scans(6))]) == [6]

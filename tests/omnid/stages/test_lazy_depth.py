@@ -1,9 +1,11 @@
-"""Dense depth is computed when it is first read, and for the pairs that enter the map."""
+"""Dense depth is computed when it is first asked for, and for the pairs that enter the map."""
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -11,16 +13,15 @@ import pytest
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.config import MappingConfig
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.engine.flow import Chain
-from omnid.engine.graph import Graph
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.types.pixel_times import PixelTimes
+from omnid.core.types.stereo_model import StereoModel
 from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.mapping import Mapping
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import wrapped
 
-MS = 1_000_000
 IMAGE = np.zeros((4, 100), np.uint8)
 
 
@@ -31,39 +32,37 @@ class Counted:
         self.computed: list[int] = []
         self.exposures: list[Exposure | None] = []
 
-    def __call__(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
-        self.computed.append(panoramas.seq)
+    def __call__(self, pair: Panoramas, exposure: Exposure | None) -> DensePoints:
+        self.computed.append(pair.seq)
         self.exposures.append(exposure)
         points = np.array([[1.0, 2.0, 0.5]])
         return DensePoints(np.full((4, 100), np.nan, np.float32), np.zeros((1, 2)), points, np.full(1, 1e-4))
 
-    def depth(self, seq: int, stamp_ns: int) -> StereoDepth:
-        panorama = wrapped(IMAGE)
-        return StereoDepth(Panoramas(seq, stamp_ns, panorama, panorama, IMAGE > 0), self)
+
+def panoramas(seq: int, stamp_ns: int = 0) -> Panoramas:
+    panorama = wrapped(IMAGE)
+    return Panoramas(seq, stamp_ns, panorama, panorama, IMAGE > 0)
 
 
-def test_depth_is_computed_once_and_only_where_it_is_read() -> None:
+def test_depth_is_computed_once() -> None:
     counted = Counted()
-    depth = counted.depth(3, 5 * MS)
-    assert (depth.seq, depth.stamp_ns, depth.panoramas.seq) == (3, 5 * MS, 3) and counted.computed == []
-    assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2) == 1 and depth.disparity.shape == (4, 100)
-    assert counted.computed == [3]
+    depths, depth = DenseDepths(counted), StereoDepth(panoramas(3))
+    assert depths.of(depth) is depths.of(depth) and counted.computed == [3]
 
 
 def test_two_threads_that_read_at_the_same_time_compute_the_depth_once() -> None:
     counted, begun = Counted(), threading.Barrier(2, timeout=20)
 
-    def slow(panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
+    def slow(pair: Panoramas, exposure: Exposure | None) -> DensePoints:
         time.sleep(0.1)
-        return counted(panoramas, exposure)
+        return counted(pair, exposure)
 
-    panorama = wrapped(IMAGE)
-    depth = StereoDepth(Panoramas(3, 0, panorama, panorama, IMAGE > 0), slow)
+    depths, depth = DenseDepths(slow), StereoDepth(panoramas(3))
     found: list[DensePoints] = []
 
     def read() -> None:
         begun.wait()
-        found.append(depth.dense())
+        found.append(depths.of(depth))
 
     readers = [threading.Thread(target=read) for _ in range(2)]
     for reader in readers:
@@ -81,81 +80,47 @@ def test_two_threads_that_read_at_the_same_time_compute_the_depth_once() -> None
 ])
 def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, speed_mps: float, expected: int
                                                                ) -> None:
-    counted, mapping = Counted(), Mapping(MappingConfig(rate_hz=rate_hz))
+    counted = Counted()
+    mapping = Mapping(MappingConfig(rate_hz=rate_hz), DenseDepths(counted))
     for seq in range(60):
         stamp_ns = round(seq * 1e9 / 30)
         T = se3.transform(np.eye(3), np.array([speed_mps * stamp_ns * 1e-9, 0, 0]))
         mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                       50, 50, counted.depth(seq, stamp_ns)))
+                                       50, 50, StereoDepth(panoramas(seq, stamp_ns))))
     assert len(counted.computed) == expected
-    assert len(mapping.finish()[0].path_xy) == 61  # the path has every pose
+    path_xy = mapping.finish()[0].path_xy  # it goes on where no pair enters the map
+    np.testing.assert_allclose(path_xy[-1], [speed_mps * 59 / 30, 0], atol=1e-6)
 
 
 def test_keyframes_enter_the_map_after_half_the_time() -> None:
     """Their dense stereo is computed in any case: with one in time, no other pair needs it."""
-    counted, mapping = Counted(), Mapping(MappingConfig(rate_hz=5.0))
+    counted = Counted()
+    mapping = Mapping(MappingConfig(rate_hz=5.0), DenseDepths(counted))
     for seq in range(60):
         stamp_ns = round(seq * 1e9 / 30)
         T = se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0]))
         mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                       50, 50, counted.depth(seq, stamp_ns), is_keyframe=seq % 4 == 0))
+                                       50, 50, StereoDepth(panoramas(seq, stamp_ns)), is_keyframe=seq % 4 == 0))
     assert counted.computed == list(range(0, 60, 4))
 
 
-class Half:
-    """Passes on half of an even number."""
-
-    def process(self, number: int) -> int | None:
-        return None if number % 2 else number // 2
-
-
-def test_a_chain_passes_results_on_and_nothing_without_one() -> None:
-    chain = Chain(Half(), Half())
-    assert [chain.process(number) for number in (8, 6, 5)] == [2, None, None]
-
-
-class Late:
-    """Notes in a list when it takes a message and when it does what is left."""
-
-    def __init__(self, name: str, events: list[str]) -> None:
-        self._name, self._events = name, events
-
-    def process(self, number: int) -> int:
-        self._events.append(f"{self._name} {number}")
-        return number
-
-    def after(self) -> None:
-        self._events.append(f"after {self._name}")
-
-
-def test_a_chain_does_what_is_left_of_both_stages_after_the_result_was_passed_on() -> None:
-    events: list[str] = []
-    graph = Graph(threaded=False)
-    read = graph.source("read", lambda: [1, 2])
-    graph.sink("sink", Late("sink", events), graph.stage("stage", Chain(Late("first", events), Late("second", events)),
-                                                         read))
-    graph.run()
-    once = ["first {0}", "second {0}", "sink {0}", "after sink", "after first", "after second"]
-    assert events == [event.format(number) for number in (1, 2) for event in once]
-    assert graph.telemetry.of("stage").processed == 2
-
-
-def test_depth_follows_the_motion_until_it_is_settled() -> None:
+def test_depth_is_computed_for_each_motion_that_is_asked_for() -> None:
     counted = Counted()
-    depth = counted.depth(3, 5 * MS)
-    model = StereoModel(Cylinder(100, 4, 2.0), 0.2)
-    slow, fast = (Exposure(ExposureTimes(0.015), RigVelocity(v * np.ones(6), np.eye(6)), model) for v in (0.0, 1.0))
-    depth.disparity_at(slow)
-    depth.disparity_at(fast)
+    depths, model = DenseDepths(counted), StereoModel(Cylinder(100, 4, 2.0), 0.2)
+    slow, fast = (Exposure(PixelTimes(0.015), RigVelocity(v * np.ones(6), np.eye(6)), model) for v in (0.0, 1.0))
+    pair = panoramas(3)
+    depths.points(pair, slow)
+    depths.points(pair, fast)
     assert counted.exposures == [slow, fast]
-    depth.settle(slow)
-    assert len(depth.points) == 1 and counted.exposures == [slow, fast], "it was computed, and stays"
-    depth.disparity_at(slow)  # for the odometry alone
-    assert counted.exposures == [slow, fast, slow]
-    unread = counted.depth(4, 6 * MS)
-    unread.settle(fast)
-    assert len(unread.points) == 1 and counted.exposures[-1] is fast
-    unread.disparity_at(fast)  # that of a keyframe, which is made after the pose was passed on
-    assert len(counted.exposures) == 4
-    unread.settle(slow, again=True)
-    assert len(unread.points) == 1 and counted.exposures[-1] is slow
+    assert depths.of(StereoDepth(pair, fast)) is depths.points(pair, fast) and len(counted.exposures) == 2
+    depths.of(StereoDepth(pair))
+    assert counted.exposures == [slow, fast, None]
+
+
+def test_depth_is_forgotten_with_its_pair() -> None:
+    depths, pair = DenseDepths(Counted()), panoramas(3)
+    found = weakref.ref(depths.points(pair).points)
+    assert found() is not None
+    del pair
+    gc.collect()
+    assert found() is None

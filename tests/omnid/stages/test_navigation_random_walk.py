@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed, transform
 from omnid.core.control.arming import MANUAL, ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
@@ -36,7 +37,6 @@ from omnid.core.navigation.requests import (
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.places.planar import composed, transform
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.navigation.local_planner import CROSSES
 from omnid.core.navigation.requests import (
@@ -28,7 +29,6 @@ from omnid.core.navigation.route import KeyframePose
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.places.planar import planar, transform
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState

@@ -14,6 +14,7 @@ from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas,
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.sinks.encoder import Outgoing
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import Obstacles
 from omnid.tracking_state import TrackingState
@@ -77,11 +78,11 @@ def test_off_means_off(scene: Path) -> None:
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
 def test_floor_between_edges_is_seen_where_the_height_of_the_cameras_is_measured(height_m: float) -> None:
     rig = replace(make_rig(baseline_m=BASELINE_M), T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, height_m]))
-    stage = Obstacles(Geometry(rig, CYLINDER), load_config().obstacles)
     visible = np.ones((CYLINDER.height, CYLINDER.width), bool)
     dense = DensePoints(np.full(visible.shape, np.nan, np.float32), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))
+    stage = Obstacles(Geometry(rig, CYLINDER), load_config().obstacles, DenseDepths(lambda panoramas, exposure: dense))
     pair = Panoramas(0, 0, *panoramas(worn, 9.0, plain), visible)
     ring = stage.process(OdometryUpdate(0, 0, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                        100, 100, StereoDepth(pair, lambda panoramas, exposure: dense)))
+                                        100, 100, StereoDepth(pair)))
     assert ring is not None and np.isnan(ring.ranges_m).all()
     assert np.median(ring.free_m) > 2.0 if height_m else ring.free_m.max() < 0.2

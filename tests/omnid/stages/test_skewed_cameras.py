@@ -13,8 +13,8 @@ from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
+from omnid.core.rig.rig_health import RigContradictedError
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.stages.rig_gate import RigContradictedError
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
 from tests.simulation.rigs import with_upper_rotated

@@ -16,20 +16,20 @@ from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config, MappingConfig, PairConfig
+from omnid.core.frames import in_outer_axes, of_base
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import PlaybackClock
 from omnid.formats.tum import read_tum
-from omnid.messages import FramePair, MapUpdate, OdometryUpdate, Panoramas, StereoDepth
-from omnid.runs.pipeline import Sinks, wire
+from omnid.messages import DensePoints, FramePair, MapUpdate, OdometryUpdate, Panoramas, StereoDepth
+from omnid.runs.pipeline import RunParts, Sinks, wire
+from omnid.stages.dense_stereo import DenseStereo
 from omnid.stages.dewarp import Dewarp
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.mapping import Mapping, ThinnedPath
-from omnid.stages.odometry import in_axes, of_base
-from omnid.stages.stereo import Stereo
+from omnid.stages.mapping import Mapping
 from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
-from tests.omnid.allocations import taken
 from tests.omnid.core.scenery import texture, wrapped
 from tests.simulation import build, make_rig, render_grey
 
@@ -76,14 +76,22 @@ def test_panoramas_are_scaled_but_not_their_elevations() -> None:
     assert geometry(rig, replace(CONFIG.panorama, width_px=800, scale=0.5)).cylinder.width == 800
 
 
+def front_end(rig_geometry: Geometry) -> FrontEnd:
+    return FrontEnd(rig_geometry, CONFIG)
+
+
 def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
     (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    return Stereo(rig_geometry, CONFIG.stereo).process(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
+    return StereoDepth(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
+
+
+def points_of(rig_geometry: Geometry, frames: list[Frame]) -> DensePoints:
+    return front_end(rig_geometry).dense.of(depth_of(rig_geometry, frames))
 
 
 def test_points_lie_on_the_surfaces_of_the_world(scene: Path, rig_geometry: Geometry, frames: list[Frame]) -> None:
     """The floor of the rendered corridor is z = 0: no points may lie below it."""
-    depth = depth_of(rig_geometry, frames)
+    depth = points_of(rig_geometry, frames)
     points = se3.apply(read_tum(scene / "truth.txt").T[0], depth.points)
     sure = depth.variance_m2 < 0.05**2
     assert sure.sum() > 500
@@ -97,7 +105,7 @@ def test_points_project_to_the_pixels_they_were_matched_at() -> None:
     run = build("misaligned", seed=1, size=256, pairs=1)
     rig_geometry = geometry(run.rig, CONFIG.panorama)
     pair = FramePair(0, 0, *(render_grey(run.scene, m, run.poses[0]) for m in (run.rig.lower, run.rig.upper)))
-    depth = Stereo(rig_geometry, CONFIG.stereo).process(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
+    depth = front_end(rig_geometry).dense.points(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
     column, row = depth.pixels.astype(int).T
     below = row + depth.disparity[row, column]
     assert len(column) > 300
@@ -118,7 +126,7 @@ def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) 
     upper = np.roll(lower, 60, axis=0)
     inner = np.zeros(shape, bool)
     inner[10:-80] = True
-    depth = Stereo(rig_geometry, replace(CONFIG.stereo, min_range_m=min_range_m)).process(
+    depth = DenseStereo(rig_geometry, replace(CONFIG.stereo, min_range_m=min_range_m)).compute(
         Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
     right = np.abs(depth.disparity - 60) < 1
     assert (right.sum() > 5000) == found
@@ -167,7 +175,7 @@ def test_a_coarser_panorama_is_made_of_a_blurred_image(rig_geometry: Geometry) -
 
 def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geometry, frames: list[Frame]) -> None:
     """Half a pixel of disparity moves a point by about its standard deviation."""
-    depth = depth_of(rig_geometry, frames)
+    depth = points_of(rig_geometry, frames)
     rect = se3.apply(rig_geometry.rig.T_rect_rig, depth.points)
     range_m = np.linalg.norm(rect, axis=1)
     disparity = rig_geometry.cylinder.focal_px * rig_geometry.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
@@ -188,9 +196,8 @@ def test_covariance_of_the_base_equals_the_scatter_of_its_motions() -> None:
     rng = np.random.default_rng(0)
     T_odom_rig, T_base_rig = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
     root = rng.normal(0, 1e-4, (6, 6))
-    T_odom_base, covariance, velocity, _ = of_base(
-        odometry(T_odom_rig, covariance=in_axes(T_odom_rig, root @ root.T)), T_base_rig
-    )
+    T_odom_base, of_body, velocity, _ = of_base(odometry(T_odom_rig, covariance=root @ root.T), T_base_rig)
+    covariance = in_outer_axes(T_odom_base, of_body)
     small = se3.exp(rng.normal(0, 1, (100_000, 6)) @ root.T)
     moved = T_base_rig @ (T_odom_rig @ small) @ se3.inverse(T_base_rig)
     shift = moved[:, :3, 3] - T_odom_base[:3, 3]
@@ -208,46 +215,26 @@ def test_base_starts_at_the_origin() -> None:
 
 
 def test_maps_certain_points_at_tracked_poses_only(rig_geometry: Geometry, frames: list[Frame]) -> None:
-    depth = depth_of(rig_geometry, frames)
+    depth, dense = depth_of(rig_geometry, frames), front_end(rig_geometry).dense
     for state, kept in (("tracking", True), ("degraded", False), ("lost", False)):
-        mapping = Mapping(MappingConfig(min_frames=1))
+        mapping = Mapping(MappingConfig(min_frames=1), dense)
         mapping.process(odometry(np.eye(4), state=state, depth=depth))
         (update,) = mapping.finish()
-        assert (len(update.points.xyz) > 0) == kept and len(update.path_xy) == 2
-    strict = Mapping(MappingConfig(min_frames=1, max_sigma_m=0.001))
+        assert (len(update.points.xyz) > 0) == kept and len(update.path_xy) == 1
+    strict = Mapping(MappingConfig(min_frames=1, max_sigma_m=0.001), dense)
     strict.process(odometry(np.eye(4), depth=depth))
     assert len(strict.finish()[0].points.xyz) == 0
-    assert Mapping(MappingConfig()).finish() == []
+    assert Mapping(MappingConfig(), dense).finish() == []
 
 
 def test_a_full_map_counts_evicted_voxels(rig_geometry: Geometry, frames: list[Frame]) -> None:
-    depth = depth_of(rig_geometry, frames)
+    depth, dense = depth_of(rig_geometry, frames), front_end(rig_geometry).dense
     for log2_voxels, evicts in ((18, False), (10, True)):
-        mapping = Mapping(MappingConfig(voxel_m=0.01, log2_voxels=log2_voxels, max_sigma_m=10.0))
+        mapping = Mapping(MappingConfig(voxel_m=0.01, log2_voxels=log2_voxels, max_sigma_m=10.0), dense)
         for seq in range(3):
             mapping.process(odometry(np.eye(4), depth=depth, seq=seq))
         assert (mapping.counts["evicted"] > 0) == evicts
-        assert 0 < mapping.counts["voxels"] <= 0.7 * 2**log2_voxels + len(depth.points)
-
-
-def test_thins_the_path_and_keeps_its_ends() -> None:
-    path = ThinnedPath(100)
-    for k in range(10_000):
-        path.add(float(k), 0.0)
-    x = path.xy()[:, 0]
-    assert len(x) <= 102 and x[0] == 0 and x[-1] == 9999 and (np.diff(x) <= 128).all()
-
-
-def test_the_memory_of_a_path_is_constant() -> None:
-    path = ThinnedPath(10_000)
-
-    def extend() -> None:
-        for k in range(9000):
-            path.add(float(k), 0.5)
-
-    assert taken(extend).held < 1000
-    assert len(path.xy()) == 9001 and path.xy()[0].tolist() == [0.0, 0.5] and path.xy()[-2].tolist() == [8999.0, 0.5]
-    assert ThinnedPath(100).xy().shape == (0, 2)
+        assert 0 < mapping.counts["voxels"] <= 0.7 * 2**log2_voxels + len(dense.of(depth).points)
 
 
 def test_playback_waits_for_the_stamps_until_woken(frames: list[Frame]) -> None:
@@ -290,8 +277,9 @@ def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str
             if isinstance(message, slow):
                 assert complete.wait(60.0), "the poses waited for the bus"
 
-    sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus(), map_every_s=0.5)
-    wire(graph, paired(graph, rig_geometry, frames)[1], rig_geometry, CONFIG, sinks)
+    sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus())
+    wire(graph, paired(graph, rig_geometry, frames)[1], front_end(rig_geometry), CONFIG, sinks,
+         RunParts(map_every_s=0.5))
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
@@ -307,6 +295,6 @@ def test_the_pipeline_reads_any_iterable_of_frames(rig_geometry: Geometry, frame
 
     graph = Graph(threaded=threaded)
     pair, pairs = paired(graph, rig_geometry, frames)
-    wire(graph, pairs, rig_geometry, CONFIG, Sinks(poses={"keep": Keep()}))
+    wire(graph, pairs, front_end(rig_geometry), CONFIG, Sinks(poses={"keep": Keep()}))
     graph.run()
     assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

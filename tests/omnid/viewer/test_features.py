@@ -51,7 +51,7 @@ def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUp
 
 def test_features_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
     for odometry in poses:
-        height, width = odometry.depth.disparity.shape
+        height, width = odometry.depth.panoramas.visible.shape
         for pixels in (odometry.features.inliers, odometry.features.rejected, odometry.features.new):
             assert pixels.shape[1] == 2 and (pixels >= -1).all() and (pixels <= [width, height]).all()
 

@@ -18,11 +18,11 @@ from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.paper.registration import Registration, consensus, register
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, flow, track
 from omnid.core.odometry.yaw_search import steps
 from omnid.core.stereo.triangulation import triangulate, view
+from omnid.core.types.stereo_model import StereoModel
 from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
 

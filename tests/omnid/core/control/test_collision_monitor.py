@@ -183,3 +183,21 @@ def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
         assert (share == 1.0) == (reason == "")
         reasons.add(reason)
     assert len(reasons) == 6
+
+
+@pytest.mark.parametrize("stamp_ns", [11 * S, 10**6 * S, math.nan])
+def test_a_ring_of_the_future_or_of_no_time_is_stale(stamp_ns: float) -> None:
+    monitor = CollisionMonitor(SETTINGS, 1.5)
+    monitor.set_ring(ControllerRing(stamp_ns, FREE_RING))  # type: ignore[arg-type]
+    assert (monitor.step(10 * S, AHEAD), monitor.reason) == (Twist(), monitor_module.RING_STALE)
+
+
+@pytest.mark.parametrize("age_s", [0.2, 0.4, 0.7])
+def test_a_moving_obstacle_has_gone_on_since_the_images_of_the_ring(age_s: float) -> None:
+    """A person 1.3 m to the right crosses the way at 1 m/s: where it is now counts, not where it was seen."""
+    x, y, speed_mps = 0.7, -1.3, 1.0
+    seen_before = after(FREE_RING, moving=(MovingPoint(x, y, 0.0, speed_mps, 0.3),), age_s=age_s)
+    seen_now = after(FREE_RING, moving=(MovingPoint(x, y + speed_mps * age_s, 0.0, speed_mps, 0.3),), age_s=0.0)
+    assert seen_before == seen_now and seen_now[1] == monitor_module.MOVING
+    assert seen_before[0].velocity_mps < after(FREE_RING, moving=(MovingPoint(x, y, 0.0, speed_mps, 0.3),),
+                                               age_s=0.0)[0].velocity_mps

@@ -61,10 +61,11 @@ def test_a_battery_is_empty_once_its_voltage_stays_low() -> None:
     assert not any(reports(*[math.nan] * 20)) and not any(reports(*[1.0] * 20, level_v=0.0))
 
 
-def test_a_fault_counts_while_it_is_reported() -> None:
+@pytest.mark.parametrize("fault", [1, 4, -1, 1 << 31])
+def test_a_fault_counts_while_it_is_reported(fault: int) -> None:
     for mode, expected in (("stop", True), ("ignore", False)):
         trust = MotorTrust(replace(TrustSettings(), motor_fault=mode))
-        trust.add_report(0, 4, 12.0)
+        trust.add_report(0, fault, 12.0)
         assert trust.faulty is expected
         trust.add_report(1, 0, 12.0)
         assert not trust.faulty

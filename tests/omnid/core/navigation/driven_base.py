@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed, relative
 from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.navigator import Navigation, Navigator
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState
-from omnid.core.places.planar import composed, relative
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.se2_arrays import relative
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.navigation.forecast import Forecast, Pace, forecast, yielding
 from omnid.core.navigation.navigator import Navigator
@@ -17,7 +18,6 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.places.planar import relative
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
 

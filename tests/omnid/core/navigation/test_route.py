@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.places.planar import composed
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.panorama import Cylinder
 from omnid.core.obstacles.floor_view import FloorView
-from omnid.core.odometry.tracking import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama
 
 HEIGHT_M, BASELINE_M = 0.9, 0.2
 CYLINDER = Cylinder(872, 253, 86.0)

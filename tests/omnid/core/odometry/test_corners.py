@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
-from omnid.core.odometry.tracking import KltSettings, PaddedPanorama
+from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 ALL = np.ones((120, 480), bool)

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from omnid.core.odometry.dense_correction import DenseCorrection
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.types.pixel_times import PixelTimes
 from tests.omnid.core.odometry.test_exposure_times import MODEL, SIGMA, TIMES, TWIST
 
 SHAPE = (361, 1200)  # no multiple of the grid
 
 
 @pytest.mark.parametrize("times", TIMES)
-def test_interpolated_corrections_are_those_of_each_pixel(times: ExposureTimes) -> None:
+def test_interpolated_corrections_are_those_of_each_pixel(times: PixelTimes) -> None:
     exposure = Exposure(times, RigVelocity(TWIST, SIGMA**2), MODEL)
     rng = np.random.default_rng(2)
     columns, rows = rng.integers(0, SHAPE[1], 500), rng.integers(0, MODEL.cylinder.height, 500)

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
-from omnid.core.odometry.pose_estimation import SharedError, StereoModel, gauss_newton
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.odometry.pose_estimation import SharedError, gauss_newton
 from omnid.core.stereo.triangulation import triangulate, view
+from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
@@ -33,11 +35,11 @@ def rolling(line_s: float) -> NDArray[np.float32]:
     return (line_s * image_rows).astype(np.float32)
 
 
-TIMES = [ExposureTimes(0.015), ExposureTimes(-0.02), ExposureTimes(0.0, rolling(26e-6), rolling(26e-6)),
-         ExposureTimes(0.01, rolling(26e-6), rolling(20e-6))]
+TIMES = [PixelTimes(0.015), PixelTimes(-0.02), PixelTimes(0.0, rolling(26e-6), rolling(26e-6)),
+         PixelTimes(0.01, rolling(26e-6), rolling(20e-6))]
 
 
-def seen(points: Array, times: ExposureTimes, twist: Array) -> tuple[Array, Array]:
+def seen(points: Array, times: PixelTimes, twist: Array) -> tuple[Array, Array]:
     """Pixels (N, 2) in both panoramas of points (N, 3), each projected at its own time of exposure."""
     pixels = []
     for camera in (0, 1):
@@ -51,7 +53,7 @@ def seen(points: Array, times: ExposureTimes, twist: Array) -> tuple[Array, Arra
 
 
 @pytest.mark.parametrize("times", TIMES)
-def test_views_are_corrected_to_the_instant_of_the_stamp(times: ExposureTimes) -> None:
+def test_views_are_corrected_to_the_instant_of_the_stamp(times: PixelTimes) -> None:
     points = world()
     truth = view(points, MODEL.cylinder, MODEL.baseline_m)
     lower, upper = seen(points, times, TWIST)
@@ -117,3 +119,22 @@ def test_points_that_cannot_be_triangulated_stay_as_they_are() -> None:
     assert not np.isfinite(triangulate(views, MODEL.cylinder, MODEL.baseline_m)).any()
     np.testing.assert_array_equal(views[:, :2], pixels)
     assert (noise == 0).all()
+
+
+def test_an_exposure_at_once_leaves_views_as_they_are_seen() -> None:
+    """A frame whose pixels are all exposed at the stamp takes the same steps as others, to the last bit."""
+    exposure = Exposure.of(AT_ONCE, RigVelocity(TWIST, SIGMA**2), MODEL)
+    points = np.array([[2.0, 1.0, 0.5], [-1.0, 3.0, -0.2]])
+    views = view(points, MODEL.cylinder, MODEL.baseline_m)
+    pixels, disparity = views[:, :2], views[:, 2] - views[:, 1]
+    shift = exposure.shift(points)
+    assert not shift.lower.any() and not shift.upper.any() and shift.by_motion.shape == (2, 4, 0)
+    assert not shift.noise(exposure.motion).any() and not shift.column_sigma(exposure.motion).any()
+    corrected, noise = exposure.corrected(pixels, views[:, 2])
+    assert corrected.tobytes() == views.tobytes() and not noise.any() and exposure.derivatives(views).shape == (2, 3, 0)
+    columns, spread_px = exposure.upper_columns(pixels, views[:, 2])
+    assert columns.tobytes() == pixels[:, 0].tobytes() and not spread_px.any()
+    upper, spread_px = exposure.upper_pixels(pixels, disparity)
+    np.testing.assert_array_equal(upper, np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]))
+    assert not spread_px.any() and exposure.is_known
+    assert not Exposure.of(PixelTimes(0.015), exposure.motion, MODEL).times.is_at_once

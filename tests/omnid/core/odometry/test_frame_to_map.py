@@ -11,13 +11,15 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure, ExposureTimes, RigVelocity
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
 from omnid.core.odometry.frame_to_map import FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import Image, motion_errors, texture, turned, wrapped
 
 MODEL = StereoModel(Cylinder(480, 120, 60.0), 0.2)
@@ -47,8 +49,9 @@ def map_of(lower: Image, keyframe_image: Image) -> LocalMap:
 def located(local_map: LocalMap, frame: StereoFrame) -> PoseEstimate | None:
     """The estimate from a guess at the origin."""
     steps = FrameToMap(local_map, MODEL, KltSettings())
-    coarse = steps.estimate(frame, local_map.track(frame.lower, np.eye(4)), np.eye(4))
-    return steps.refine(frame, coarse) if coarse else None
+    exposure = Exposure.of(AT_ONCE, UNKNOWN_VELOCITY, MODEL)
+    coarse = steps.estimate(frame, local_map.track(frame.lower, np.eye(4)), np.eye(4), exposure)
+    return steps.refine(frame, coarse, exposure) if coarse else None
 
 
 @pytest.mark.parametrize(("columns_shown", "supported"), [(480, True), (60, False)])
@@ -73,10 +76,9 @@ def test_the_estimate_carries_the_views_of_its_inliers() -> None:
 
 def test_tracks_that_a_wrong_velocity_made_outliers_are_inliers_again() -> None:
     """The rig stands, but it is believed to pitch between the exposures of its cameras."""
-    local_map, frame = map_of(texture(1), texture(1)), replace(stereo_frame(texture(1)), times=ExposureTimes(0.03))
+    local_map, frame = map_of(texture(1), texture(1)), replace(stereo_frame(texture(1)), times=PixelTimes(0.03))
     steps, still = FrameToMap(local_map, MODEL, KltSettings()), RigVelocity(np.zeros(6), 1e-4 * np.eye(6))
     pitching = replace(still, twist=np.array([0, 0, 0, 0, 2.0, 0]))
-    assert frame.times is not None
     believed, known = (Exposure(frame.times, motion, MODEL) for motion in (pitching, still))
     tracks = local_map.track(frame.lower, np.eye(4))
     coarse = steps.estimate(frame, tracks, np.eye(4), believed)

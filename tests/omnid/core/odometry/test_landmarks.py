@@ -10,9 +10,9 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]

@@ -14,6 +14,7 @@ from tests.omnid.core.odometry.test_landmarks import MODEL, POSE, keyframe, view
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 TURN_PX = 150
+AT_STAMP = np.zeros(2)  # all pixels are exposed at the stamp
 T_TURNED = POSE @ se3.exp([0, 0, 0, 0, 0, TURN_PX * 2 * np.pi / 480])
 
 
@@ -68,12 +69,12 @@ def test_without_a_pyramid_landmarks_are_found_near_the_guess_only(local_map: Lo
 
 def test_patches_are_aligned_to_hundredths_of_a_pixel_where_the_pose_is_known(local_map: LocalMap) -> None:
     every = np.arange(len(local_map))
-    patches = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every)
+    patches = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every, AT_STAMP)
     pixels, aligned = patches.pixels, patches.found
     assert aligned.mean() > 0.95
     error = pixels[aligned] - local_map.store.table.views[aligned, :2] - (TURN_PX + 0.4, 0)
     assert np.abs(MODEL.cylinder.wrap(error[:, 0])).max() < 0.05 and np.abs(error[:, 1]).max() < 0.05
-    far = local_map.align(wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED, every)
+    far = local_map.align(wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED, every, AT_STAMP)
     assert far.found.mean() < 0.2
 
 
@@ -89,7 +90,7 @@ def test_each_landmark_is_aligned_with_its_own_keyframe() -> None:
     seen = np.column_stack([points, points[:, 1] + 8])
     local_map.add_keyframe(keyframe(2, image=other), seen, np.zeros((len(seen), 2)))
     for image, seq in ((wrapped(texture(1)), 1), (other, 2)):
-        aligned = local_map.align(image, POSE, np.arange(len(local_map)))
+        aligned = local_map.align(image, POSE, np.arange(len(local_map)), AT_STAMP)
         close = aligned.found & (np.abs(aligned.pixels - local_map.store.table.views[:, :2]).max(axis=1) < 0.1)
         assert local_map.store.anchor_shares(np.flatnonzero(close))[seq] > 0.8
         assert close.sum() > 30

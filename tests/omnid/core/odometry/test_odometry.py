@@ -14,11 +14,11 @@ from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.stereo.triangulation import view
+from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.odometry.patch_alignment import align, align_rows, view_noise
 from omnid.core.odometry.patch_fit import TEMPLATE_PX
-from omnid.core.odometry.pose_estimation import StereoModel
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]

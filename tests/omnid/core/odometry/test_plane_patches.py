@@ -12,9 +12,9 @@ from omnid.core.odometry import plane_kernels
 from omnid.core.odometry.patch_alignment import align
 from omnid.core.odometry.patch_fit import TEMPLATE_PX
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, moved_slopes, plane_templates
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.stereo.triangulation import view
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 

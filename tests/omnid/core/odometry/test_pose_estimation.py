@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac, rigid_fit, whitening
+from omnid.core.odometry.pose_estimation import gauss_newton, ransac, rigid_fit, whitening
 from omnid.core.odometry.ransac_kernels import rigid_motion, triple
 from omnid.core.odometry.view_kernels import linearise
 from omnid.core.stereo.triangulation import point_covariance, view
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import motion_errors
 
 Array = NDArray[np.float64]

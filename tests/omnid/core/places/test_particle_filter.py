@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.scan_grid import scan_grid
-from omnid.core.places.particle_filter import SCANS, ParticleEstimate, ParticleFilter
+from omnid.core.places.particle_filter import SCANS, ParticleEstimate, ParticleFilter, systematic_resample
 from tests.omnid.core.mapping.rooms import box, pose, scan_of
 
 Array = NDArray[np.float64]
@@ -109,6 +109,17 @@ def test_without_ranges_or_without_a_map_there_is_no_pose() -> None:
     filter = ParticleFilter(grid_of(CORNERED, MAPPED), 7)
     assert not any(filter.update(unknown).converged for _ in range(2 * SCANS))
     assert not ParticleFilter(scan_grid([], np.zeros((0, 4, 4)), 0.05)).update(unknown).converged
+
+
+def test_resampling_takes_each_particle_about_as_often_as_its_weight_says() -> None:
+    weight = np.array([0.1, 0.0, 0.5, 0.4])
+    counts = np.zeros(4)
+    for offset in (np.arange(100) + 0.5) / 100:
+        chosen = np.bincount(systematic_resample(weight, offset), minlength=4)
+        assert chosen.sum() == 4 and (np.abs(chosen - 4 * weight) < 1).all()
+        counts += chosen
+    np.testing.assert_allclose(counts / 400, weight, atol=0.01)
+    assert systematic_resample(np.full(3, 0.3333), 0.9999).max() == 2  # weights whose sum is below 1 by rounding
 
 
 def test_the_same_input_gives_the_same_result_and_numpys_generator_is_left_alone() -> None:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.pose_estimation import StereoModel
-from omnid.core.odometry.tracking import PaddedPanorama
 from omnid.core.places.tags import TagFinder
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 CYLINDER = Cylinder(1304, 378, 170.0)

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.rig.drive_landmarks import MAX_KEYFRAMES, MIN_KEYFRAMES, DriveLandmarks, View
 from omnid.core.stereo.triangulation import view
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import RenderedCameras
 from tests.simulation.paths import planar_poses
 

@@ -1,4 +1,4 @@
-"""Stereo depth of a pair: matching along the columns, then triangulation (Dang et al. 2012, section III)."""
+"""Dense depth of pairs: matching along the columns, then triangulation (Dang et al. 2012, section III)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import DensePoints, Panoramas, StereoDepth
-from omnid.stages.geometry import Geometry, GeometryVersions
-from omnid.stages.rig_gate import RigGate
+from omnid.messages import DensePoints, Panoramas
+from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
 
@@ -26,31 +25,15 @@ DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
 SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 
 
-class Stereo:
+class DenseStereo:
     """Computes disparities and points of the edges of the lower panorama."""
 
-    def __init__(self, geometry: Geometry | GeometryVersions, config: StereoConfig, rig_gate: RigGate | None = None
-                 ) -> None:
-        """rig_gate: sees all panoramas first, and raises OmnidError where they contradict the rig."""
-        self._versions = geometry if isinstance(geometry, GeometryVersions) else GeometryVersions(geometry)
-        self._config, self._cylinder = config, self._versions[0].cylinder
+    def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
+        self._config, self._geometry, self._cylinder = config, geometry, geometry.cylinder
+        self._baseline_m = geometry.rig.baseline_m
         self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
-        self._rig_gate = rig_gate
-        self._previous: StereoDepth | None = None  # the last pair, if it is still to be checked
 
-    def process(self, panoramas: Panoramas) -> StereoDepth:
-        """Return the depth of a pair, which is computed when it is first read."""
-        gate = self._rig_gate
-        if gate is not None and panoramas.times is None:
-            gate.process(panoramas)
-        elif gate is not None and self._previous is not None:
-            # The odometry finds the motion between the exposures of a pair before the next pair comes.
-            gate.process(self._previous.panoramas, self._previous.exposure)
-        depth = StereoDepth(panoramas, self.dense, rig_fits=gate is None or not gate.doubtful)
-        self._previous = depth if gate is not None and gate.is_active and panoramas.times is not None else None
-        return depth
-
-    def dense(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
+    def compute(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, at the stamp of the pair.
 
         exposure: the motion during the exposures; None: unknown, or there is none. May be called in several threads at
@@ -63,11 +46,10 @@ class Stereo:
             views, by_motion = correction.corrected(columns, rows, found)
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]
-        place = self._versions[panoramas.rig_version]
-        points = triangulate(views, place.cylinder, place.rig.baseline_m)
+        points = triangulate(views, self._cylinder, self._baseline_m)
         kept = np.isfinite(points).all(axis=1)
-        variance_m2 = self._variance_m2(points[kept], by_motion[kept], place.rig.baseline_m)
-        points, pixels = se3.apply(place.T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
+        variance_m2 = self._variance_m2(points[kept], by_motion[kept])
+        points, pixels = se3.apply(self._geometry.T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
         return DensePoints(disparity, pixels.astype(float), points, variance_m2)
 
     def _match(self, panoramas: Panoramas, correction: DenseCorrection | None
@@ -85,7 +67,7 @@ class Stereo:
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity
 
-    def _variance_m2(self, points: Array, by_motion: Array, baseline_m: float) -> Array:
+    def _variance_m2(self, points: Array, by_motion: Array) -> Array:
         """Return variances (N,) along the rays to points (N, 3) in the rectified frame.
 
         by_motion: variances (N,) [px^2] of their disparities by the uncertain motion between the exposures.
@@ -94,12 +76,12 @@ class Stereo:
         sqrt(1 + z^2 / r^2) times as large.
         """
         r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
-        per_px = r2 / (self._cylinder.focal_px * baseline_m)
+        per_px = r2 / (self._cylinder.focal_px * self._baseline_m)
         return np.asarray((1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion))
 
     def _matching(self, height: int) -> MatchingSettings:
         """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
-        nearest_px = self._cylinder.focal_px * self._versions[0].rig.baseline_m / self._config.min_range_m
+        nearest_px = self._cylinder.focal_px * self._baseline_m / self._config.min_range_m
         needed = math.ceil(nearest_px / DISPARITY_STEP_PX) * DISPARITY_STEP_PX
         matching = self._config.matching
         return _limited(replace(matching, disparities=min(matching.disparities, needed)), height)

@@ -1,0 +1,102 @@
+"""Motion of the rig during the exposures of frames, and the steps of the odometry that depend on it.
+
+The velocity is predicted before a frame is estimated, and known better afterwards. Frames whose pixels are all exposed
+at the stamp take the same steps, with an exposure that corrects nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
+from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
+from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
+from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.motion_model import MotionModel
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.types.stereo_model import StereoModel
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# The depths of the first frame are measured as if it stood still, so the motion is wrong by a few per cent of what
+# happens between two exposures: each round of starting the map again reduces the error by this ratio.
+START_ROUNDS = 2
+
+
+class RequestAtPose(Protocol):
+    """Makes the request of a keyframe at the last accepted pose."""
+
+    def __call__(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
+        """Return the request; usable (H, W): pixels in which landmarks may lie."""
+
+
+class FrameExposures:
+    """Exposures of frames by the velocity of a motion model."""
+
+    def __init__(self, motion: MotionModel, model: StereoModel, *, max_gap_s: float, local_map: LocalMap,
+                 keyframes: Keyframes, frame_to_map: FrameToMap) -> None:
+        """max_gap_s: a longer step shows no velocity."""
+        self._motion, self._model, self._max_gap_s = motion, model, max_gap_s
+        self._map, self._keyframes, self._frame_to_map = local_map, keyframes, frame_to_map
+        self._first: StereoFrame | None = None  # started the map before its velocity was known
+
+    def predicted(self, frame: StereoFrame, dt_s: float) -> Exposure:
+        """Return the exposure of the frame to which a step of dt_s was predicted."""
+        return Exposure.of(frame.times, self._motion.at_exposure(dt_s), self._model)
+
+    def now(self, frame: StereoFrame) -> Exposure:
+        """Return the exposure of a frame by the velocity that the filter has now."""
+        return Exposure.of(frame.times, self._motion.now(), self._model)
+
+    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure, T_odom_prev: Array, dt_s: float
+               ) -> PoseEstimate | None:
+        """Refine a pose; where the velocity matters, once more with that which the pose implies.
+
+        T_odom_prev (4, 4): pose dt_s [s] before. A sudden motion implies no velocity.
+        """
+        refined = self._frame_to_map.refine(frame, coarse, exposure)
+        if refined is None or frame.times.is_at_once or not 0 < dt_s <= self._max_gap_s:
+            return refined
+        T_prev_curr = se3.inverse(T_odom_prev) @ refined.T_odom_rect
+        is_sudden = self._motion.is_sudden(T_prev_curr, dt_s)
+        velocity = UNKNOWN_VELOCITY if is_sudden else self._motion.after(T_prev_curr, refined.covariance, dt_s)
+        settled = Exposure.of(frame.times, velocity, self._model)
+        coarse = self._frame_to_map.again(frame, coarse, refined.T_odom_rect, settled)
+        return self._frame_to_map.refine(frame, coarse, settled)
+
+    def map_started(self, frame: StereoFrame) -> None:
+        """Note that a frame started the map; where its velocity matters, the map starts again with the next pose."""
+        self._first = None if frame.times.is_at_once else frame
+
+    def start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float, *,
+                    request: RequestAtPose, tracked: int) -> PoseEstimate:
+        """Start the map again at its first frame, if its velocity was not known; return the pose of the second frame.
+
+        estimate: of the second frame, dt_s [s] after the last accepted pose. tracked: landmarks tracked at most.
+        """
+        first, self._first = self._first, None
+        if first is None or not 0 < dt_s <= self._max_gap_s:
+            return estimate
+        for _ in range(START_ROUNDS):
+            # 1. The second frame shows the velocity at both frames.
+            start = request(first, usable & first.usable, self.now(first))
+            T_prev_curr = se3.inverse(start.T_odom_rect) @ estimate.T_odom_rect
+            velocity = self._motion.after(T_prev_curr, estimate.covariance, dt_s)
+            # 2. Start the map with it.
+            self._map.clear()
+            self._keyframes.add(replace(start, exposure=Exposure.of(first.times, velocity, self._model)))
+            # 3. Estimate the second frame again.
+            exposure = Exposure.of(frame.times, velocity, self._model)
+            tracks = self._map.track(frame.lower, estimate.T_odom_rect, tracked, turn=frame.seq)
+            coarse = self._frame_to_map.estimate(frame, tracks, estimate.T_odom_rect, exposure)
+            again = self.refine(frame, coarse, exposure, start.T_odom_rect, dt_s) if coarse else None
+            estimate = again if again is not None else estimate.without_landmarks
+        return estimate

@@ -1,0 +1,135 @@
+"""State of the rig of a run: one state machine, driven by the first pairs and by views of the drive.
+
+The stage that computes depth shows it the first pairs (`begin`), before a pose moves wheels; a sink shows it views of a
+live run (`drive`). Each of the two threads sets its own finding in one assignment, and any thread may read the state.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from calib.panorama import Cylinder
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.rig.column_finding import RigFinding
+from omnid.core.rig.column_matches import PanoramaPair
+from omnid.core.rig.driving_views import DrivingViews
+from omnid.core.rig.first_pairs import FirstPairs, StartFinding
+from omnid.core.rig.rig_state import RigState
+from omnid.errors import OmnidError
+
+CheckMode = Literal["refuse", "warn", "off"]
+
+EXCHANGE: Final = ("exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
+                   "is that of other cameras")
+CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"
+GO_ON: Final = "give the rig of these cameras with --rig, or go on all the same with --set rig.check=warn"
+
+
+class RigContradictedError(OmnidError):
+    """The images cannot be of this rig."""
+
+
+class RigHealth:
+    """State of the rig of a run.
+
+    mode: what a contradiction by the first pairs does: "refuse" raises RigContradictedError, "warn" keeps the reason in
+    `warning`, "off" checks no first pairs. Where these show too little, as in darkness, later ones are used, and until
+    then the rig counts as fitting.
+    """
+
+    def __init__(self, cylinder: Cylinder, mode: str, every_s: float = 0.0, hint: str = "") -> None:
+        """every_s: time between two views of the drive; 0: none is used. hint: ends the reason of a refusal."""
+        self._mode, self._hint = mode, hint
+        self._first = FirstPairs(cylinder)
+        self._views = DrivingViews(cylinder, every_s) if every_s else None
+        self._later = RigState.UNCHECKED  # by the views of the drive
+        self._newest_ns = 0
+        self._found: tuple[RigFinding, int] | None = None  # by the views of the drive, with its stamp
+
+    @property
+    def state(self) -> RigState:
+        """The state, by all that was seen."""
+        first = self._first.state
+        if first is RigState.EXCHANGED or self._later is RigState.UNCHECKED:
+            return first
+        return self._later
+
+    @property
+    def is_checking(self) -> bool:
+        """True while first pairs are needed."""
+        return self._mode != "off" and not self._first.ended
+
+    @property
+    def uses_views(self) -> bool:
+        """True if views of the drive are used."""
+        return self._views is not None
+
+    @property
+    def start_finding(self) -> StartFinding | None:
+        """The newest finding of the first pairs; None before the first."""
+        return self._first.finding
+
+    @property
+    def finding(self) -> RigFinding | None:
+        """The newest finding of the drive; None before the first."""
+        return self._found[0] if self._found else None
+
+    @property
+    def finding_age_s(self) -> float:
+        """Time since then, by the stamps; NaN before the first."""
+        return (self._newest_ns - self._found[1]) * 1e-9 if self._found else float("nan")
+
+    @property
+    def new_views(self) -> int:
+        """Views of the drive since the last whole check."""
+        return self._views.new if self._views else 0
+
+    @property
+    def warning(self) -> str:
+        """One line about a rig that the first pairs do not fit, or could not check; empty for a good one."""
+        finding = self._first.finding
+        if self._mode == "off" or finding is None:
+            return ""
+        if self._first.state.is_contradicted:
+            return contradiction(finding)
+        if self._first.state is RigState.UNCHECKED:
+            return ("the rig could not be checked by the images: too few points are seen by both cameras; are they "
+                    "dark, covered or unsharp?")
+        if finding.state is RigState.DRIFTED and self._first.used_unknown_motion:
+            return ("the rig could only be checked to 2 deg: the cameras are not synchronised, and the motion between "
+                    "their exposures is not known: check it by a recording of slow driving, `omnid calibrate check`")
+        if finding.state is RigState.DRIFTED:
+            return (f"the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate check` on "
+                    "a recording")
+        return ""
+
+    def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+        """Use one of the first pairs, some 30 ms of work; RigContradictedError where the mode is to refuse the rig.
+
+        exposure: the motion between the exposures of a pair that is not synchronised.
+        """
+        if not self.is_checking:
+            return
+        self._first.add(pair, exposure)
+        if self._first.state.is_contradicted and self._mode == "refuse":
+            raise RigContradictedError(self.warning + self._hint)
+
+    def drive(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+        """Use a pair of the drive if it is due; a finding changes the state unless it saw too little."""
+        self._newest_ns = pair.stamp_ns
+        finding = self._views.add(pair, exposure) if self._views else None
+        if finding is None:
+            return
+        self._found = finding, pair.stamp_ns
+        if finding.state is not RigState.UNCHECKED:
+            self._later = finding.state
+
+
+def contradiction(finding: StartFinding) -> str:
+    """Return what the first pairs show against the rig, and what to do."""
+    straight = finding.straight
+    if finding.state is RigState.EXCHANGED:
+        return (f"the images match better the other way round: {finding.exchanged_matches} points are seen as if the "
+                f"lower camera were the upper one, {straight.matches} as the rig says: {EXCHANGE}")
+    return (f"the images contradict the rig: the upper camera seems turned by {straight.turn_deg:.1f} deg by "
+            f"{straight.matches} points: {CALIBRATE}")

@@ -1,0 +1,153 @@
+"""The wiring of a live run: cameras, stages, sinks, commands and status of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
+
+from calib.rig_file import rig_toml
+from drivers.frame import Camera
+from omnid.controller.link import ControllerLink
+from omnid.core.control.command_sources import PLANNER
+from omnid.diagnostics.latency import Latency
+from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
+from omnid.diagnostics.motion_status import motion_status
+from omnid.diagnostics.places_status import places_status
+from omnid.diagnostics.status import StatusCollector, StatusSources
+from omnid.engine.graph import NEWEST, Sink
+from omnid.formats.route_file import RouteFolder
+from omnid.light.exposure_control import ExposureControl
+from omnid.light.grey_levels import UsefulArea
+from omnid.messages import OdometryUpdate
+from omnid.refinement.refined_file import RefinedRigFile
+from omnid.runs.live_cameras import LiveCamera
+from omnid.runs.live_commands import LiveCommands
+from omnid.runs.live_status import add_status_tickers
+from omnid.runs.map_saver import MapSaver
+from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, wheel_state, wire
+from omnid.runs.place_maps import RunPlaces
+from omnid.runs.record import open_recorder
+from omnid.runs.rig_checks import LiveRig, live_health
+from omnid.runs.sensor_sources import MotionSource, SensorSources
+from omnid.runs.session import TICKERS, Session
+from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
+from omnid.sinks.recorder import Recorder
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import Geometry
+from omnid.stages.obstacles import ASSUMED_HEIGHT_M, floor_is_assumed
+from omnid.stages.places import Places
+from omnid.stages.synchronise import Synchronise
+from omnid.transport.bus import Bus
+from omnid.transport.navigation_commands import RequestQueue
+
+Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
+
+
+class LiveWiring:
+    """Joins the parts of one run."""
+
+    def __init__(self, session: Session, geometry: Geometry, refined: RefinedRigFile | None, report: Report) -> None:
+        """refined: the file of the refined rig; None where the rig is not refined."""
+        self._session, self._geometry, self._refined, self._report = session, geometry, refined, report
+        self._latency = Latency()
+
+    def wire(self, cameras: Mapping[Camera, LiveCamera], run_places: RunPlaces, motion: MotionSource | None) -> None:
+        """Join cameras, stages, sinks and tickers.
+
+        motion: wheels and gyro where the images are those of a log; None: those of the robot.
+        """
+        session, geometry, rig = self._session, self._geometry, self._geometry.rig
+        config, graph = session.config, session.graph
+        # 1. Connections: the wheels, the bus, wheels' and gyro's samples, the recording.
+        controller = session.start_controller(config.realtime) if config.motor.port else None
+        bus = session.open_bus(rig)
+        pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
+        sensors = SensorSources(config, pairing.motion, session, controller, self._report, motion)
+        if sensors.read_by_thread is not None:
+            graph.source("imu" if sensors.gyro else "motion", sensors.read, wake=sensors.read_by_thread.close)
+        recorder = self._recorder() if config.record.enabled else None
+        # 2. From the cameras to pairs.
+        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
+        pairs = graph.stage("pair", pairing, *frames)
+        states = {name: camera.state for name, camera in cameras.items()}
+        exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, states)
+        graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
+        # 3. From pairs to poses, maps and setpoints.
+        ladder, requests = LoadLadder(), RequestQueue()
+        front_end = FrontEnd(geometry, config, live_health(geometry, config, self._refined), load=lambda: ladder.level)
+        live_rig = LiveRig(session, front_end, ladder, self._refined)
+        sinks = self._sinks(live_rig, bus)
+        if recorder is not None:
+            sinks = replace(sinks, recording=RecordingSink(recorder, tuple(frames), config.record.queue))
+        parts = run_places.known_to(RunParts(load=lambda: ladder.level, map_every_s=config.live.cloud_s))
+        if controller:
+            self._warn_of_assumed_floor()
+            sinks.rings["controller-ring"] = RingToController(controller)
+            parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
+                            navigation=self._navigation(controller, requests))
+        stages = wire(graph, pairs, front_end, config, sinks, parts)
+        if config.live.shed_load:
+            graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
+        graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
+        saver = self._saver(run_places, stages.places)
+        # 4. From the bus: commands, requests, samples.
+        received = LiveCommands(session, bus, controller, requests, self._report)
+        received.subscribe(recorder, sensors, saver)
+        # 5. Status.
+        status = [ladder.status, exposure.status, live_rig.status,
+                  *([received.navigation.status] if controller else ()),
+                  motion_status(front_end.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
+                  *([partial(places_status, stages.places)] if stages.places else ()),
+                  *(part.status for part in (bus, recorder, saver) if part)]
+        sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,
+                                controller.statistics if controller else None, received.commands, TICKERS,
+                                tuple(status))
+        add_status_tickers(session, StatusCollector(sources), bus, recorder)
+
+    def _sinks(self, live_rig: LiveRig, bus: Bus) -> Sinks:
+        """Return the sinks of a run that neither drives nor records."""
+        session, config = self._session, self._session.config
+        poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
+        if config.bus.panorama_hz:
+            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+        return Sinks(poses={**poses, **live_rig.pose_sinks},
+                     bus=BusSink(bus, session.encoder(self._geometry.rig, config.live.cloud_points)))
+
+    def _warn_of_assumed_floor(self) -> None:
+        """Warn where the wheels depend on a floor that was never measured."""
+        config = self._session.config
+        needs_floor = config.obstacles.enabled and config.controller.collision.check
+        if needs_floor and floor_is_assumed(self._geometry, config.obstacles):
+            self._session.warn(
+                f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
+                f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
+
+    def _saver(self, run_places: RunPlaces, places: Places | None) -> MapSaver | None:
+        """Return what saves the map of places now and then; None where it stays as it is."""
+        if places is None or not run_places.is_extended:
+            return None
+        saver = MapSaver(run_places, places, self._session.config.places.save_s)
+        self._session.graph.ticker("save", saver.PERIOD_S, saver)
+        return saver
+
+    def _recorder(self) -> Recorder:
+        session, rig = self._session, self._geometry.rig
+        encode = session.encoder(rig, session.config.record.cloud_points)
+        recorder = open_recorder(session.config, rig_toml(rig), self._report, encode=encode,
+                                 offset_ns=session.offset_ns)
+        session.outputs.callback(recorder.close)
+        return recorder
+
+    def _navigation(self, controller: ControllerLink, requests: RequestQueue) -> NavigationParts | None:
+        """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
+        config = self._session.config
+        if PLANNER not in config.controller.sources.names:
+            self._session.warn(f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off")
+            return None
+        routes = RouteFolder(Path(config.navigation.routes))
+        return NavigationParts(requests, lambda: wheel_state(controller.statistics.state), PlannerDrive(controller),
+                               routes, config.places.map)

@@ -1,0 +1,49 @@
+"""Memory of the dense depths of pairs, which several stages share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from weakref import WeakKeyDictionary
+
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.engine.one_at_a_time import OneAtATime
+from omnid.messages import DensePoints, Panoramas, StereoDepth
+
+# Computes the dense depth of panoramas for a motion during their exposures; None: unknown, or there is none.
+Compute = Callable[[Panoramas, Exposure | None], DensePoints]
+
+
+class DenseDepths:
+    """Dense depths, computed when they are first asked for.
+
+    Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map or
+    the obstacle ring. What was computed is remembered as long as the panoramas of the pair exist. Any thread may ask;
+    while one computes, others that ask for the same pair wait for the result.
+    """
+
+    def __init__(self, compute: Compute) -> None:
+        self._compute = compute
+        self._known: WeakKeyDictionary[Panoramas, _Known] = WeakKeyDictionary()
+        self._one = OneAtATime()
+
+    def of(self, depth: StereoDepth) -> DensePoints:
+        """Return the dense depth of a pair whose pose is known."""
+        return self.points(depth.panoramas, depth.exposure)
+
+    def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
+        """Return the dense depth of panoramas; of several motions during the exposures the last is remembered."""
+        with self._one:
+            known = self._known.setdefault(panoramas, _Known())
+        with known.one:
+            if known.points is None or known.exposure is not exposure:
+                known.points, known.exposure = self._compute(panoramas, exposure), exposure
+            return known.points
+
+
+class _Known:
+    """Depth of a pair that was computed last, and the motion for which it was corrected."""
+
+    def __init__(self) -> None:
+        self.points: DensePoints | None = None
+        self.exposure: Exposure | None = None
+        self.one = OneAtATime()

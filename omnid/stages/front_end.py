@@ -1,0 +1,67 @@
+"""Front end of all runs: image pair, panoramas, check of the rig, odometry; and the dense depth of its pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from omnid.config import Config
+from omnid.core.rig.rig_health import RigHealth
+from omnid.load_level import Load, full_load
+from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
+from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry
+from omnid.stages.odometry import OdometryStage
+from omnid.tracking_state import TrackingState
+
+
+class FrontEnd:
+    """The stages from a pair to its pose, with the settings of one configuration.
+
+    A run with threads has `dewarp` and `poses` as two stages; `process` does the work of both. `dense` computes the
+    dense depth of their pairs for all stages that need it.
+    """
+
+    def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None, *,
+                 load: Load = full_load) -> None:
+        """health: state of the rig; None: one of its own, as the configuration checks it."""
+        self.geometry = geometry
+        self.health = health or RigHealth(geometry.cylinder, config.rig.check)
+        self.dewarp = Dewarp(geometry, config.panorama, config.camera)
+        self.dense = DenseDepths(DenseStereo(geometry, config.stereo_settings()).compute)
+        self.odometry = OdometryStage(geometry, config.odometry, self.dense, load)
+        self.poses = CheckedOdometry(self.odometry, self.health)
+
+    def process(self, pair: FramePair) -> OdometryUpdate:
+        """Return the pose at a pair."""
+        return self.poses.process(self.dewarp.process(pair))
+
+
+class CheckedOdometry:
+    """Odometry of a rig that its images do not contradict: the first pairs are checked before their poses."""
+
+    def __init__(self, odometry: OdometryStage, health: RigHealth) -> None:
+        self._odometry, self._health = odometry, health
+        self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
+
+    def process(self, panoramas: Panoramas) -> OdometryUpdate:
+        """Return the pose at a pair; RigContradictedError where the images contradict the rig."""
+        # 1. Check the rig by the pair; where the pixels were exposed at several times, by the pair before: the odometry
+        #    has found the motion during its exposures.
+        if panoramas.times.is_at_once:
+            self._health.begin(panoramas)
+        elif self._unchecked is not None:
+            self._health.begin(self._unchecked.panoramas, self._unchecked.exposure)
+        is_contradicted, is_checking = self._health.state.is_contradicted, self._health.is_checking
+
+        # 2. Estimate the pose. With a rig that the images contradict it is degraded at best.
+        update = self._odometry.process(panoramas)
+        self._unchecked = update.depth if is_checking and not panoramas.times.is_at_once else None
+        if is_contradicted and update.state is TrackingState.TRACKING:
+            return replace(update, state=TrackingState.DEGRADED)
+        return update
+
+    def after(self) -> None:
+        """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""
+        self._odometry.after()

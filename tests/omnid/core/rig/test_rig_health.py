@@ -1,0 +1,241 @@
+"""State of the rig by panoramas of rendered rooms: right rigs and wrong ones, at the start and while driving."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from drivers.logs.log_reader import LogReader
+from omnid.config import Config, PairConfig, PanoramaConfig
+from omnid.core.rig.column_matches import POINTS
+from omnid.core.rig.driving_views import MIN_PLACES, VIEWS
+from omnid.core.rig.rig_health import RigContradictedError, RigHealth
+from omnid.core.rig.rig_state import RigState
+from omnid.diagnostics.rig_status import RefinementReport, rig_status
+from omnid.engine.flow import NEWEST
+from omnid.engine.graph import Graph
+from omnid.messages import Panoramas
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import geometry
+from omnid.stages.synchronise import Synchronise
+from omnid.tracking_state import TrackingState
+from omnid.transport.status_names import RIG
+from tests.omnid.core.scenery import wrapped
+from tests.simulation import build, write_log
+from tests.simulation.readout import PERIOD_NS
+from tests.simulation.rigs import with_upper_rotated
+
+SECONDS = 10**9
+PERIOD_S = 5.0
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the log of a loop through a room, 24 places."""
+    folder = tmp_path_factory.mktemp("rooms")
+    run = build("rooms", seed=31, size=256, pairs=24)
+    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=31)
+    return folder
+
+
+class Driver:
+    """A sink of panoramas that shows them to the state as views of the drive."""
+
+    def __init__(self, health: RigHealth) -> None:
+        self.process = health.drive
+
+
+class Collector(list[Panoramas]):
+    """A sink that keeps all panoramas."""
+
+    def process(self, panoramas: Panoramas) -> None:
+        self.append(panoramas)
+
+
+def monitored(folder: Path, rig: Rig) -> tuple[RigHealth, Collector]:
+    """Run a log through the stages; return the monitor and the panoramas."""
+    place, config, graph = geometry(rig, PanoramaConfig()), PanoramaConfig(), Graph(threaded=False)
+    monitor, kept = RigHealth(place.cylinder, "off", PERIOD_NS / SECONDS), Collector()
+    frames = graph.source("log", LogReader(folder / "log.mcap").frames)
+    pairs = graph.stage("pair", Synchronise(rig, PairConfig()), frames)
+    panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
+    graph.sink("rig", Driver(monitor), panoramas, policy=NEWEST, depth=1)
+    graph.sink("kept", kept, panoramas)
+    graph.run()
+    return monitor, kept
+
+
+@pytest.fixture(scope="module")
+def true(rooms: Path) -> tuple[RigHealth, Collector]:
+    return monitored(rooms, read_rig(rooms / "rig.toml"))
+
+
+def monitor_after(
+    true: tuple[RigHealth, Collector], panoramas: Sequence[Panoramas], every_s: float = PERIOD_S
+) -> RigHealth:
+    """Return a new monitor after these panoramas, PERIOD_S apart."""
+    assert true[0]._views is not None
+    monitor = RigHealth(true[0]._views._cylinder, "off", every_s)
+    for number, one in enumerate(panoramas):
+        monitor.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+    return monitor
+
+
+def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
+    status = rig_status(true[0], None)
+    assert (status.name, status.level, status.message) == (RIG, 0, "fits")
+    assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
+    assert status.values["state"] == "fits" and int(status.values["new_views"]) == len(true[1]) - VIEWS
+    found, sought = int(status.values["matches"]), int(status.values["tried"])
+    assert 500 < found < sought and status.values["age_s"] == "1"
+
+
+@pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
+def test_half_a_degree_is_a_warning(rooms: Path, turn_deg: tuple[float, float, float]) -> None:
+    monitor, _ = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), turn_deg))
+    status = rig_status(monitor, None)
+    assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
+    assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
+    assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
+
+
+def test_three_degrees_are_an_error(rooms: Path) -> None:
+    status = rig_status(monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0], None)
+    assert status.level == 2 and status.message.startswith("broken: ")
+
+
+def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) -> None:
+    status = rig_status(monitor_after(true, true[1][:1] * 100), None)
+    assert (status.level, status.values) == (0, {"state": "unchecked", "new_views": "1", "needed_views": str(VIEWS)})
+    assert status.message.startswith("not checked yet")
+
+
+def test_few_places_give_no_finding_however_often(true: tuple[RigHealth, Collector]) -> None:
+    places = true[1][::3]
+    assert monitor_after(true, places[:MIN_PLACES - 1] * 8).finding is None
+    found = monitor_after(true, places[:MIN_PLACES] * 6).finding
+    assert found is not None and found.state is RigState.FITS and found.tried <= MIN_PLACES * POINTS
+
+
+def test_uses_no_more_views_than_its_period_allows(true: tuple[RigHealth, Collector]) -> None:
+    assert monitor_after(true, true[1], every_s=PERIOD_S + 1).new_views == len(true[1]) // 2
+    back = monitor_after(true, true[1][:4])
+    back.drive(replace(true[1][9], stamp_ns=1))  # also after the clock was set back
+    assert back.new_views == 5
+
+
+def test_a_rig_that_moves_during_the_run_is_detected(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+    _, after = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
+    monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
+    assert monitor.finding is not None and monitor.state is RigState.DRIFTED
+    assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+    """Three new views of it are enough, long before a whole check is due."""
+    place, config = geometry(read_rig(rooms / "rig.toml"), PanoramaConfig()), Config()
+    columns = round(3 / 360 * place.cylinder.width)
+    health = RigHealth(place.cylinder, "refuse", PERIOD_S)
+    poses = FrontEnd(place, config, health).poses
+    for number, right in enumerate(true[1][:8]):
+        turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
+        health.drive(replace(right, upper=turned, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+        assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
+    assert rig_status(health, None).level == 2
+    assert poses.process(true[1][8]).state is TrackingState.DEGRADED
+    fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S)).poses
+    assert fits.process(true[1][8]).state is TrackingState.TRACKING
+
+
+def test_the_status_has_the_result_of_the_start(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+    right = read_rig(rooms / "rig.toml")
+    health = started(true, [])
+    assert rig_status(health, None).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
+    health = started(true, true[1][:2])
+    status = rig_status(health, None)
+    assert (status.level, status.message, status.values["state"]) == (0, "fits", "fits") and not health.is_checking
+    for turn_deg, level, words in ((0.8, 1, "do not quite fit"), (3.0, 2, "contradict the rig")):
+        _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)))
+        health = started(true, seen[:4])
+        status = rig_status(health, None)
+        assert status.level == level and words in status.message
+        assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
+
+
+def started(true: tuple[RigHealth, Collector], pairs: Sequence[Panoramas]) -> RigHealth:
+    """Return the state after first pairs."""
+    assert true[0]._views is not None
+    health = RigHealth(true[0]._views._cylinder, "warn", PERIOD_S)
+    for one in pairs:
+        health.begin(one)
+    return health
+
+
+def test_the_drive_overrules_the_start_except_for_exchanged_cameras(rooms: Path, true: tuple[RigHealth, Collector]
+                                                                    ) -> None:
+    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+    exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in true[1]]
+    for first, later, state in ((wrong, true[1], RigState.FITS), (true[1], wrong, RigState.BROKEN),
+                                (exchanged, true[1], RigState.EXCHANGED)):
+        health = started(true, first[:4])
+        begun = health.state
+        for number, one in enumerate(later):
+            health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+        assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
+    assert rig_status(health, None).level == 2 and "exchange" in rig_status(health, None).message
+
+
+def test_a_check_in_the_dark_changes_no_state(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+    health = started(true, wrong[:4])
+    rng = np.random.default_rng(4)
+    for number, one in enumerate(true[1]):
+        black = wrapped(rng.normal(9, 2, one.lower.panorama.shape).clip(0, 255).astype(np.uint8))
+        seen = replace(one, lower=black, upper=black, stamp_ns=round(number * PERIOD_S * SECONDS))
+        health.drive(seen)
+    assert health.state is RigState.BROKEN
+
+
+def test_the_refinement_is_part_of_the_entry(true: tuple[RigHealth, Collector]) -> None:
+    health = started(true, true[1][:2])
+    fits = rig_status(health, RefinementReport(0, "", {"windows": "1"}), "a.toml")
+    assert (fits.level, fits.message) == (0, "fits")
+    assert (fits.values["windows"], fits.values["refined_in_use"]) == ("1", "a.toml")
+    moved = rig_status(health, RefinementReport(1, "moved", {"windows": "2"}))
+    assert (moved.level, moved.message, moved.values["state"]) == (1, "moved", "fits")
+
+
+def test_a_refusal_ends_with_the_hint(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+    assert true[0]._views is not None
+    health = RigHealth(true[0]._views._cylinder, "refuse", hint="; delete a.toml")
+    with pytest.raises(RigContradictedError, match=r"contradict the rig.*; delete a\.toml$"):
+        for one in wrong[:4]:
+            health.begin(one)
+
+
+@pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
+def test_darkness_is_no_alarm(true: tuple[RigHealth, Collector], gain: float, noise: float) -> None:
+    """In the dark, noise gives points without a match."""
+    rng = np.random.default_rng(4)
+
+    def dark(one: Panoramas) -> Panoramas:
+        images = [np.clip(w.image * gain + 8 + noise * rng.standard_normal(w.image.shape), 0, 255).astype(np.uint8)
+                  for w in (one.lower, one.upper)]
+        return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
+
+    status = rig_status(monitor_after(true, [dark(one) for one in true[1]]), None)
+    assert status.level == 0 and status.values["state"] == "unchecked", status
+
+
+def test_a_covered_camera_is_an_error(true: tuple[RigHealth, Collector]) -> None:
+    covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
+    status = rig_status(monitor_after(true, covered), None)
+    assert status.level == 2 and "covered" in status.message

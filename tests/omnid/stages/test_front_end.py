@@ -1,0 +1,74 @@
+"""The front end: the same poses in one call or as two stages, and a check of the rig that sees each pair once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig_file import read_rig
+from drivers.logs.log_reader import LogReader
+from omnid.config import Config
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.rig.column_matches import PanoramaPair
+from omnid.core.rig.rig_health import RigHealth
+from omnid.messages import FramePair, Panoramas
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.synchronise import Synchronise
+
+PAIRS = 4
+
+
+@pytest.fixture(scope="module")
+def place(scene: Path) -> Geometry:
+    return geometry(read_rig(scene / "rig.toml"), Config().panorama)
+
+
+@pytest.fixture(scope="module")
+def pairs(scene: Path, place: Geometry) -> list[FramePair]:
+    pairing = Synchronise(place.rig, Config().pair)
+    return [pair for pair in map(pairing.process, LogReader(scene / "log.mcap").frames()) if pair][:PAIRS]
+
+
+class Seen(RigHealth):
+    """State of a rig that notes the first pairs, and decides nothing."""
+
+    def __init__(self, place: Geometry) -> None:
+        super().__init__(place.cylinder, "warn")
+        self.pairs: list[tuple[int, bool]] = []  # number, and whether its motion is given
+
+    def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+        assert isinstance(pair, Panoramas)
+        self.pairs.append((pair.seq, exposure is not None))
+
+
+def test_one_call_gives_the_poses_of_two_stages(place: Geometry, pairs: list[FramePair]) -> None:
+    whole, parts = FrontEnd(place, Config()), FrontEnd(place, Config())
+    for pair in pairs:
+        one, other = whole.process(pair), parts.poses.process(parts.dewarp.process(pair))
+        parts.poses.after()
+        assert one.T_odom_rig.tobytes() == other.T_odom_rig.tobytes()
+        assert whole.dense.of(one.depth).points.tobytes() == parts.dense.of(other.depth).points.tobytes()
+
+
+def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_has_found_their_motion(
+        place: Geometry, pairs: list[FramePair]) -> None:
+    at_once, skewed = Seen(place), Seen(place)
+    for health, skew_s in ((at_once, 0.0), (skewed, 0.015)):
+        front_end = FrontEnd(place, Config(), health)
+        for number, pair in enumerate(pairs):
+            front_end.process(FramePair(number, pair.stamp_ns, pair.lower, pair.upper, skew_s))
+    assert at_once.pairs == [(number, False) for number in range(PAIRS)]
+    assert [number for number, _ in skewed.pairs] == list(range(PAIRS - 1))
+    assert all(is_given for number, is_given in skewed.pairs if number > 0)
+
+
+def test_the_stereo_of_the_papers_method_is_chosen_for_all(place: Geometry, pairs: list[FramePair]) -> None:
+    """The method of the odometry decides the matching that each user of the front end gets."""
+    paper = Config(odometry=Config().odometry.__class__(method="paper"))
+    found = [FrontEnd(place, config).dense for config in (Config(), paper)]
+    panoramas = FrontEnd(place, Config()).dewarp.process(pairs[0])
+    disparities = [np.nan_to_num(dense.points(panoramas).disparity) for dense in found]
+    assert not np.array_equal(*disparities)
